@@ -19,18 +19,18 @@ _OFFERED = {
     "Metric": "harness.measures",
     "bench": "harness.bench",
     "build_scene": "builder.pipeline",
-    "plan": "harness.planning.probed",
-    "read_runs": "harness.running.store",
-    "table": "harness.tables.comparison",
+    "plan": "harness.make_plan",
+    "read_runs": "harness.store",
+    "table": "report.comparison",
 }
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import build_scene as build_scene
     from ambiguous_wild.harness.bench import bench as bench
+    from ambiguous_wild.harness.make_plan import plan as plan
     from ambiguous_wild.harness.measures import Metric as Metric
-    from ambiguous_wild.harness.planning.probed import plan as plan
-    from ambiguous_wild.harness.running.store import read_runs as read_runs
-    from ambiguous_wild.harness.tables.comparison import table as table
+    from ambiguous_wild.harness.store import read_runs as read_runs
+    from ambiguous_wild.report.comparison import table as table
 
 
 def __getattr__(name: str) -> Any:

@@ -24,8 +24,8 @@ from typing import Any
 from job_queue import aw, exit_code, find_scenes, parser_of
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.harness.running.result_file import RESULT, read_result
-from ambiguous_wild.io.atomic import write_text
+from ambiguous_wild.harness.result_file import RESULT, read_result
+from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS

@@ -31,16 +31,16 @@ import torch
 from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.harness.running.result_file import RESULT, read_result
-from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.tables.papers import paper
-from ambiguous_wild.harness.tables.plain_formats import to_markdown as to_layout
-from ambiguous_wild.io.atomic import write_text
+from ambiguous_wild.harness.result_file import RESULT, read_result
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.metrics.image import psnr
+from ambiguous_wild.report.papers import paper
+from ambiguous_wild.report.plain_formats import to_markdown as to_layout
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import render
 

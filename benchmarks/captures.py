@@ -26,12 +26,12 @@ from captures_report import facts_of, missing_runs, rows_of, summarise, tabulate
 from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.cell import Cell, environment
-from ambiguous_wild.harness.running.choosing import chosen_by
-from ambiguous_wild.harness.running.grid import Probing, cell_folder, plan_cells
-from ambiguous_wild.harness.running.run import EFFECTS, refuse_other_config
-from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.io.atomic import write_text
+from ambiguous_wild.harness.cell import Cell, environment
+from ambiguous_wild.harness.choosing import chosen_by
+from ambiguous_wild.harness.grid import Probing, cell_folder, plan_cells
+from ambiguous_wild.harness.run import EFFECTS, refuse_other_config
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.splat.pace import TrainConfig

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core import Scene
-from ambiguous_wild.harness.running.cell import scene_identity
-from ambiguous_wild.harness.running.regions import true_distractor
-from ambiguous_wild.harness.running.store import Runs
+from ambiguous_wild.harness.cell import scene_identity
+from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.store import Runs
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats

@@ -22,8 +22,8 @@ import numpy as np
 from job_queue import aw, exit_code
 
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.harness.running.regions import train_looks
-from ambiguous_wild.io.atomic import write_text
+from ambiguous_wild.harness.regions import train_visibility
+from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.scene_folder import load_scene
 
 RESULTS = Path(__file__).parent / "results" / "composites.md"
@@ -40,7 +40,7 @@ def support(scene: Scene) -> dict[str, float]:
             scene,
             views=tuple(replace(v, split="test" if v.name == view.name else "train") for v in scene.views),
         )
-        looks = train_looks(alone, lambda _: None)
+        looks = train_visibility(alone, lambda _: None)
         shares[view.name] = 0.0 if isinstance(looks, str) else float(looks[view.name].supported.mean())
     return shares
 

@@ -33,16 +33,16 @@ from job_queue import exit_code, find_scenes
 from scipy.stats import rankdata
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.regions import true_distractor
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
 from ambiguous_wild.methods.refinesplat.evidence import ratio, uncertainty
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
-from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.masks import enlarge, instance_means
 from ambiguous_wild.methods.refinesplat.paper import PaperConfig
+from ambiguous_wild.methods.refinesplat.recipe import consistency_loss, identity_loss, instance_matrix
+from ambiguous_wild.methods.refinesplat.threshold import contrast, entropy, surprise
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.losses import photometric

@@ -28,18 +28,18 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.cell import environment
-from ambiguous_wild.harness.running.evaluate import frames_per_second, load_test_photos, mean_psnr
-from ambiguous_wild.harness.running.training import peak_memory, reset_peak
-from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.harness.cell import environment
+from ambiguous_wild.harness.evaluate import frames_per_second, load_test_photos, mean_psnr
+from ambiguous_wild.harness.training import peak_memory, reset_peak
+from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat import readiness
+from ambiguous_wild.splat.backend import wait
 from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.device import wait
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gpu.gsplat_seam import gsplat
-from ambiguous_wild.splat.gpu.kernels import photometric_fused
+from ambiguous_wild.splat.gpu_kernels import photometric_fused
+from ambiguous_wild.splat.gsplat_seam import gsplat
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.trainer import Trainer

@@ -19,8 +19,8 @@ import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
-from ambiguous_wild.harness.running.result_file import RESULT, read_result
-from ambiguous_wild.harness.running.store import read_config
+from ambiguous_wild.harness.result_file import RESULT, read_result
+from ambiguous_wild.harness.store import read_config
 
 
 def exit_code(main: Callable[[], int | None]) -> int | None:

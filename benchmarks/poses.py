@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.cell import environment
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.harness.cell import environment
 from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.files import write_json, write_text
 
 RESULTS = Path(__file__).parent / "results" / "poses"
 BASES = ("monstree", "sceaux", "seneca", "skull")

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.files import write_json
 from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.cpu import blend
 from ambiguous_wild.splat.cpu.compile import threads

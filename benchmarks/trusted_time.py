@@ -24,11 +24,11 @@ from pathlib import Path
 
 from job_queue import aw, exit_code
 
-from ambiguous_wild.harness.running.result_file import RESULT, read_result
-from ambiguous_wild.harness.running.store import read_runs, run_folders
-from ambiguous_wild.harness.running.timing import timing_of
-from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.harness.result_file import RESULT, read_result
+from ambiguous_wild.harness.store import read_runs, run_folders
+from ambiguous_wild.harness.timing import timing_of
+from ambiguous_wild.io.files import write_json
+from ambiguous_wild.report.comparison import comparison
 
 METHODS = ("3dgs", "robustsplat", "refinesplat")
 PRESETS = ("courtyard", "courtyard-twin")

@@ -12,7 +12,7 @@ right one.
 import torch
 
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.parts import Parts
 
 LAMPS = 2
@@ -30,7 +30,7 @@ class Lamps(Learnt):
     def rows(self, gaussians):
         share = torch.zeros(len(gaussians), LAMPS, device=gaussians.device)
         share[:, 0] = 1.0  # the first lamp starts as light that falls on everything
-        return {"lit": Row(share, rate=0.005)}
+        return {"lit": GaussianAttribute(share, rate=0.005)}
 
     def forward(self, visible, leaf, shot):
         light = visible.extra["lit"] @ leaf["lamps"]  # [M, 3]; zero lamps leave the colours as they are

@@ -17,7 +17,7 @@ import pandas as pd
 
 from ambiguous_wild import read_runs
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.tables.comparison import tidy
+from ambiguous_wild.report.comparison import tidy
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Transcribe the tables of the RefineSplat paper from its LaTeX source to CSV.
 
-    python leaderboard/transcribe.py paper.tex -o ambiguous_wild/harness/audit/reported
+    python leaderboard/transcribe.py paper.tex -o ambiguous_wild/report/reported
 
 Numbers are copied, never corrected. What the table itself does not say (which scene an ablation is on, which
 variant of a metric) comes from the text around it, or is "unknown". docs/audit.md describes the columns.

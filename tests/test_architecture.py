@@ -18,7 +18,7 @@ from ambiguous_wild.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ambiguous_wild"
-BELOW_HARNESS = {"core", "io", "builder", "datasets", "simulate", "vision", "metrics", "splat", "methods"}
+BELOW_RUNS = {"core", "io", "builder", "datasets", "simulate", "vision", "metrics", "splat", "methods"}
 ALLOWED: dict[str, set[str]] = {
     "core": set(),
     "io": {"core"},
@@ -30,14 +30,15 @@ ALLOWED: dict[str, set[str]] = {
     "splat": {"core", "io"},
     "methods": {"core", "io", "splat", "vision"},
     "viewing": {"core", "io", "metrics", "splat"},
-    "harness": BELOW_HARNESS | {"viewing"},
-    "study": {"core", "io", "metrics", "harness"},
+    "harness": BELOW_RUNS | {"viewing"},
+    "report": BELOW_RUNS | {"viewing", "harness"},
+    "study": {"core", "io", "metrics", "harness", "report"},
     "stress": {"core", "metrics", "splat", "methods"},
-    "cli": BELOW_HARNESS | {"viewing", "harness", "study", "stress"},
+    "cli": BELOW_RUNS | {"viewing", "harness", "report", "study", "stress"},
 }
 HEAVY = ("torch", "numba", "pycolmap", "cv2", "matplotlib", "transformers", "scipy", "pandas", "skimage")
 FILES = sorted(PACKAGE.rglob("*.py"))
-MOST_LINES = 400  # of a Python file
+MOST_LINES = 500  # of a Python file
 
 
 def imports(path: Path) -> Iterator[tuple[str, int, bool]]:
@@ -107,8 +108,8 @@ def test_only_the_back_end_asks_where_tensors_lie() -> None:
         for path in FILES
         if re.search(r"\baccelerated\(", path.read_text(encoding="utf-8"))
     }
-    ours = {f"methods/refinesplat/{name}.py" for name in ("density", "losses", "policy", "support")}
-    assert asking - ours == {"splat/device.py", "splat/backend.py"}
+    ours = {f"methods/refinesplat/{name}.py" for name in ("density", "recipe")}
+    assert asking - ours == {"splat/backend.py"}
 
 
 def test_no_two_packages_import_each_other() -> None:
@@ -164,8 +165,8 @@ def test_the_finder_of_circles_finds_them() -> None:
     real = import_graph()
     ours = "ambiguous_wild.methods"
     assert f"{ours}.graft" in real[f"{ours}.registry"]
-    assert f"{ours}.grafted_policy" in real[f"{ours}.graft"]  # inside a function
-    assert f"{ours}.external.program" in real[f"{ours}.entry"]  # for types alone
+    assert f"{ours}.given_masks" in real[f"{ours}.graft"]  # inside a function
+    assert f"{ours}.external_process" in real[f"{ours}.entry"]  # for types alone
     assert "ambiguous_wild.core" in real[f"{ours}.truth"]  # a name of a package
 
 

@@ -25,7 +25,7 @@ from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import CapturedPhoto, CaptureRecord, FrameCounts, LeftOut
 from ambiguous_wild.builder.screen import sharpness, without_copies
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_dir, check_output, write_json
+from ambiguous_wild.io.files import atomic_dir, check_output, write_json
 from ambiguous_wild.io.photos import UnreadablePhoto, read_photo
 
 QUALITY = 97  # of JPEG; video is compressed harder

@@ -17,7 +17,7 @@ from typing import Literal
 
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, counted, shortlist
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_alpha, read_mask, write_png
 from ambiguous_wild.io.photos import TRANSPARENT, upright
 from ambiguous_wild.io.scene_folder import find_masks as by_name

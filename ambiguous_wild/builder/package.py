@@ -12,8 +12,7 @@ from typing import Any
 
 from ambiguous_wild.builder.records import KeyedRecord, PackageResult, SceneRecord
 from ambiguous_wild.core.scene import FileEntry
-from ambiguous_wild.io.atomic import write_json
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file, write_json
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA
 
 

@@ -21,7 +21,7 @@ from ambiguous_wild.builder.stages import Stages
 from ambiguous_wild.builder.workspace import Workspace, build_lock
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.io.atomic import check_output, refuse_foreign_files
+from ambiguous_wild.io.files import check_output, refuse_foreign_files
 from ambiguous_wild.io.scene_folder import read_scene_json, verify_files
 
 # Full disk, quota, permissions, read-only disk, broken disk: the user can repair these.

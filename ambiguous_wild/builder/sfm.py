@@ -29,7 +29,7 @@ from ambiguous_wild.builder.retrieval import MOTIONS, PAIRS
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.io.files import write_json
 
 LOG = "colmap.log"
 DATABASE = "database.db"

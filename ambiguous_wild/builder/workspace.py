@@ -21,8 +21,7 @@ from typing import Any, Generic, TypeVar
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_dir, write_json
-from ambiguous_wild.io.lock import Held, file_lock, lock_path
+from ambiguous_wild.io.files import Held, atomic_dir, file_lock, lock_path, write_json
 
 BUILDER = 15  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")

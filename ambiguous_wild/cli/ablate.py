@@ -86,10 +86,10 @@ def command(
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.cli.options import choose_device, prepare_cpu
     from ambiguous_wild.cli.progress import ProgressBar
-    from ambiguous_wild.harness.ablation.plan import earlier_groups, plan_study
-    from ambiguous_wild.harness.ablation.report import markdown_of, report, write_report
-    from ambiguous_wild.harness.running.grid import run_cells
-    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.harness.ablation import earlier_groups, plan_study
+    from ambiguous_wild.harness.grid import run_cells
+    from ambiguous_wild.io.files import check_output
+    from ambiguous_wild.report.ablation import markdown_of, report, write_report
     from ambiguous_wild.splat.pace import TrainConfig
 
     on = choose_device(device)

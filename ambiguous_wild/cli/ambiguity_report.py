@@ -69,24 +69,24 @@ def command(
     from tqdm import tqdm
 
     from ambiguous_wild.core.errors import AwError
-    from ambiguous_wild.harness.ambiguity import measure, page, sources, summary
-    from ambiguous_wild.io.atomic import check_output, write_json
+    from ambiguous_wild.io.files import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
+    from ambiguous_wild.report import ambiguity_measure, ambiguity_page, ambiguity_sources, ambiguity_summary
 
     loaded = load_scene(scene)
     if run is not None:
-        sources.check_run(loaded, run)
+        ambiguity_sources.check_run(loaded, run)
     if masks is not None and keep_masks is not None:
         raise AwError("--distractor-masks and --keep-masks exclude each other: give one of them")
     chosen = masks if keep_masks is None else str(keep_masks)
-    found = sources.find_masks(loaded, chosen, run, keep=keep_masks is not None)
-    behind = sources.find_background(loaded, background, run, found)
+    found = ambiguity_sources.find_masks(loaded, chosen, run, keep=keep_masks is not None)
+    behind = ambiguity_sources.find_background(loaded, background, run, found)
     folder = output or scene.resolve().parent / f"{scene.resolve().name}-ambiguity"
     if folder.resolve().is_relative_to(scene.resolve()):
         raise AwError(f"{folder} is inside {scene} and would change the scene; choose another -o")
     check_output(folder / "index.html" if folder.is_dir() else folder)
-    page.check_folder(folder)
-    measured, look = measure.measure(
+    ambiguity_page.check_folder(folder)
+    measured, look = ambiguity_measure.measure(
         loaded,
         found,
         behind,
@@ -94,10 +94,10 @@ def command(
         objects=objects,
         progress=lambda v: tqdm(v, unit="photo", desc="measure", disable=as_json or None),
     )
-    facts = summary.summarise(
+    facts = ambiguity_summary.summarise(
         loaded, measured, look, features=features, masks=found.source, background=behind.source, seed=seed
     )
-    page.write_report(loaded, found, behind, measured, look, facts, folder)
+    ambiguity_page.write_report(loaded, found, behind, measured, look, facts, folder)
     # scene.json is not part of the scene's identity, which is a hash of the other files.
     info = read_scene_json(scene) if record else None
     if info is not None:
@@ -106,7 +106,7 @@ def command(
         click.echo(json.dumps({**facts, "report": str(folder)}, indent=2))
         return
     click.echo(f"{loaded.name}: {facts['class']}")
-    for line in summary.describe(facts):
+    for line in ambiguity_summary.describe(facts):
         click.echo(line)
     saved = ", scores saved in scene.json" if info is not None else ""
     click.echo(f"wrote {folder / 'index.html'} ({len(measured)} photos){saved}")

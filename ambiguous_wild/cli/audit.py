@@ -30,9 +30,9 @@ def command(tables: tuple[Path, ...], style: str, output: Path | None, strict: b
     their values, implausible SSIM and LPIPS, and wrong ranks. The correct values are not known, so a finding
     is a question to the authors of the table.
     """
-    from ambiguous_wild.harness.audit.checks import audit, csv_of, markdown_of, text_of
-    from ambiguous_wild.harness.audit.table import REPORTED, read_tables
-    from ambiguous_wild.io.atomic import write_text
+    from ambiguous_wild.io.files import write_text
+    from ambiguous_wild.report.audit import audit, csv_of, markdown_of, text_of
+    from ambiguous_wild.report.audit_numbers import REPORTED, read_tables
 
     numbers = read_tables(tables or (REPORTED,))
     findings = audit(numbers)

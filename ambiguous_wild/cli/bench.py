@@ -18,7 +18,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.bench import bench
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.suite import PreparedSuite
+    from ambiguous_wild.report.suite import PreparedSuite
 
 SUITES = ("ambiguous-wild", "on-the-go", "robustnerf", "photo-tourism", "drone")
 LONGEST_S = 366 * 24 * 3600.0
@@ -231,7 +231,7 @@ def _suite(
 ) -> tuple[PreparedSuite, tuple[str, ...], int | None]:
     """The suite's scenes, its methods and length unless others are asked for."""
     from ambiguous_wild.datasets.suites import get_suite
-    from ambiguous_wild.harness.suite import prepare_suite, suite_methods
+    from ambiguous_wild.report.suite import prepare_suite, suite_methods
 
     if root is None or scenes:
         raise AwError(f"--suite {name} takes its scenes from --root DIR; leave --scene out")
@@ -242,8 +242,8 @@ def _suite(
 
 
 def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
-    from ambiguous_wild.harness.suite import suite_tables
-    from ambiguous_wild.harness.tables.plain_formats import to_text
+    from ambiguous_wild.report.plain_formats import to_text
+    from ambiguous_wild.report.suite import suite_tables
 
     try:
         click.echo(to_text(suite_tables(prepared, folder), color=sys.stdout.isatty()), nl=False)

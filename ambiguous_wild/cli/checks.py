@@ -21,9 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.extras import install_command
-from ambiguous_wild.harness.running.cell import installed
+from ambiguous_wild.core.errors import AwError, install_command
+from ambiguous_wild.harness.cell import installed
 from ambiguous_wild.splat import readiness
 
 TIMEOUT_S = 60
@@ -283,7 +282,7 @@ def _installed(name: str, extra: str, use: str) -> Check:
 
 def _extras() -> list[Check]:
     """Packages for single commands, and nerfbaselines, which has its own environment."""
-    from ambiguous_wild.methods.external.nerfbaselines import find_program
+    from ambiguous_wild.methods.nerfbaselines import find_program
 
     checks = [
         _installed("ray", "ray", "aw bench --engine ray"),

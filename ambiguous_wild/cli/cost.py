@@ -15,7 +15,7 @@ from ambiguous_wild.cli.options import Number, PathName, only_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.cost.read import Found
+    from ambiguous_wild.report.cost_read import CostRuns
 
 
 @click.command(name="cost")
@@ -64,9 +64,9 @@ def command(
     """
     if any(not math.isfinite(t) for t in targets):
         raise AwError("--target must be a number of dB, e.g. 25")
-    from ambiguous_wild.harness.cost.read import read_cost_runs
-    from ambiguous_wild.harness.cost.report import cost_report, plain_data, to_text, write_report
-    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.io.files import check_output
+    from ambiguous_wild.report.cost import cost_report, plain_data, to_text, write_report
+    from ambiguous_wild.report.cost_read import read_cost_runs
 
     if (recommended is None) != (budget is None):
         raise AwError(
@@ -81,19 +81,19 @@ def command(
     check_output(output / "cost.json")  # not before: it makes the folder, and there may be nothing to write
     written = write_report(report, output)
     if plots:
-        from ambiguous_wild.harness.cost.plots import draw_all
+        from ambiguous_wild.report.cost_plots import draw_all
 
         written += draw_all(report, output)
     click.echo(json.dumps(plain_data(report), indent=2) if as_json else to_text(report), nl=as_json)
     click.echo(f"wrote {', '.join(p.name for p in written)} in {output}", err=True)
 
 
-def _recommend(found: Found, scene: Path, budget: str, as_json: bool) -> None:
+def _recommend(found: CostRuns, scene: Path, budget: str, as_json: bool) -> None:
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.harness.cost.recommend import in_words, recommend, speed_here
-    from ambiguous_wild.harness.cost.report import finite
-    from ambiguous_wild.harness.running.cell import scene_identity
+    from ambiguous_wild.harness.cell import scene_identity
     from ambiguous_wild.io.scene_folder import load_scene
+    from ambiguous_wild.report.cost import finite
+    from ambiguous_wild.report.cost_recommend import in_words, recommend, speed_here
 
     seconds = parse_budget(budget)
     opened = load_scene(scene, verify="quick")

@@ -221,19 +221,19 @@ def package_command(
 
     The same scenes give the same bytes. Without licence and consent the package says "not for release".
     """
-    from ambiguous_wild.datasets.release.describe import TEMPLATE, ReleaseInfo, read_release_info
+    from ambiguous_wild.datasets.release_facts import TEMPLATE, ReleaseInfo, read_release_info
 
     if template is not None:
         if template.exists():
             raise AwError(f"{template} exists; nothing is overwritten: choose another name")
-        from ambiguous_wild.io.atomic import write_text
+        from ambiguous_wild.io.files import write_text
 
         write_text(template, TEMPLATE)
         click.echo(f"wrote {template}: fill it in, then pass it with --info")
         return
     if not scenes or output is None:
         raise AwError("give at least one scene folder and -o DIR; 'aw package --help' shows examples")
-    from ambiguous_wild.datasets.release.package import package_scenes
+    from ambiguous_wild.datasets.package import package_scenes
 
     info = read_release_info(info_file) if info_file else ReleaseInfo()
     done = package_scenes(
@@ -277,7 +277,7 @@ def verify_command(package: Path, scratch: Path | None, as_json: bool) -> None:
 
     Nothing is trusted: hostile archives are refused.
     """
-    from ambiguous_wild.datasets.release.verify import verify
+    from ambiguous_wild.datasets.verify import verify
 
     found = verify(package, scratch=scratch)
     if as_json:

@@ -13,7 +13,7 @@ import click
 from ambiguous_wild.cli.options import PathName
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.leaderboard.edit import AddReport
+    from ambiguous_wild.report.board_edit import AddReport
 
 _board = click.option(
     "--board",
@@ -79,7 +79,7 @@ def add_command(
     left for later. Adding a run twice changes nothing.
     """
     from ambiguous_wild.core import AwError
-    from ambiguous_wild.harness.leaderboard.edit import add
+    from ambiguous_wild.report.board_edit import add
 
     with _bar() as tick:
         reports = add(
@@ -153,7 +153,7 @@ def remove_command(
     dry_run: bool,
 ) -> None:
     """Remove runs and their pictures from the board."""
-    from ambiguous_wild.harness.leaderboard.edit import remove
+    from ambiguous_wild.report.board_edit import remove
 
     gone = remove(board, method=method, dataset=dataset, scene=scene, setting=setting, seed=seed, dry=dry_run)
     for entry in gone:
@@ -194,7 +194,7 @@ def publish_command(
     """
     import dataclasses
 
-    from ambiguous_wild.harness.leaderboard.publish import publish
+    from ambiguous_wild.report.board_publish import publish
 
     done = publish(
         board,
@@ -226,7 +226,7 @@ def check_command(board: Path, as_json: bool) -> None:
     import dataclasses
 
     from ambiguous_wild.core import AwError
-    from ambiguous_wild.harness.leaderboard.edit import check
+    from ambiguous_wild.report.board_edit import check
 
     found = check(board)
     if as_json:

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.harness.running.callbacks import Engine
+from ambiguous_wild.harness.callbacks import Engine
 
 
 class PathName(click.Path):

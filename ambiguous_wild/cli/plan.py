@@ -15,7 +15,7 @@ from ambiguous_wild.cli.options import PathName
 
 if TYPE_CHECKING:
     from ambiguous_wild.core import Scene
-    from ambiguous_wild.harness.planning.decide import Decision, Plan
+    from ambiguous_wild.harness.effects_plan import Decision, Plan
 
 MASKS = (
     "masks: no effect to switch on; a method makes them while it trains (aw bench --method refinesplat, or "
@@ -66,9 +66,9 @@ def command(
     both leave out. 'aw bench --effects auto' decides the same way, but not about masks.
     """
     from ambiguous_wild.core.errors import AwError
-    from ambiguous_wild.harness.planning.decide import plan_without_training
-    from ambiguous_wild.harness.planning.tried import untried
-    from ambiguous_wild.io.atomic import check_output, write_json
+    from ambiguous_wild.harness.effects_plan import plan_without_training
+    from ambiguous_wild.harness.select_effects import untried
+    from ambiguous_wild.io.files import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene
 
     loaded = load_scene(scene, factor=factor)
@@ -86,7 +86,7 @@ def command(
     else:
         plan = untried(plan_without_training(loaded), "--no-probe")
     if costs:
-        from ambiguous_wild.harness.planning.probe import effect_costs
+        from ambiguous_wild.harness.residual_probe import effect_costs
 
         plan = plan.with_costs(effect_costs(loaded))
     write_json(path, plan.plain())
@@ -104,7 +104,7 @@ def _probed(scene: Scene, iterations: int, path: Path, quiet: bool) -> Plan:
     """The plan from probes; those of effects are kept beside its file until it is written."""
     from tqdm import tqdm
 
-    from ambiguous_wild.harness.planning.probed import plan_with_probes
+    from ambiguous_wild.harness.make_plan import plan_with_probes
     from ambiguous_wild.splat.pace import TrainConfig
 
     folder = path.parent / f".{path.name}.probes"
@@ -124,7 +124,7 @@ def _probed(scene: Scene, iterations: int, path: Path, quiet: bool) -> Plan:
 def _check_overwrite(path: Path, probe: bool) -> None:
     """Only an earlier plan may be replaced, and not one with a probe by one without."""
     from ambiguous_wild.core.errors import AwError
-    from ambiguous_wild.harness.planning.decide import read_plan
+    from ambiguous_wild.harness.effects_plan import read_plan
 
     if not path.exists():
         return

@@ -14,11 +14,11 @@ import click
 
 from ambiguous_wild.cli.options import say
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.running.callbacks import Callbacks, Lines, outcome_line, run_name
+from ambiguous_wild.harness.callbacks import Callbacks, Lines, outcome_line, run_name
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.bench import BenchReport
-    from ambiguous_wild.harness.running.cell import Cell, CellReport
+    from ambiguous_wild.harness.cell import Cell, CellReport
     from ambiguous_wild.splat.trainer import Trainer
 
 

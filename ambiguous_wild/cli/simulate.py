@@ -74,8 +74,7 @@ def simulate_command(
 
     from tqdm import tqdm
 
-    from ambiguous_wild.io.atomic import check_output, sweep_siblings
-    from ambiguous_wild.io.lock import folder_lock
+    from ambiguous_wild.io.files import check_output, folder_lock, sweep_siblings
     from ambiguous_wild.simulate.capture import simulate
 
     def bar(shots: list) -> tqdm:
@@ -86,7 +85,7 @@ def simulate_command(
         sweep_siblings(output)  # left by a killed call
         facts = simulate(spec, output, seed, depth, overwrite, bar)
         if sheet and not (facts["reused"] and (output / "truth" / "sheet.jpg").is_file()):
-            from ambiguous_wild.harness.pictures.sheets import write_capture_sheet
+            from ambiguous_wild.harness.sheets import write_capture_sheet
 
             write_capture_sheet(output)
     outside = _outside(spec, facts["photos"])
@@ -206,11 +205,10 @@ def composite_command(
 
     from ambiguous_wild.core.config import from_plain
     from ambiguous_wild.core.errors import AwError
-    from ambiguous_wild.io.atomic import check_output, sweep_siblings
-    from ambiguous_wild.io.lock import folder_lock
-    from ambiguous_wild.simulate.composite.composite_photos import composite_photos, is_photo_folder
-    from ambiguous_wild.simulate.composite.composite_scene import composite
-    from ambiguous_wild.simulate.composite.placement import CompositeConfig
+    from ambiguous_wild.io.files import check_output, folder_lock, sweep_siblings
+    from ambiguous_wild.simulate.composite_photos import composite_photos, is_photo_folder
+    from ambiguous_wild.simulate.composite_scene import composite
+    from ambiguous_wild.simulate.placement import CompositeConfig
 
     config = from_plain(CompositeConfig, settings)
     plain = is_photo_folder(source)

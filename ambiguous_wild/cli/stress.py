@@ -74,14 +74,14 @@ def command(
     if style == "json":
         text = json.dumps([o.plain() for o in outcomes], indent=2, allow_nan=False) + "\n"
     elif style == "markdown":
-        from ambiguous_wild.harness.tables.plain_formats import to_markdown
-        from ambiguous_wild.harness.tables.table import text_table
+        from ambiguous_wild.report.plain_formats import to_markdown
+        from ambiguous_wild.report.table import text_table
 
         text = to_markdown([text_table("", table.HEAD, map(table.row, outcomes), words=table.WORDS)])
     else:
         text = "\n".join([table.HEADER, *map(table.to_line, outcomes)]) + "\n"
     if output is not None:
-        from ambiguous_wild.io.atomic import write_text
+        from ambiguous_wild.io.files import write_text
 
         write_text(output, text)
     elif not live:
@@ -104,7 +104,7 @@ def _devices(wanted: str) -> list[str]:
 
 def _replay(run: Path) -> None:
     from ambiguous_wild.cli.options import prepare_cpu
-    from ambiguous_wild.harness.running.replay import replay
+    from ambiguous_wild.harness.replay import replay
 
     prepare_cpu(None)
     result = replay(run)

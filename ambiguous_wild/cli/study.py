@@ -94,7 +94,7 @@ def make_command(
 
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.core.names import is_text
-    from ambiguous_wild.io.atomic import check_output
+    from ambiguous_wild.io.files import check_output
     from ambiguous_wild.study.make import Question, StudySettings, make_study, render_pairs, scene_photos
 
     if not photos_of and runs is None:
@@ -161,8 +161,8 @@ def score_command(
     answers: tuple[Path, ...], key: Path, output: Path | None, seed: int, as_json: bool
 ) -> None:
     """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
-    from ambiguous_wild.io.atomic import check_output, is_record, refuse_files_there
-    from ambiguous_wild.io.atomic import refuse_foreign_files as refuse_strangers
+    from ambiguous_wild.io.files import check_output, is_record, refuse_files_there
+    from ambiguous_wild.io.files import refuse_foreign_files as refuse_strangers
     from ambiguous_wild.study.answers import read_answers, read_key
     from ambiguous_wild.study.report import SCORE_FILES, markdown_of, write_scores
     from ambiguous_wild.study.scores import score

@@ -18,8 +18,8 @@ from ambiguous_wild.cli.options import PathName, metric_file_option, only_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.running.store import Runs
-    from ambiguous_wild.harness.tables.table import Table
+    from ambiguous_wild.harness.store import Runs
+    from ambiguous_wild.report.table import Table
 
 STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
 # Suffix of -o -> format.
@@ -107,11 +107,11 @@ def table_command(
                 raise AwError(
                     f"{flag} does not go with --layout {layout}: give --layout paper, means or memory"
                 )
-    from ambiguous_wild.io.atomic import write_text
+    from ambiguous_wild.io.files import write_text
 
     found = None if layout == "ablation" else _read(runs)
     if sheet is not None and found is not None:
-        from ambiguous_wild.harness.pictures.sheets import write_sheet
+        from ambiguous_wild.harness.sheets import write_sheet
 
         shown = write_sheet(found, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
@@ -133,7 +133,7 @@ def table_command(
 
 
 def _read(runs: Sequence[Path]) -> Runs:
-    from ambiguous_wild.harness.running.store import read_runs
+    from ambiguous_wild.harness.store import read_runs
 
     return read_runs(*runs)
 
@@ -150,7 +150,7 @@ def _style_of(output: Path | None) -> str:
 
 def _width(everything: bool, output: Path | None) -> int | None:
     """Characters that a row of a text table may have; None: any number."""
-    from ambiguous_wild.harness.tables.plain_formats import WIDTH
+    from ambiguous_wild.report.plain_formats import WIDTH
 
     if everything:
         return None
@@ -158,9 +158,9 @@ def _width(everything: bool, output: Path | None) -> int | None:
 
 
 def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
-    from ambiguous_wild.harness.tables.comparison import tidy
-    from ambiguous_wild.harness.tables.plain_formats import to_csv
-    from ambiguous_wild.io.atomic import write_text
+    from ambiguous_wild.io.files import write_text
+    from ambiguous_wild.report.comparison import tidy
+    from ambiguous_wild.report.plain_formats import to_csv
 
     frame = tidy(found, metrics=metrics, scenes=scenes)
     text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
@@ -182,8 +182,8 @@ def _blocks(
     color: bool,
     width: int | None,
 ) -> tuple[str, str]:
-    from ambiguous_wild.harness.tables.papers import cost_at_the_end, in_blocks
-    from ambiguous_wild.harness.tables.plain_formats import fitted, to_wide_csv
+    from ambiguous_wild.report.papers import cost_at_the_end, in_blocks
+    from ambiguous_wild.report.plain_formats import fitted, to_wide_csv
 
     tables = in_blocks(found, metrics=metrics, scenes=scenes)
     if style == "text" and not metrics and width is not None:
@@ -199,15 +199,15 @@ def _blocks(
 
 
 def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
-    from ambiguous_wild.harness.tables.plain_formats import plain
+    from ambiguous_wild.report.plain_formats import plain
 
     for note in dict.fromkeys([note for table in tables for note in table.notes] + [made_by]):
         click.echo(plain(note), err=True)
 
 
 def _written(tables: Sequence[Table], style: str, color: bool) -> str:
-    from ambiguous_wild.harness.tables.plain_formats import to_markdown, to_text
-    from ambiguous_wild.harness.tables.typeset import to_html, to_latex
+    from ambiguous_wild.report.plain_formats import to_markdown, to_text
+    from ambiguous_wild.report.typeset import to_html, to_latex
 
     if style == "text":
         return to_text(tables, color=color)
@@ -224,9 +224,9 @@ def _layouts(
     reported: bool,
     reported_from: Path | None,
 ) -> list[Table]:
-    from ambiguous_wild.harness.ablation.report import ablation
-    from ambiguous_wild.harness.tables import papers
-    from ambiguous_wild.harness.tables.papers import datasets_of, read_reported, with_reported
+    from ambiguous_wild.report import papers
+    from ambiguous_wild.report.ablation import ablation
+    from ambiguous_wild.report.papers import datasets_of, read_reported, with_reported
 
     if found is None:
         return ablation(runs, tuple(metrics))
@@ -246,7 +246,7 @@ def _layouts(
 
 
 def _laid_out(made: list[Table], style: str, made_by: str, color: bool, width: int | None) -> tuple[str, str]:
-    from ambiguous_wild.harness.tables.plain_formats import divided, to_long_csv
+    from ambiguous_wild.report.plain_formats import divided, to_long_csv
 
     told = f"{len(made)} table{'' if len(made) == 1 else 's'}"
     if style == "csv":
@@ -310,7 +310,7 @@ def rescore_command(
     aw table runs
     """
     from ambiguous_wild.harness.measures import load_metrics
-    from ambiguous_wild.harness.rescore import rescore
+    from ambiguous_wild.report.rescore import rescore
 
     for file in metrics:
         load_metrics(file)

@@ -39,7 +39,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     aw try walk.mp4 -o out --budget 15m
     """
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.harness.running.store import known_iterations
+    from ambiguous_wild.harness.store import known_iterations
 
     begin, seconds = time.monotonic(), parse_budget(budget)
     photos, scene, runs, plan = (output / name for name in ("photos", "scene", "runs", "plan.json"))
@@ -105,7 +105,7 @@ def _minutes(seconds: float) -> str:
 def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
     """How many iterations both methods can train in this time, measured here; told with its time."""
     from ambiguous_wild.cli.options import prepare_cpu
-    from ambiguous_wild.harness.running.timing import expected_s, slowness
+    from ambiguous_wild.harness.timing import expected_s, slowness
     from ambiguous_wild.io.scene_folder import load_scene
 
     prepare_cpu(threads)

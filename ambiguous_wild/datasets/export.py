@@ -16,9 +16,9 @@ from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import without_suffix
 from ambiguous_wild.datasets.photos import link_file
 from ambiguous_wild.io import motion_points
-from ambiguous_wild.io.atomic import atomic_dir, check_output
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.files import atomic_dir, check_output
 from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene, model_folder

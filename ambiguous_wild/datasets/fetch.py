@@ -27,8 +27,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.builder.workspace import build_lock
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io.archive import extract
-from ambiguous_wild.io.atomic import check_output, write_json
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import check_output, sha256_file, write_json
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 CATALOGUE = Path(__file__).with_name("public.yaml")

@@ -32,9 +32,9 @@ from ambiguous_wild.datasets.photos import (
 from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_points, triangulate
 from ambiguous_wild.datasets.readers import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
-from ambiguous_wild.io.atomic import check_output, refuse_foreign_files, sweep, write_json, write_text
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.files import check_output, refuse_foreign_files, sweep, write_json, write_text
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"

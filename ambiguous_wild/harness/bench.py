@@ -22,18 +22,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.harness.callbacks import Callbacks as Callbacks
+from ambiguous_wild.harness.callbacks import Engine as Engine
+from ambiguous_wild.harness.callbacks import Lines as Lines
 from ambiguous_wild.harness.measures import load_metrics, try_own
-from ambiguous_wild.harness.running.callbacks import Callbacks as Callbacks
-from ambiguous_wild.harness.running.callbacks import Engine as Engine
-from ambiguous_wild.harness.running.callbacks import Lines as Lines
-from ambiguous_wild.harness.running.engines.session import Session
+from ambiguous_wild.harness.session import Session
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.planning.decide import Plan
-    from ambiguous_wild.harness.running.cell import Cell, CellReport, Outcome, Overwrite, Protocol
-    from ambiguous_wild.harness.running.result_file import RunResult
-    from ambiguous_wild.harness.running.store import Runs
-    from ambiguous_wild.harness.showing.read import Viewer
+    from ambiguous_wild.harness.cell import Cell, CellReport, Outcome, Overwrite, Protocol
+    from ambiguous_wild.harness.effects_plan import Plan
+    from ambiguous_wild.harness.models import Viewer
+    from ambiguous_wild.harness.result_file import RunResult
+    from ambiguous_wild.harness.store import Runs
 
 Place = Literal["mask", "density", "regulariser"]
 Words = str | Path
@@ -71,7 +71,7 @@ class RunReport:
 
     def mean(self, metric: str) -> float | None:
         """Mean of an image metric over the test views, of the finite values; None where any is missing."""
-        from ambiguous_wild.harness.running.result_file import mean_of
+        from ambiguous_wild.harness.result_file import mean_of
 
         mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
@@ -85,7 +85,7 @@ class RunReport:
         Raises:
             AwError: the run has no model, or its scene is not where it was.
         """
-        from ambiguous_wild.harness.showing.read import Viewer
+        from ambiguous_wild.harness.models import Viewer
 
         return Viewer([self.folder], height=height)
 
@@ -121,13 +121,13 @@ class BenchReport:
         Args:
             folder: one of `folders`; None = the first.
         """
-        from ambiguous_wild.harness.running.store import read_runs
+        from ambiguous_wild.harness.store import read_runs
 
         return read_runs(self.folders[0] if folder is None else folder)
 
     def show(self, height: int = 640) -> Viewer:
         """The page of `aw view` with every model side by side, for a notebook; see `RunReport.show`."""
-        from ambiguous_wild.harness.showing.read import Viewer
+        from ambiguous_wild.harness.models import Viewer
 
         return Viewer([run.folder for run in self.runs if run.outcome != "failed"], height=height)
 
@@ -212,10 +212,9 @@ def bench(
         raise AwError("iterations and budgets_s exclude each other: a run is as long as one of them says")
     out = Path(output)
     with Session(where, threads, told) as session:
-        from ambiguous_wild.harness.running.cell import RunOptions
-        from ambiguous_wild.harness.running.engines.job import read_sources
-        from ambiguous_wild.harness.running.external import check_program
-        from ambiguous_wild.harness.running.grid import (
+        from ambiguous_wild.harness.cell import RunOptions
+        from ambiguous_wild.harness.external import check_program
+        from ambiguous_wild.harness.grid import (
             Probing,
             check_grafts,
             expected_line,
@@ -225,8 +224,9 @@ def bench(
             try_recipes,
             unfinished,
         )
-        from ambiguous_wild.harness.running.training import check_passes
-        from ambiguous_wild.io.atomic import check_output
+        from ambiguous_wild.harness.job import read_sources
+        from ambiguous_wild.harness.training import check_passes
+        from ambiguous_wild.io.files import check_output
         from ambiguous_wild.splat.calibration import prepare_cpu
         from ambiguous_wild.splat.pace import TrainConfig
 
@@ -325,7 +325,7 @@ def _check_methods(
 def _check_effects(
     choices: Sequence[str], plan: Plan | Words | None, scenes: Sequence[Path], methods: Sequence[str]
 ) -> None:
-    from ambiguous_wild.harness.running.choosing import check_wanted, takes_effects
+    from ambiguous_wild.harness.choosing import check_wanted, takes_effects
     from ambiguous_wild.methods.registry import get_method
 
     for wanted in choices:
@@ -345,14 +345,14 @@ def _check_effects(
 def _read_plan(plan: Plan | Words | None) -> Plan | None:
     if not isinstance(plan, str | Path):
         return plan
-    from ambiguous_wild.harness.planning.decide import read_plan
+    from ambiguous_wild.harness.effects_plan import read_plan
 
     return read_plan(Path(plan))
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
     """Effects that are on, who cannot take them, warnings of the scenes; each once."""
-    from ambiguous_wild.harness.running.choosing import NOT_OURS, takes_effects
+    from ambiguous_wild.harness.choosing import NOT_OURS, takes_effects
 
     lines = []
     on = dict.fromkeys((c.scene.name, c.chosen.effects) for c in cells if c.chosen.effects)
@@ -369,7 +369,7 @@ def _rescorable(made: BenchReport, metrics: Sequence[Words] = ()) -> str:
     kept = [run.result for run in made.runs if run.outcome in ("kept", "skipped") and run.result is not None]
     if not metrics and not any(result["missing"] for result in kept):
         return ""
-    from ambiguous_wild.harness.rescore import could_be_measured
+    from ambiguous_wild.harness.store import could_be_measured
 
     names = could_be_measured(kept)
     command = shlex.join(["aw", "rescore", str(made.output), *(f"--metric-file={file}" for file in metrics)])
@@ -379,8 +379,8 @@ def _rescorable(made: BenchReport, metrics: Sequence[Words] = ()) -> str:
 
 
 def _run_report(cell: Cell, report: CellReport) -> RunReport:
-    from ambiguous_wild.harness.running.result_file import RESULT, read_result
-    from ambiguous_wild.harness.running.run import is_finished
+    from ambiguous_wild.harness.result_file import RESULT, read_result
+    from ambiguous_wild.harness.run import is_finished
 
     result = report.result
     if result is None and report.outcome != "failed" and is_finished(report.folder):

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any, Literal, Required, TypedDict, cast, get_a
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods.entry import resolve
-from ambiguous_wild.methods.plugin_file import import_file, place_of
+from ambiguous_wild.methods.references import import_file, place_of
 
 if TYPE_CHECKING:
     from ambiguous_wild.core import Scene
@@ -84,7 +84,7 @@ def _psnr(key: str, label: str, function: str, **more: Any) -> Metric:
 
 
 def _region(key: str, label: str, tolerance: float = 1e-6) -> Metric:
-    function = f"ambiguous_wild.harness.running.regions:{key}"
+    function = f"ambiguous_wild.harness.regions:{key}"
     return _psnr(key, label, function, needs=("photo", "view", "scene"), partial=True, tolerance=tolerance)
 
 

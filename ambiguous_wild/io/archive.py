@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_dir
+from ambiguous_wild.io.files import atomic_dir
 
 _CHUNK = 1 << 20
 _HEADER = 4 << 20  # bytes that all headers of one tar member may have

@@ -16,7 +16,6 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Points, View
-from ambiguous_wild.io.atomic import atomic_path
 from ambiguous_wild.io.colmap_records import (
     FOCAL_RANGE,
     LARGEST_COORDINATE,
@@ -31,6 +30,7 @@ from ambiguous_wild.io.colmap_records import (
     model_of_id,
     points_without_tracks,
 )
+from ambiguous_wild.io.files import atomic_path
 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.files import atomic_path
 
 # Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
 MAX_PIXELS = 120_000_000

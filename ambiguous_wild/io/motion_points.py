@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.files import atomic_path
 
 FILE = "motion.npz"  # in the scene's folder
 _MOST_BYTES = 1 << 28  # unpacked: a thousand photos have about 2e7

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.core.errors import AwError, install_command
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
 from ambiguous_wild.io.images import MAX_PIXELS, pillow
 

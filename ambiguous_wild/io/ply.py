@@ -11,7 +11,7 @@ from typing import IO
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, Place
-from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.files import atomic_path
 
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
 _TYPES = {

@@ -17,7 +17,7 @@ from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split, centred, far_cameras
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model, ModelImage
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import image_size
 
 SCENE_SCHEMA = 1  # of scene.json; raised when a reader of the old one would be wrong

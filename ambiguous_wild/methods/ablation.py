@@ -1,6 +1,8 @@
 """Ablations as data: a method lists the settings to vary, `aw ablate` trains and tabulates them.
 
 Imports nothing heavy: `aw ablate --list` shows them without torch.
+
+The paper's plug-in table: RefineSplat's masks, by three thresholds, in methods with appearance.
 """
 
 from __future__ import annotations
@@ -87,3 +89,27 @@ def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) ->
         if name not in known:
             raise unknown(f"group of {method}'s ablations", name, known, "'aw ablate --list' shows them")
     return tuple(group for group in groups if not names or group.name in names)
+
+
+def plug_in(host: str) -> tuple[Group, ...]:
+    """The host's group; its default row has the masks that it comes with, or none."""
+    grafted = f"{host}@mask=refinesplat"
+    return (
+        Group(
+            "plug-in",
+            f"Entropy-aware masks in {host}",
+            (
+                Variant("m-final", method=grafted, text="masks as RefineSplat makes them here"),
+                Variant("t-hard", ("mask.mask.threshold=hard",), "a fixed threshold", method=grafted),
+                Variant(
+                    "t-statistics", ("mask.mask.threshold=statistics",), "mean and deviation", method=grafted
+                ),
+                Variant("t-ent", ("mask.mask.threshold=kapur",), "by entropy", method=grafted),
+            ),
+            "Tab. ablation of the threshold with existing methods",
+        ),
+    )
+
+
+GSW = plug_in("gs-w")
+WILDGAUSSIANS = plug_in("wildgaussians")

@@ -4,28 +4,74 @@ Its form with two models is `asymgs_twin.py`.
 Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding)
 and instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map,
 not its gradient; the base is 3DGS without Mip-Splatting's filters and growth.
+
+A slow average of the model, carried with every Gaussian: a teacher that density control keeps in step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.methods.dronesplat import nearest, unit_range
-from ambiguous_wild.methods.robustsplat.supervision import residual, resized
-from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.base import RowAdam
-from ambiguous_wild.splat.effects.slow import SlowAverage, SlowDensity, slow_gaussians
+from ambiguous_wild.methods.masking_common import residual, resized
+from ambiguous_wild.splat.density import DensityConfig, DensityControl
+from ambiguous_wild.splat.effects.base import Effect, RowAdam
+from ambiguous_wild.splat.field import GaussianAttribute
+from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
-from ambiguous_wild.vision.mask_ops import standing, unsupported
+from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
+
+
+class SlowAverage(Effect):
+    """p_slow = keep p_slow + (1 - keep) p of the raw parameters, after every step."""
+
+    name = "slow-average"
+
+    def __init__(self, keep: float) -> None:
+        self.share = 1.0 - keep
+
+    def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
+        return {slow(name): GaussianAttribute(tensor.clone()) for name, tensor in gaussians.items()}
+
+    @torch.no_grad()
+    def after_step(self, step: Step, gaussians: Gaussians) -> None:
+        gaussians.settle()
+        for name, tensor in gaussians.items():
+            gaussians.extra[slow(name)].lerp_(tensor, self.share)
+
+
+class SlowDensity(DensityControl):
+    """The average of a split's child lies where the child lies and is as large; the rest is the parent's."""
+
+    def _split_half(self, parents: Gaussians) -> Gaussians:
+        child = super()._split_half(parents)
+        for name in ("means", "log_scales"):
+            if slow(name) in child.extra:
+                child.extra[slow(name)].copy_(getattr(child, name))
+        return child
+
+
+def slow(name: str) -> str:
+    """Under which name a parameter's average is carried."""
+    return f"slow_{name}"
+
+
+def slow_gaussians(gaussians: Gaussians) -> Gaussians | None:
+    """The average as a model of its own; None where it is not carried. Its tensors are those of `extra`."""
+    if slow("means") not in gaussians.extra:
+        return None
+    found: dict[str, Any] = {name: gaussians.extra[slow(name)] for name in PARAMETERS}
+    return Gaussians(**found)
 
 
 @dataclass(frozen=True)
@@ -65,7 +111,7 @@ class AsymMask(MaskPolicy):
         self.labels = [torch.from_numpy(labels).to(data.device) for labels in left]
         self.soft = [RowAdam(torch.ones(1, *x.shape, device=data.device)) for x in self.labels]
 
-    def losses_read(self) -> SlowAverage | None:
+    def loss_effect(self) -> SlowAverage | None:
         return self.average
 
     def keep(self, step: Step) -> Tensor:
@@ -96,7 +142,7 @@ class AsymMask(MaskPolicy):
         error = residual(step.photo, step.rendered.image)
         suspect = error > torch.quantile(error, self.config.colour)
         suspect &= distance > torch.quantile(distance, self.config.feature)
-        return standing(nearest(self.labels[step.view], *size), suspect)
+        return keep_unsuspicious(nearest(self.labels[step.view], *size), suspect)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
         if step.nominal <= self.config.warm_up or not (teacher := slow_gaussians(step.gaussians)):

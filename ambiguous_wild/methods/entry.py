@@ -13,7 +13,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.ablation import Group
 
 if TYPE_CHECKING:
-    from ambiguous_wild.methods.external.program import Program
+    from ambiguous_wild.methods.external_process import Program
     from ambiguous_wild.splat.parts import Parts
 
 

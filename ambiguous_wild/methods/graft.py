@@ -193,7 +193,7 @@ def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tup
 
 def compose(mask: Any, regulariser: Any) -> Any:
     """One policy of two: keep maps of `mask`, cotangents of `regulariser`."""
-    from ambiguous_wild.methods.grafted_policy import GraftedPolicy
+    from ambiguous_wild.methods.given_masks import GraftedPolicy
 
     if regulariser is mask:
         return mask

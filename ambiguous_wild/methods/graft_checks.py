@@ -99,7 +99,7 @@ def _check_effects(host: Member, donors: Mapping[str, Member]) -> None:
     effects, mask = donor.parts.effects, donors.get("mask", host).parts.mask
     if not effects or donor.parts is host.parts:
         return
-    if not any(effect is mask.reads() or any(map(effect.acts, _SEEN)) for effect in effects):
+    if not any(effect is mask.required_effect() or any(map(effect.acts, _SEEN)) for effect in effects):
         raise AwError(
             f"effects={donor.name} would change no picture: the effects of {donor.name} serve its own "
             f"fields, which a graft does not take; use {donor.name} as the host, or write effects=none"
@@ -112,16 +112,16 @@ def _check_what_is_read(host: Member, donors: Mapping[str, Member]) -> None:
     def lacks(effect: Effect | None) -> bool:
         return effect is not None and not any(effect is other for other in taken)
 
-    if host.parts.fields is not None and lacks(host.parts.fields.reads()):
+    if host.parts.fields is not None and lacks(host.parts.fields.required_effect()):
         raise AwError(
             f"the fields of {host.name} need its effects, which effects={donors['effects'].name} replaces: "
             f"leave effects={donors['effects'].name} out"
         )
     unfit = {}  # method whose masks or losses need effects that are not there, by place
     masking, losing = donors.get("mask", host), donors.get("regulariser", host)
-    if lacks(masking.parts.mask.reads()):
+    if lacks(masking.parts.mask.required_effect()):
         unfit["mask"] = masking
-    if losing.parts.mask.regularises() and lacks(losing.parts.mask.losses_read()):
+    if losing.parts.mask.regularises() and lacks(losing.parts.mask.loss_effect()):
         unfit["regulariser"] = losing
     for place, owner in unfit.items():
         what = "masks" if place == "mask" else "losses"

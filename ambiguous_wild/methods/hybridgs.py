@@ -97,7 +97,7 @@ class Uncovered(MaskPolicy):
     def __init__(self, plane: Plane) -> None:
         self.plane, self.config, self.shares = plane, plane.config, MaskedShares()
 
-    def reads(self) -> Plane:
+    def required_effect(self) -> Plane:
         return self.plane
 
     def setup(self, data: TrainData) -> None:

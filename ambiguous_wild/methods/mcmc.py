@@ -86,8 +86,8 @@ class McmcDensity(DensityControl):
         g, events = super().refine(step, gaussians, optimiser)
         noise = torch.from_numpy(self.rng.standard_normal((len(g), 3), dtype=np.float32)).to(g.device)
         gate = torch.sigmoid(100 * (0.005 - torch.sigmoid(g.opacity_logits)))
-        if self.spares is not None:
-            gate[self.spares(g.means)] = 0.0
+        if self.protected is not None:
+            gate[self.protected(g.means)] = 0.0
         half = rotation_matrices(g.quats) * g.log_scales.exp()[:, None, :]  # covariance = half half^T
         pushed = noise * (gate * self.config.noise * optimiser.rates["means"])[:, None]
         g.means += (half @ (half.mT @ pushed[:, :, None])).squeeze(2)
@@ -97,7 +97,9 @@ class McmcDensity(DensityControl):
         return True  # noise in every step
 
     def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
-        free = self.free(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians)
+        free = self.mutable_rows(
+            torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians
+        )
         if not bool(free.any()):
             return gaussians
         dead = (torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity) & free

@@ -17,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.palette import MASKED, faded, tint
-from ambiguous_wild.methods.fixed_masks import FixedMasks
+from ambiguous_wild.methods.given_masks import FixedMasks
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances

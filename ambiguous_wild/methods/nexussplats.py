@@ -22,14 +22,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.feature_distance import FeatureDistance
 from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform
-from ambiguous_wild.methods.wildgaussians import fourier
+from ambiguous_wild.methods.wildgaussians import FeatureDistance, fourier
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import directions, in_picture
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.parts import Parts, State
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
@@ -108,14 +107,14 @@ class Codes(Learnt):
         }
         return photos | {name: replace(leaf, made_for=NOMINAL_ITERATIONS) for name, leaf in nets.items()}
 
-    def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
+    def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
         light = fourier(gaussians.means, self.points)
         noise = 1e-4 * np.random.default_rng([self.seed, 0x4E]).normal(size=tuple(light.shape))
         light = light + torch.from_numpy(noise.astype(np.float32)).to(light.device)
         doubt = torch.zeros(len(gaussians), CODE, device=gaussians.device)
         return {
-            "nexus_light": Row(light, self.config.lr_light),
-            "nexus_doubt": Row(doubt, self.config.lr_code),
+            "nexus_light": GaussianAttribute(light, self.config.lr_light),
+            "nexus_doubt": GaussianAttribute(doubt, self.config.lr_code),
         }
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
@@ -147,7 +146,7 @@ class Doubt(WarmUpMask):
         self.shares = MaskedShares()
         self.pending: Gradients | None = None  # of the step under way
 
-    def reads(self) -> Codes:
+    def required_effect(self) -> Codes:
         return self.codes
 
     def setup(self, data: TrainData) -> None:

@@ -82,10 +82,10 @@ class PupDensity(DensityControl):
         share = 1.0 - (1.0 - config.share) ** (1.0 / config.rounds)
         score = log_det(self.blocks(step, gaussians))
         drop = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
-        free = self.free(~drop, gaussians)
+        free = self.mutable_rows(~drop, gaussians)
         if bool(free.any()):
             drop[free] = removed(score[free], share)  # the share is of those that may be removed
-        if self.empties(drop, gaussians):
+        if self.leaves_only_protected(drop, gaussians):
             return gaussians, events
         optimiser.flush()
         self._match(gaussians)

@@ -12,12 +12,11 @@ import importlib.metadata
 from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
-from ambiguous_wild.methods.plugin_file import import_file
-from ambiguous_wild.methods.references import is_reference, read_reference, without_recipe
+from ambiguous_wild.methods.references import import_file, is_reference, read_reference, without_recipe
 from ambiguous_wild.methods.second_pass import second_pass, trained_once
 
 __all__ = [

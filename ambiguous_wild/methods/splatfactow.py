@@ -20,12 +20,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.robustsplat.net import enlarged
+from ambiguous_wild.methods.mask_net import enlarged
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import directions, harmonics, ray_directions
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
@@ -100,9 +100,13 @@ class SplatfactoColours(Learnt):
                 found[key] = replace(leaf, values=values, final=final)
         return found
 
-    def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
+    def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
         zeros = torch.zeros(len(gaussians), FEATURE, device=gaussians.device)
-        return {"splatfacto_feature": Row(zeros, self.config.lr_feature, self.config.lr_feature / 20)}
+        return {
+            "splatfacto_feature": GaussianAttribute(
+                zeros, self.config.lr_feature, self.config.lr_feature / 20
+            )
+        }
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         photo = leaf["photo"].expand(len(visible.means), PHOTO)
@@ -141,7 +145,7 @@ class TrimmedLoss(MaskPolicy):
         self.low: float | Tensor = 1.0
         self.rounds = 0
 
-    def reads(self) -> SplatfactoColours:
+    def required_effect(self) -> SplatfactoColours:
         return self.effect
 
     def setup(self, data: TrainData) -> None:

@@ -20,9 +20,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, annealed, sampled, upsampled
-from ambiguous_wild.methods.robustsplat.net import adam_of, adam_state, load_adam_state
-from ambiguous_wild.methods.robustsplat.supervision import calibrated, resized
+from ambiguous_wild.methods.mask_net import adam_of, adam_state, load_adam_state
+from ambiguous_wild.methods.masking_common import (
+    MaskedShares,
+    PausingMask,
+    annealed,
+    calibrated,
+    resized,
+    sampled,
+    upsampled,
+)
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
 from ambiguous_wild.splat.parts import Parts, Schedule, State

@@ -12,6 +12,8 @@ starts from unchanged colours; D-SSIM is of the toned picture (one render a step
 Gaussians only; a test photo's embedding is fitted without masks. Sky, 3D filter and growth are not part of
 it.
 Cost: features of every render.
+
+How far the features of a photo are from those of its render: what uncertainties are learnt from.
 """
 
 from __future__ import annotations
@@ -27,17 +29,59 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.feature_distance import FeatureDistance
-from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, hashed_uniform
-from ambiguous_wild.methods.robustsplat.net import adam_of, adam_state, load_adam_state
-from ambiguous_wild.methods.robustsplat.supervision import resized
-from ambiguous_wild.splat.effects.base import hurried
+from ambiguous_wild.methods.mask_net import adam_of, adam_state, load_adam_state
+from ambiguous_wild.methods.masking_common import (
+    MaskedShares,
+    PausingMask,
+    calibrated,
+    hashed_uniform,
+    resized,
+    upsampled,
+)
+from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
-from ambiguous_wild.vision.backends import check_features
+from ambiguous_wild.vision.backends import check_features, make_features
+from ambiguous_wild.vision.precompute import photo_features
+
+
+class FeatureDistance:
+    """WildGaussians' distance: clip(2 - 2 cosine, 0, 1), 1 from a cosine of 0.5 down."""
+
+    def __init__(self, features: str, normal_units: float) -> None:
+        """
+        Args:
+            features: see vision/backends.py.
+            normal_units: of hand-made features: the distance, in units of what blur alone makes, that is 1.
+
+        Raises:
+            AwError: unknown features, or their weights are missing.
+        """
+        self.features = make_features(features)
+        self.normal_units = normal_units if features.startswith("labhog") else None
+
+    @property
+    def name(self) -> str:
+        return self.features.name
+
+    def setup(self, data: TrainData) -> None:
+        self.cameras = data.cameras
+        self.features.fit(data.photos)
+        self.photos = photo_features(self.features, data.photos, data.cache_dir)  # [h, w, C] each
+
+    @torch.no_grad()
+    def __call__(self, step: Step) -> Tensor:
+        """[H, W] at the size of the step's photo."""
+        full = self.cameras[step.view]  # not the photo, which may not be on the device
+        seen = self.features(upsampled(step.rendered.image.detach(), full.height, full.width))
+        cosine = F.cosine_similarity(self.photos[step.view], seen, dim=2)
+        if self.normal_units is not None:
+            cosine = calibrated(cosine, self.features.unit, self.normal_units)
+        return resized((2.0 - 2.0 * cosine).clamp(0.0, 1.0), *step.photo.shape[:2])
+
 
 PHOTO, OCTAVES = 32, 4  # of the photo's embedding; of the Fourier features that the Gaussians' start from
 GAUSSIAN = 6 * OCTAVES
@@ -99,11 +143,11 @@ class WildAppearance(Learnt):
         net = mlp_leaves("net", widths, rng, self.config.lr_net)
         return {"photo": Leaf(start, self.config.lr_photo, per_photo=True), **net}
 
-    def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
+    def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
         start = fourier(gaussians.means, self.points)
         noise = 1e-4 * np.random.default_rng([self.seed, 0x36]).normal(size=tuple(start.shape))
         start += torch.from_numpy(noise.astype(np.float32)).to(start.device)
-        return {"wild_embedding": Row(start, self.config.lr_gaussian)}
+        return {"wild_embedding": GaussianAttribute(start, self.config.lr_gaussian)}
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         photo = leaf["photo"].expand(len(visible.base), PHOTO)
@@ -198,7 +242,7 @@ class Uncertainty(PausingMask):
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
         for group in self.optimiser.param_groups:
-            group["lr"] = hurried(c.lr_head, NOMINAL_ITERATIONS, step)
+            group["lr"] = rate_for_run_length(c.lr_head, NOMINAL_ITERATIONS, step)
         self.optimiser.step()
 
     def facts(self) -> dict[str, Any]:

@@ -8,16 +8,18 @@ from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import CYLINDER, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.things import circle_of, parts_of, shapes_of_thing
 from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
     baked_sheets,
     box,
+    circle_of,
     ground_and_sky,
+    parts_of,
     poster,
     shade_feet,
+    shapes_of_thing,
     sunlight,
     surface,
 )

@@ -15,9 +15,8 @@ from ambiguous_wild.simulate.image_effects import specular
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor, GroundPlan
-from ambiguous_wild.simulate.things import car, placard, statue
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
-from ambiguous_wild.simulate.world import World
+from ambiguous_wild.simulate.world import World, car, placard, statue
 
 _TRIES = 80  # layouts drawn for a photo, of which the best is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place

@@ -11,17 +11,20 @@ from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID, PLANAR, QUAD
 from ambiguous_wild.simulate.shapes import Shape, between, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.things import circle_of, parts_of, shapes_of_thing, statue
 from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
     baked_sheets,
     box,
+    circle_of,
     ground_and_sky,
     on_wall,
+    parts_of,
     poster,
     shade_feet,
+    shapes_of_thing,
+    statue,
     sunlight,
     wall,
 )

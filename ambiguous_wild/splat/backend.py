@@ -4,6 +4,8 @@ A run holds one of the two (`TrainData.backend`), and `backend_of` gives that of
 between them is a call here, so that effects and methods are written once. Tests run the GPU's calls on the
 CPU, as numbers by letting `device.accelerated` say yes to every device, and without numbers on torch's `meta`
 device, where whatever would make the host wait raises.
+
+Devices: whether what lies on one is left to a GPU, and waiting for it; `backend.py` is what differs.
 """
 
 from __future__ import annotations
@@ -15,9 +17,20 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat import device as devices
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, NEEDS, Rendered
+
+
+def accelerated(device: torch.device | str) -> bool:
+    """Whether what lies there is left to torch and gsplat; reading it back makes the host wait."""
+    return torch.device(device).type != "cpu"
+
+
+def wait(device: torch.device | str) -> None:
+    """Until what was launched there is done; elsewhere than on a GPU it is already."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+
 
 Photometric = tuple[float | Tensor, float | Tensor, Tensor]  # L1, 1 - SSIM, gradient [H, W, 3] of their mix
 _LANES = 64  # sums a label while a GPU adds up
@@ -144,26 +157,26 @@ class GpuBackend(Backend):
     kernels = reads_at_once = same_bits = False
 
     def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
-        from ambiguous_wild.splat.gpu.render import render_cuda
+        from ambiguous_wild.splat.gpu_render import render_cuda
 
         return render_cuda(gaussians, camera, **options)
 
     def photometric(
         self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
     ) -> Photometric:
-        from ambiguous_wild.splat.gpu.kernels import photometric_fused
+        from ambiguous_wild.splat.gpu_kernels import photometric_fused
 
         return photometric_fused(render, photo, keep, lambda_dssim, weighting)
 
     def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
-        from ambiguous_wild.splat.gpu.kernels import ssim_map_fused
+        from ambiguous_wild.splat.gpu_kernels import ssim_map_fused
 
         return ssim_map_fused(a, b)
 
     def prepare_loss(
         self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
     ) -> None:
-        from ambiguous_wild.splat.gpu.kernels import prepare
+        from ambiguous_wild.splat.gpu_kernels import prepare
 
         prepare(device, sizes, lambda_dssim, weighting)
 
@@ -188,7 +201,7 @@ class GpuBackend(Backend):
         return bool(torch.isfinite(torch.stack([tensor.sum() for tensor in tensors])).all())
 
     def max_alpha(self, device: torch.device | str) -> float:
-        from ambiguous_wild.splat.gpu.gsplat_seam import max_alpha
+        from ambiguous_wild.splat.gsplat_seam import max_alpha
 
         return max_alpha(str(device))
 
@@ -207,7 +220,7 @@ class GpuBackend(Backend):
         return (values * inside.reshape(-1, *[1] * (values.dim() - 1))).sum() / seen.clamp(min=1.0)
 
     def neighbours(self, points: Tensor, count: int) -> Tensor:
-        from ambiguous_wild.splat.gpu.nearest import nearest
+        from ambiguous_wild.splat.gpu_kernels import nearest
 
         return nearest(points, count)
 
@@ -220,7 +233,7 @@ class GpuBackend(Backend):
         return sums.reshape(count, _LANES).sum(dim=1)
 
     def pose(self, camera: Camera, like: Tensor) -> Tensor:
-        from ambiguous_wild.splat.gpu.render import on_device
+        from ambiguous_wild.splat.gpu_render import on_device
 
         return on_device(camera, like.device).viewmat[0]
 
@@ -233,4 +246,4 @@ _CPU, _GPU = Backend(), GpuBackend()
 
 def backend_of(device: torch.device | str) -> Backend:
     """The back end that computes with tensors on this device."""
-    return _GPU if devices.accelerated(device) else _CPU
+    return _GPU if accelerated(device) else _CPU

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat import device as devices
+from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import one_thread
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
@@ -82,7 +82,7 @@ class Calibration:
         if self.device.type != "cuda":
             begin = time.perf_counter()
             self._steps(self.size.steps)
-            devices.wait(self.device)
+            backend.wait(self.device)
             return time.perf_counter() - begin
         first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         first.record()

@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.files import atomic_path
 
 FORMAT = "ambiguous_wild/1"
 _TENSOR = "@tensor"  # stands in the plain tree where a tensor was

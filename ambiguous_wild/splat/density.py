@@ -94,7 +94,7 @@ class DensityControl:
         self.resets_done = 0
         self.log = DensityLog()  # for pictures; decides nothing
         # of means [N, 3] the rows [N] that are neither copied nor removed: an effect's; None = there are none
-        self.spares: Callable[[Tensor], Tensor] | None = None
+        self.protected: Callable[[Tensor], Tensor] | None = None
         self._halves: dict[tuple[int, int], Tensor] = {}
 
     def setup(self, data: TrainData) -> None:
@@ -154,23 +154,25 @@ class DensityControl:
             events.append("reset")
         return gaussians, events
 
-    def free(self, rows: Tensor, gaussians: Gaussians) -> Tensor:
+    def mutable_rows(self, rows: Tensor, gaussians: Gaussians) -> Tensor:
         """[N] bool: of these rows those that may be copied and removed."""
-        return rows if self.spares is None else rows & ~self.spares(gaussians.means)
+        return rows if self.protected is None else rows & ~self.protected(gaussians.means)
 
-    def empties(self, drop: Tensor, gaussians: Gaussians) -> bool:
+    def leaves_only_protected(self, drop: Tensor, gaussians: Gaussians) -> bool:
         """Whether nothing but spared rows would stay: such a model cannot learn again, so all rows stay."""
-        return not bool(self.free(~drop, gaussians).any())
+        return not bool(self.mutable_rows(~drop, gaussians).any())
 
     def weights(self, gaussians: Gaussians) -> Tensor:
         """[N] of a mean over the Gaussians, for losses on them: the spared ones count nothing."""
-        free = self.free(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians)
+        free = self.mutable_rows(
+            torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians
+        )
         return free / free.sum().clamp(min=1)
 
     def _ignore_spared(self, gaussians: Gaussians) -> None:
         """As if no view had seen the spared rows since the last round."""
-        if self.spares is not None:
-            rows = self.spares(gaussians.means)
+        if self.protected is not None:
+            rows = self.protected(gaussians.means)
             for name in self.sums:
                 getattr(self, name)[rows] = 0.0
 
@@ -269,8 +271,8 @@ class DensityControl:
         drop = torch.sigmoid(gaussians.opacity_logits) < config.prune_opacity
         if self.last_reset:
             drop |= gaussians.log_scales.exp().amax(dim=1) > config.prune_scale * self.extent
-        drop = self.free(drop, gaussians) | ~torch.isfinite(gaussians.means).all(dim=1)
-        if not bool(drop.any()) or self.empties(drop, gaussians):
+        drop = self.mutable_rows(drop, gaussians) | ~torch.isfinite(gaussians.means).all(dim=1)
+        if not bool(drop.any()) or self.leaves_only_protected(drop, gaussians):
             return gaussians
         self.log.now.pruned += int(drop.sum())
         return self.keep_rows(gaussians, optimiser, ~drop)

@@ -19,7 +19,7 @@ from ambiguous_wild.splat.rendered import Gradients, Rendered, Shade, check_need
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
 
-class Drawing:
+class SceneRenderer:
     """Draws for one run, and holds the fields beside the static one."""
 
     def __init__(self, data: TrainData, parts: Parts, static: Field, effects: Chain | None) -> None:
@@ -53,7 +53,7 @@ class Drawing:
         if start.density is not None:
             check_needs(start.density.needs, data.backend.statistics)
             start.density.setup(data)
-            start.density.spares = None if self.effects is None else self.effects.spares()
+            start.density.protected = None if self.effects is None else self.effects.protected()
 
     # -- pictures ---------------------------------------------------------------------------------
 
@@ -101,9 +101,9 @@ class Drawing:
         fields = self.parts.fields
         if fields is None or shot.view is None:
             return rendered
-        bent = {name: fields.bend(name, self.others[name].gaussians, shot) for name in fields.drawn(shot)}
+        bent = {name: fields.deform(name, self.others[name].gaussians, shot) for name in fields.drawn(shot)}
         drawn = {
-            name: self._draw(gaussians.settling_like(self.others[name].gaussians), shot, None)
+            name: self._draw(gaussians.share_pending_updates(self.others[name].gaussians), shot, None)
             for name, (gaussians, _) in bent.items()
         }
         pulls = {name: pull for name, (_, pull) in bent.items()}

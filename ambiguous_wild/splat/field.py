@@ -19,7 +19,7 @@ Rates = Callable[[float], Mapping[str, float]]  # learning rate of every tensor 
 
 
 @dataclass(frozen=True)
-class Row:
+class GaussianAttribute:
     """What one method carries with every Gaussian."""
 
     values: Tensor  # [N, ...] float32
@@ -82,7 +82,7 @@ class Field:
             self.density.load_state_dict(state["density"])
 
 
-def rates_with(rows: Mapping[str, Row], rates: Rates) -> Rates:
+def rates_with(rows: Mapping[str, GaussianAttribute], rates: Rates) -> Rates:
     """Learning rates of the parameters and of what is carried beside them."""
     learnt = {name: row for name, row in rows.items() if row.rate > 0}
     if not learnt:

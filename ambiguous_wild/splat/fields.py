@@ -59,7 +59,7 @@ class Fields(ABC):
             rates: the first field's learning rates.
         """
 
-    def reads(self) -> Effect | None:
+    def required_effect(self) -> Effect | None:
         """The effect of their method that they cannot work without; a graft that lacks it is refused."""
         return None
 
@@ -67,7 +67,7 @@ class Fields(ABC):
         """Fields that take part in this picture beside the static one; only asked for train photos."""
         return ()
 
-    def bend(self, name: str, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+    def deform(self, name: str, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
         """A field's Gaussians as they are drawn for this picture, and the pull to those that learn."""
         return gaussians, lambda gradients: gradients
 

@@ -111,7 +111,7 @@ class Gaussians:
         if self.postponed is not None:
             self.postponed.make()
 
-    def settling_like(self, source: Gaussians) -> Gaussians:
+    def share_pending_updates(self, source: Gaussians) -> Gaussians:
         """These, made anew of `source` for one picture with its `sh_rest`: its updates are made here too."""
         if self.postponed is None:
             self.postponed = source.postponed

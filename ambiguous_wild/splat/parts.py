@@ -46,13 +46,13 @@ class MaskPolicy:
     def setup(self, data: TrainData) -> None:
         """Called once before the first step (and again when a run resumes): frozen inputs, own nets."""
 
-    def reads(self) -> Effect | None:
+    def required_effect(self) -> Effect | None:
         """The effect of its method that it cannot work without; a graft that lacks it is refused."""
         return None
 
-    def losses_read(self) -> Effect | None:
+    def loss_effect(self) -> Effect | None:
         """The effect of its method that its own losses cannot work without."""
-        return self.reads()
+        return self.required_effect()
 
     def keep(self, step: Step) -> Tensor | None:
         """The keep map that weighs this step's loss. May train nets of its own."""

@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.extras import install_command, torch_command
-from ambiguous_wild.io.lock import patient_lock
+from ambiguous_wild.core.errors import AwError, install_command, torch_command
+from ambiguous_wild.io.files import patient_lock
 
 GSPLAT = "1.5.3"  # the release whose calls are known
 INSTALL_GSPLAT = f"{sys.executable} -m pip install 'gsplat=={GSPLAT}'"
@@ -165,7 +164,7 @@ def load_kernels() -> None:
     """
     from torch.utils.cpp_extension import get_default_build_root
 
-    from ambiguous_wild.splat.gpu.gsplat_seam import max_alpha
+    from ambiguous_wild.splat.gsplat_seam import max_alpha
 
     own = str(Path(sys.executable).parent)  # pip puts ninja there, also where nobody activated it
     if own not in (path := os.environ.get("PATH", "")).split(os.pathsep):

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ambiguous_wild.io.atomic import write_text
+from ambiguous_wild.io.files import write_text
 
 # On a GPU the parts of every so many-th step are timed: an event costs a launch. A prime: growth comes every
 # hundredth step, merging every thousandth, and a divisor of theirs would time them too often or never.

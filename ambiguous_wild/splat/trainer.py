@@ -13,7 +13,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat.data import Pyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
-from ambiguous_wild.splat.drawing import Drawing
+from ambiguous_wild.splat.drawing import SceneRenderer
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.field import Field, rates_with
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -79,9 +79,9 @@ class Trainer(Run):
             gaussians = gaussians.carrying({name: row.values for name, row in rows.items()})
         density = parts.density(parts.density_config, data.scene.extent, config.seed)
         density.setup(data)
-        density.spares = None if self.effects is None else self.effects.spares()
+        density.protected = None if self.effects is None else self.effects.protected()
         self.field = Field(gaussians, rates_with(rows, self.pace.learning_rates), density)
-        self.drawing = Drawing(data, parts, self.field, self.effects)
+        self.drawing = SceneRenderer(data, parts, self.field, self.effects)
         parts.mask.setup(data)
 
     # The first field, the one that is the result.

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.atomic import atomic_path, write_json
+from ambiguous_wild.io.files import atomic_path, write_json
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import Gaussians

@@ -11,9 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.methods.refinesplat.entropy import Variant, entropy
 from ambiguous_wild.methods.refinesplat.evidence import global_mask, ratio, uncertainty
-from ambiguous_wild.methods.refinesplat.losses import consistency_loss
 from ambiguous_wild.methods.refinesplat.masks import instance_means
 from ambiguous_wild.methods.refinesplat.merging import (
     MergeConfig,
@@ -23,7 +21,8 @@ from ambiguous_wild.methods.refinesplat.merging import (
     merge_pairs,
     overlap,
 )
-from ambiguous_wild.methods.refinesplat.threshold import learnt, objective, pool_of, t_ent
+from ambiguous_wild.methods.refinesplat.recipe import consistency_loss
+from ambiguous_wild.methods.refinesplat.threshold import Variant, entropy, learnt, objective, pool_of, t_ent
 from ambiguous_wild.metrics import ambiguity
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.masks import confusion, psnr_valid

@@ -14,9 +14,9 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.showing.read import open_scene
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.harness.models import open_scene
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.scene_folder import load_scene

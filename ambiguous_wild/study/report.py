@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import counted
-from ambiguous_wild.harness.tables import plain_formats
-from ambiguous_wild.harness.tables.plain_formats import markdown_text
-from ambiguous_wild.harness.tables.table import text_table
-from ambiguous_wild.io.atomic import atomic_dir, write_json, write_text
+from ambiguous_wild.io.files import atomic_dir, write_json, write_text
+from ambiguous_wild.report import plain_formats
+from ambiguous_wild.report.plain_formats import markdown_text
+from ambiguous_wild.report.table import text_table
 from ambiguous_wild.study.answers import KIND_PAIR, KIND_PHOTO
-from ambiguous_wild.study.ranking import (
+from ambiguous_wild.study.scores import (
+    HARD,
     AgreementScore,
     Ambiguity,
     Counted,
@@ -22,7 +23,6 @@ from ambiguous_wild.study.ranking import (
     Scores,
     Share,
 )
-from ambiguous_wild.study.scores import HARD
 
 SCORE_FILES = ("scores.json", "scores.csv", "scores.md")
 COLUMNS = (

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.viewing.model import space_of

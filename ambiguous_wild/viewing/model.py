@@ -13,10 +13,10 @@ import numpy as np
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.scene import together
-from ambiguous_wild.io.atomic import sweep_killed
+from ambiguous_wild.io import compressed_ply, gltf, sog, spz
+from ambiguous_wild.io.files import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
-from ambiguous_wild.io.splat_formats import compressed_ply, gltf, sog, spz
 from ambiguous_wild.metrics.image import psnr
 
 
@@ -59,7 +59,7 @@ Arrays = Mapping[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
 
 
 @dataclass(frozen=True)
-class Look:
+class RenderSettings:
     """How a method draws its Gaussians."""
 
     sh_degree: int = 3
@@ -74,7 +74,7 @@ class Model:
 
     label: str  # unique among the models that are shown together
     ply: Path
-    look: Look = field(default_factory=Look)
+    look: RenderSettings = field(default_factory=RenderSettings)
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
     masks: Path | None = None  # folder of keep maps of train views, white = keep
     reference: bool = False  # it saw exact masks or clean photos, so it is no rival
@@ -96,7 +96,7 @@ class Model:
 class Renderer:
     """Renders one model on the CPU, with the kernels it was trained with."""
 
-    def __init__(self, gaussians: Arrays, look: Look) -> None:
+    def __init__(self, gaussians: Arrays, look: RenderSettings) -> None:
         """
         Args:
             gaussians: raw parameters; of none nothing can be drawn.
@@ -220,7 +220,7 @@ def export(
     return found
 
 
-def _write(wanted: str, path: Path, gaussians: Arrays, look: Look, place: Place) -> int:
+def _write(wanted: str, path: Path, gaussians: Arrays, look: RenderSettings, place: Place) -> int:
     if wanted == "spz":
         return spz.write_spz(path, gaussians, antialias=look.antialias, place=place)
     write = {
@@ -231,7 +231,9 @@ def _write(wanted: str, path: Path, gaussians: Arrays, look: Look, place: Place)
     return write[wanted](path, gaussians, place=place)
 
 
-def _renders(gaussians: Mapping[str, np.ndarray], look: Look, views: Sequence[View]) -> list[np.ndarray]:
+def _renders(
+    gaussians: Mapping[str, np.ndarray], look: RenderSettings, views: Sequence[View]
+) -> list[np.ndarray]:
     if not views:
         return []
     renderer = Renderer(gaussians, look)

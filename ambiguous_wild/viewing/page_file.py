@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.io.atomic import check_output, refuse_file, write_text
+from ambiguous_wild.io.files import check_output, refuse_file, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
-from ambiguous_wild.io.splat_formats.arrays import finite, sigmoid
-from ambiguous_wild.io.splat_formats.spz import spz_arrays, spz_bytes
+from ambiguous_wild.io.splat_arrays import finite, sigmoid
+from ambiguous_wild.io.spz import spz_arrays, spz_bytes
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.viewing.model import Model, Renderer, space_of
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.scene import together
-from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.viewing.model import Model, Renderer, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back

@@ -18,7 +18,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.weight_files import expanded, read_tensors
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.vision import weights
 from ambiguous_wild.vision.dino import normalised
 from ambiguous_wild.vision.protocols import cell_grid, check_image, degraded_distance, whole_cells

@@ -17,13 +17,10 @@ from tempfile import TemporaryFile, mkdtemp
 from typing import Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.core.errors import install_command, shortlist
 from ambiguous_wild.core.weight_files import DEFAULT_FOLDER, folder_fault, weights_folder
 from ambiguous_wild.io.archive import Limits, unpack
-from ambiguous_wild.io.atomic import write_json
-from ambiguous_wild.io.hashing import sha256_file
-from ambiguous_wild.io.lock import lock_path, patient_lock
+from ambiguous_wild.io.files import lock_path, patient_lock, sha256_file, write_json
 from ambiguous_wild.vision import weights
 from ambiguous_wild.vision.weight_files import check, convert, read_as_arrays, save
 from ambiguous_wild.vision.weights import RECEIPT, TENSORS, Package, Weight

@@ -121,7 +121,7 @@ def unsupported(labels: np.ndarray, scene: Scene, name: str, most: float, least_
     return np.where(static[labels], 0, labels)
 
 
-def standing(labels: Tensor, suspect: Tensor) -> Tensor:
+def keep_unsuspicious(labels: Tensor, suspect: Tensor) -> Tensor:
     """Keep map [H, W]: without the instances that are more suspect than the photo is on average.
 
     Args:

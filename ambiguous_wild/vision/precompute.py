@@ -20,8 +20,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.io.atomic import atomic_path
-from ambiguous_wild.io.hashing import sha256_array
+from ambiguous_wild.io.files import atomic_path, sha256_array
 from ambiguous_wild.vision.protocols import (
     Bar,
     Features,

@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.core.extras import install_command
+from ambiguous_wild.core.errors import install_command, shortlist
 from ambiguous_wild.core.weight_files import expanded, not_finite
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.vision import fetch, weights
 
 TENSORS = weights.TENSORS

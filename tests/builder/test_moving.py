@@ -23,7 +23,7 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.motion import MotionConfig, MotionMask
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.moving import moving_labels, moving_map

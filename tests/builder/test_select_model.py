@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder.report import _lost_photos, _parallax_warnings, parallax_deg
-from ambiguous_wild.builder.select_model import (
+from ambiguous_wild.builder.stages import (
     PairFacts,
     check_registered,
 )
@@ -48,7 +48,7 @@ def test_the_reason_follows_the_figures(change, reason):
 def test_enough_photos_pass_and_the_share_counts(tmp_path):
     check_registered(summary(3), 10, 0, tmp_path / "unused.db", {"pairs": 45})
     check_registered(summary(3), 3, 0, tmp_path / "unused.db", {"pairs": 3})
-    import ambiguous_wild.builder.select_model as module
+    import ambiguous_wild.builder.stages as module
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "pair_facts", lambda *_: FACTS)
@@ -59,7 +59,7 @@ def test_enough_photos_pass_and_the_share_counts(tmp_path):
 
 
 def test_photos_placed_without_points_are_no_scene(tmp_path):
-    import ambiguous_wild.builder.select_model as module
+    import ambiguous_wild.builder.stages as module
 
     turned = dataclasses.replace(FACTS, verified=12, degenerate=1.0, angle_deg=0.3)
     with pytest.MonkeyPatch.context() as patch:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.sift import features_of, sift
+from ambiguous_wild.builder.sfm_worker import features_of, sift
 
 
 def blobs(height=240, width=320, seed=0):

@@ -15,10 +15,10 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.ambiguity_report import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.ambiguity.summary import describe
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
+from ambiguous_wild.report.ambiguity_summary import describe
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
 SEMANTIC_METRIC = "semantic_lookalike_labhog"
@@ -176,7 +176,7 @@ def test_keep_masks_are_the_inverse(scene: Path, tmp_path: Path) -> None:
 
 
 def test_names_are_escaped_on_the_page() -> None:
-    from ambiguous_wild.harness.ambiguity.page import page
+    from ambiguous_wild.report.ambiguity_page import page
 
     interval = {"value": 0.5, "low": None, "high": None}
     summary = {
@@ -206,7 +206,7 @@ def test_an_output_that_cannot_be_is_found_before_the_work(
 ) -> None:
     (tmp_path / "file").write_text("x")
     monkeypatch.setattr(
-        "ambiguous_wild.harness.ambiguity.measure.measure", lambda *_, **__: pytest.fail("worked first")
+        "ambiguous_wild.report.ambiguity_measure.measure", lambda *_, **__: pytest.fail("worked first")
     )
     assert "cannot write" in error(scene, "-o", out.format(tmp_path))
 

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.simulate import composite_command as command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.io.model_maker import write_scene
 

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.grid import cell_folder, grouped, plan_cells
+from ambiguous_wild.harness.grid import cell_folder, grouped, plan_cells
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.harness.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene

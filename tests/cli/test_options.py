@@ -9,8 +9,7 @@ from pathlib import Path
 import click
 import pytest
 
-from ambiguous_wild.cli.main import cli
-from ambiguous_wild.cli.renamed import RENAMED, with_new_names
+from ambiguous_wild.cli.main import RENAMED, cli, with_new_names
 
 
 def _walk(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.simulate import simulate_command as command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.simulate.presets import PRESETS
 
 

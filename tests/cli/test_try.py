@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.harness.running.store import known_iterations
+from ambiguous_wild.harness.store import known_iterations
 from tests.builder.capture_maker import write_capture
 from tests.command_line import aw
 

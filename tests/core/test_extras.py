@@ -3,11 +3,11 @@
 import shlex
 from pathlib import Path
 
-from ambiguous_wild.core import extras
+from ambiguous_wild.core import errors
 
 
 def test_from_a_checkout_the_command_installs_the_checkout():
-    words = shlex.split(extras.install_command("cuda"))
+    words = shlex.split(errors.install_command("cuda"))
     root = Path(__file__).parents[2]
     assert words[1:4] == ["-m", "pip", "install"]
     assert words[-1] == f"{root}[cuda]"
@@ -16,6 +16,6 @@ def test_from_a_checkout_the_command_installs_the_checkout():
 
 def test_installed_as_a_package_the_command_names_the_package(monkeypatch, tmp_path):
     monkeypatch.setattr(
-        extras, "__file__", str(tmp_path / "site-packages" / "ambiguous_wild" / "core" / "x.py")
+        errors, "__file__", str(tmp_path / "site-packages" / "ambiguous_wild" / "core" / "x.py")
     )
-    assert shlex.split(extras.install_command("masks"))[-1] == "ambiguous-wild[masks]"
+    assert shlex.split(errors.install_command("masks"))[-1] == "ambiguous-wild[masks]"

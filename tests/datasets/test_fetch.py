@@ -12,7 +12,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets import fetch as fetching
 from ambiguous_wild.datasets.fetch import PublicData, fetch, find_public, public_data
 from ambiguous_wild.datasets.readers import READERS
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from tests.command_line import aw
 
 

@@ -14,7 +14,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.readers import READERS, recognise
 from ambiguous_wild.datasets.suites import suites
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
-from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.pace import TrainConfig

@@ -11,7 +11,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.readers import recognise
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
-from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.io.colmap_records import points_without_tracks
 from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.scene_folder import load_scene

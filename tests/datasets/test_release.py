@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.datasets.release.describe import TEMPLATE, ReleaseInfo, read_release_info
-from ambiguous_wild.datasets.release.package import package_scenes
-from ambiguous_wild.datasets.release.privacy import strip_metadata
-from ambiguous_wild.datasets.release.verify import verify
+from ambiguous_wild.datasets.package import package_scenes
+from ambiguous_wild.datasets.privacy import strip_metadata
+from ambiguous_wild.datasets.release_facts import TEMPLATE, ReleaseInfo, read_release_info
+from ambiguous_wild.datasets.verify import verify
 from ambiguous_wild.datasets.write import import_scene
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.command_line import aw
@@ -251,7 +251,7 @@ def test_people_are_listed(tmp_path):
     """The detectors find an upright figure and a face of known photos, and nothing in waves."""
     from skimage import data
 
-    from ambiguous_wild.datasets.release.privacy import may_show_person
+    from ambiguous_wild.datasets.privacy import may_show_person
 
     cv2.imwrite(str(tmp_path / "face.png"), data.astronaut()[:, :, ::-1])
     cv2.imwrite(str(tmp_path / "waves.png"), np.kron(layouts.photo(0), np.ones((5, 5, 1), np.uint8)))

@@ -17,9 +17,9 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.weight_files import read_tensors
-from ambiguous_wild.harness.planning.decide import SCHEMA, read_plan
-from ambiguous_wild.harness.running.result_file import read_result
-from ambiguous_wild.harness.running.store import read_config
+from ambiguous_wild.harness.effects_plan import SCHEMA, read_plan
+from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.images import header_size, read_png_rgb, write_png

@@ -13,13 +13,13 @@ import pytest
 from ambiguous_wild.builder.workspace import build_lock
 from ambiguous_wild.cli import main
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.files import folder_lock
 from tests.faults.small_disks import read_only, small_disk, writable
 
 LOCKS = {
     "bench": (
         lambda folder: folder_lock(folder, "aw bench --method 3dgs"),
-        "from ambiguous_wild.io.lock import folder_lock as lock; doing = ('aw bench --method 3dgs',)",
+        "from ambiguous_wild.io.files import folder_lock as lock; doing = ('aw bench --method 3dgs',)",
     ),
     "build-scene": (
         build_lock,

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.harness.running import evaluate
+from ambiguous_wild.harness import evaluate
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.calibration import warm_up

@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
-from ambiguous_wild.methods.refinesplat.losses import consistency_loss
 from ambiguous_wild.methods.refinesplat.merging import covariances, merge_members, scale_rotation
-from ambiguous_wild.methods.refinesplat.threshold import learnt, pool_of, t_ent
+from ambiguous_wild.methods.refinesplat.recipe import consistency_loss
+from ambiguous_wild.methods.refinesplat.threshold import contrast, entropy, learnt, pool_of, surprise, t_ent
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.stats import bootstrap_interval, mean, paired_interval, spread
 from ambiguous_wild.splat.cpu.render import render_cpu

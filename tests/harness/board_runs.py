@@ -14,9 +14,9 @@ import numpy as np
 import yaml
 
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.harness.running.cell import config_identity, scene_identity
-from ambiguous_wild.harness.running.result_file import write_result
-from ambiguous_wild.io.atomic import write_json, write_text
+from ambiguous_wild.harness.cell import config_identity, scene_identity
+from ambiguous_wild.harness.result_file import write_result
+from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import image as image_metrics

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ambiguous_wild.harness.running.result_file import write_result
+from ambiguous_wild.harness.result_file import write_result
 from tests.harness.fake_runs import fake_result
 
 ALONE: dict[str, Any] = {"verdict": "alone", "reason": "", "kernel": "cpu-1"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ambiguous_wild.harness.running.result_file import write_result
+from ambiguous_wild.harness.result_file import write_result
 
 
 def fake_result(

@@ -9,14 +9,14 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.harness.ablation.plan import plan_study, read_outcomes
-from ambiguous_wild.harness.ablation.report import markdown_of, report, write_report
-from ambiguous_wild.harness.running.cell import reproduce
-from ambiguous_wild.harness.running.grid import cell_folder, run_cells
-from ambiguous_wild.harness.running.result_file import write_result
-from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.ablation import plan_study, read_outcomes
+from ambiguous_wild.harness.cell import reproduce
+from ambiguous_wild.harness.grid import cell_folder, run_cells
+from ambiguous_wild.harness.result_file import write_result
+from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
 from ambiguous_wild.methods.ablation import Group, Variant, check_groups, choose_groups
+from ambiguous_wild.report.ablation import markdown_of, report, write_report
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts

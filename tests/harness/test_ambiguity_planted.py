@@ -11,10 +11,10 @@ import pytest
 import torch
 from scipy import ndimage
 
-from ambiguous_wild.harness.ambiguity import measure, sources, summary
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
+from ambiguous_wild.report import ambiguity_measure, ambiguity_sources, ambiguity_summary
 from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import preset
 from ambiguous_wild.vision.labhog import LabHog
@@ -87,8 +87,8 @@ def test_each_distractor_is_told_by_what_tells_it(tmp_path):
     """A piece in the wall's colour is told by its motion alone, where the scene has it."""
     root, _ = plant(tmp_path / "scene", "colour")
     scene = load_scene(root, verify=False)
-    masks = sources.find_masks(scene, None, None)
-    background = sources.find_background(scene, None, None, masks)
+    masks = ambiguity_sources.find_masks(scene, None, None)
+    background = ambiguity_sources.find_background(scene, None, None, masks)
     for motion in (None, 1, 0):
         if motion is not None:
             pieces = {
@@ -96,11 +96,11 @@ def test_each_distractor_is_told_by_what_tells_it(tmp_path):
                 for k, n in enumerate(TRAIN)
             }
             write_motion_points(root / FILE, pieces)
-        measured, look = measure.measure(scene, masks, background)
+        measured, look = ambiguity_measure.measure(scene, masks, background)
         found = [d for m in measured for d in m.distractors]
         assert len(found) == len(TRAIN) and {d.colour for d in found} == {False}
         assert {d.motion for d in found} == {None if motion is None else bool(motion)}
-        told = summary.summarise(scene, measured, look)["told"]
+        told = ambiguity_summary.summarise(scene, measured, look)["told"]
         assert told["motion"] == (None if motion is None else motion * len(TRAIN))
 
 
@@ -114,10 +114,10 @@ def test_a_scene_is_classified_as_it_was_made(kind: str, tmp_path: Path) -> None
 
 def report(root: Path, objects: Path | None = None) -> dict:
     scene = load_scene(root)
-    masks = sources.find_masks(scene, None, None)
-    behind = sources.find_background(scene, None, None, masks)
-    measured, look = measure.measure(scene, masks, behind, objects=objects)
-    return summary.summarise(scene, measured, look)
+    masks = ambiguity_sources.find_masks(scene, None, None)
+    behind = ambiguity_sources.find_background(scene, None, None, masks)
+    measured, look = ambiguity_measure.measure(scene, masks, behind, objects=objects)
+    return ambiguity_summary.summarise(scene, measured, look)
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.ambiguity_report import command
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.harness.ambiguity.sources import RunBackground, find_masks, sees, unproject
-from ambiguous_wild.harness.running.cell import scene_identity
+from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
+from ambiguous_wild.report.ambiguity_sources import RunBackground, find_masks, sees, unproject
 from tests.tiny_scene import TRAIN, WALL_Z, wall_colour, write_tiny_scene
 
 

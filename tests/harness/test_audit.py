@@ -13,12 +13,12 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.audit import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.audit.checks import audit
-from ambiguous_wild.harness.audit.table import Finding, read_tables
+from ambiguous_wild.report.audit import audit
+from ambiguous_wild.report.audit_numbers import Finding, read_tables
 from tests.harness.clean_tables import COLUMNS, Row, clean_tables, write
 
 ROOT = Path(__file__).resolve().parents[2]
-REPORTED = ROOT / "ambiguous_wild/harness/audit/reported"
+REPORTED = ROOT / "ambiguous_wild/report/reported"
 
 
 def findings(rows: list[Row], folder: Path) -> list[Finding]:

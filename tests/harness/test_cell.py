@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.cli.bench import command, parse_budget
-from ambiguous_wild.harness.running.cell import (
+from ambiguous_wild.harness.cell import (
     Cell,
     code_hash,
     environment,
@@ -22,8 +22,8 @@ from ambiguous_wild.harness.running.cell import (
     reproduce,
     scene_identity,
 )
-from ambiguous_wild.harness.running.grid import plan_cells
-from ambiguous_wild.harness.running.training import peak_rss_mb, reset_peak
+from ambiguous_wild.harness.grid import plan_cells
+from ambiguous_wild.harness.training import peak_rss_mb, reset_peak
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin

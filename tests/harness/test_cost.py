@@ -14,21 +14,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cost.curves import (
+from ambiguous_wild.report.cost import cost_report, to_text, write_report
+from ambiguous_wild.report.cost_curves import (
     Curve,
     Point,
     Summary,
+    changes,
     curves_of,
     pareto,
     points,
     summary,
     timeline,
 )
-from ambiguous_wild.harness.cost.pairs import changes
-from ambiguous_wild.harness.cost.plots import draw_all, spread_out
-from ambiguous_wild.harness.cost.reach import first_time, times_to_reach
-from ambiguous_wild.harness.cost.read import CostRun, Found, read_cost_runs
-from ambiguous_wild.harness.cost.report import cost_report, to_text, write_report
+from ambiguous_wild.report.cost_plots import draw_all, spread_out
+from ambiguous_wild.report.cost_reach import first_time, times_to_reach
+from ambiguous_wild.report.cost_read import CostRun, CostRuns, read_cost_runs
 from tests.harness.fake_cost import cost_run
 from tests.harness.fake_runs import failed
 
@@ -36,11 +36,11 @@ RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]
 HOSTILE = "=cmd|$x_1$<script>\x1b[31m"
 
 
-def read(*folders: Path) -> Found:
+def read(*folders: Path) -> CostRuns:
     return read_cost_runs(folders)
 
 
-def only(found: Found) -> CostRun:
+def only(found: CostRuns) -> CostRun:
     (run,) = found.runs
     return run
 

@@ -13,13 +13,12 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cost import recommend as advice
-from ambiguous_wild.harness.cost.curves import curves_of
-from ambiguous_wild.harness.cost.pairs import changes
-from ambiguous_wild.harness.cost.reach import answers
-from ambiguous_wild.harness.cost.read import Found, read_cost_runs
-from ambiguous_wild.harness.cost.recommend import additive, in_words, recommend, value_at, words_of
-from ambiguous_wild.harness.cost.report import cost_report, plain_data, to_text
+from ambiguous_wild.report import cost_recommend as advice
+from ambiguous_wild.report.cost import cost_report, plain_data, to_text
+from ambiguous_wild.report.cost_curves import changes, curves_of
+from ambiguous_wild.report.cost_reach import answers
+from ambiguous_wild.report.cost_read import CostRuns, read_cost_runs
+from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, value_at, words_of
 from tests.harness.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene
 
@@ -32,7 +31,7 @@ def timed(samples: list[list[float]], kernel_reference_s: float = 0.25) -> dict[
     return record | {"samples": samples, "kernel_reference_s": kernel_reference_s}
 
 
-def read(*folders: Path) -> Found:
+def read(*folders: Path) -> CostRuns:
     return read_cost_runs(folders)
 
 

@@ -12,13 +12,13 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.cell import RunOptions
-from ambiguous_wild.harness.running.engines import job as jobs
-from ambiguous_wild.harness.running.engines.ray_cluster import receive, run_sent, send_scene
-from ambiguous_wild.harness.running.engines.session import run_in_processes
-from ambiguous_wild.harness.running.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.running.result_file import read_result
-from ambiguous_wild.harness.running.run import left_alone
+from ambiguous_wild.harness import job as jobs
+from ambiguous_wild.harness.cell import RunOptions
+from ambiguous_wild.harness.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.ray_cluster import receive, run_sent, send_scene
+from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.harness.run import left_alone
+from ambiguous_wild.harness.session import run_in_processes
 from ambiguous_wild.methods import registry
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene

@@ -16,13 +16,13 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.grid import plan_cells, run_cells
-from ambiguous_wild.harness.running.result_file import read_result
-from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.external.process import end_left_over
+from ambiguous_wild.methods.external_process import end_left_over
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
@@ -312,7 +312,7 @@ def test_what_was_started_ends_with_us(tmp_path):
     code = (
         # a shell that runs us in the background has told its children to ignore Ctrl-C
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from pathlib import Path; from ambiguous_wild.methods.external.process import run_logged; "
+        "from pathlib import Path; from ambiguous_wild.methods.external_process import run_logged; "
         f"run_logged('x', ['sh', '-c', 'sleep 60 & wait'], log=Path({str(tmp_path / 'x.log')!r}), "
         "cwd=Path('.'), environment={}, timeout_s=None)"
     )

@@ -8,14 +8,14 @@ import pytest
 import yaml
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.grid import plan_cells, run_cells
-from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.colmap_model import read_model, write_views
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.external.description import PACKAGED, load_description
-from ambiguous_wild.methods.external.staging import stage
+from ambiguous_wild.methods.external import PACKAGED, load_description
+from ambiguous_wild.methods.external_process import stage
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.methods.baselines import parts_of, trained
 from tests.tiny_scene import TEST, TRAIN

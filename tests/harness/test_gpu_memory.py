@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running import training
-from ambiguous_wild.harness.running.grid import plan_cells, run_cells
-from ambiguous_wild.harness.running.result_file import read_result
-from ambiguous_wild.harness.running.training import is_out_of_gpu_memory, out_of_gpu_memory
+from ambiguous_wild.harness import training
+from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.harness.training import is_out_of_gpu_memory, out_of_gpu_memory
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene

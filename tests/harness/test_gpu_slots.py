@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from ambiguous_wild.harness.running.callbacks import Engine, Lines
-from ambiguous_wild.harness.running.cell import CellReport
-from ambiguous_wild.harness.running.engines import job, session
-from ambiguous_wild.harness.running.engines.session import VISIBLE, Session, run_in_processes, visible_gpus
+from ambiguous_wild.harness import job, session
+from ambiguous_wild.harness.callbacks import Engine, Lines
+from ambiguous_wild.harness.cell import CellReport
+from ambiguous_wild.harness.session import VISIBLE, Session, run_in_processes, visible_gpus
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_the_session_hands_the_gpus_on_and_warns_where_they_are_shared(four_gpus
     given, said, cells = [], [], [FakeCell()] * 9
     monkeypatch.setattr(session, "run_in_processes", lambda *made: given.extend(made) or [])
     monkeypatch.setattr(job, "make_job", lambda *made: None)
-    monkeypatch.setattr("ambiguous_wild.harness.running.grid.checked_folders", lambda *made: [None] * 9)
+    monkeypatch.setattr("ambiguous_wild.harness.grid.checked_folders", lambda *made: [None] * 9)
     used = Session(Engine(jobs=jobs), None, Lines(said.append))
     used.in_process(cells)
     used.run(cells, Path(), None)

@@ -10,7 +10,7 @@ import pytest
 
 from ambiguous_wild.cli import main
 from ambiguous_wild.harness.bench import Callbacks, bench
-from ambiguous_wild.harness.running.store import run_folders
+from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.splat.run import Stopped, deferred
 from tests.tiny_scene import write_tiny_scene
@@ -71,7 +71,7 @@ def test_the_model_is_kept_and_the_same_command_goes_on(tmp_path: Path, scene: P
 def test_a_second_one_ends_at_once(
     tmp_path: Path, scene: Path, ctrl_c: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ambiguous_wild.harness.running import training
+    from ambiguous_wild.harness import training
 
     def pressed(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)

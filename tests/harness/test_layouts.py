@@ -19,20 +19,20 @@ from hypothesis import strategies as st
 
 from ambiguous_wild.cli.table import table_command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.ablation.report import ablation
 from ambiguous_wild.harness.measures import MEASURES
-from ambiguous_wild.harness.running.store import Runs, read_runs
-from ambiguous_wild.harness.tables import papers, plain_formats
-from ambiguous_wild.harness.tables.papers import (
+from ambiguous_wild.harness.store import Runs, read_runs
+from ambiguous_wild.metrics import stats
+from ambiguous_wild.report import papers, plain_formats
+from ambiguous_wild.report.ablation import ablation
+from ambiguous_wild.report.papers import (
     datasets_of,
     difference_interval,
     read_reported,
     with_reported,
 )
-from ambiguous_wild.harness.tables.plain_formats import divided
-from ambiguous_wild.harness.tables.table import Cell, Column, Table
-from ambiguous_wild.harness.tables.typeset import latex_text, to_html, to_latex
-from ambiguous_wild.metrics import stats
+from ambiguous_wild.report.plain_formats import divided
+from ambiguous_wild.report.table import Cell, Column, Table
+from ambiguous_wild.report.typeset import latex_text, to_html, to_latex
 from tests.harness.fake_runs import failed, fake_result, save
 
 HOSTILE = '=[2em]<script src="http://x">|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e日'

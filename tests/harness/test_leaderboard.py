@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 
 from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.leaderboard.board import (
+from ambiguous_wild.harness.cell import config_identity
+from ambiguous_wild.io.images import read_png_rgb, write_png
+from ambiguous_wild.report.board import (
     board_csv,
     guard,
     read_board,
@@ -23,9 +25,7 @@ from ambiguous_wild.harness.leaderboard.board import (
     unguard,
     unique_slug,
 )
-from ambiguous_wild.harness.leaderboard.edit import check
-from ambiguous_wild.harness.running.cell import config_identity
-from ambiguous_wild.io.images import read_png_rgb, write_png
+from ambiguous_wild.report.board_edit import check
 from tests.harness.board_runs import change_result, write_run, write_scene
 
 HOSTILE = '=HYPERLINK("x")</script><img src=x onerror=alert(1)>/../../etc'

@@ -12,9 +12,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.leaderboard import command
-from ambiguous_wild.harness.leaderboard import publish as publishing
-from ambiguous_wild.harness.leaderboard.board import read_board
-from ambiguous_wild.harness.leaderboard.page_facts import Reported, facts
+from ambiguous_wild.report import board_publish as publishing
+from ambiguous_wild.report.board import read_board
+from ambiguous_wild.report.board_publish import Reported, facts
 from tests.chromium import Browser, needs_chromium
 from tests.harness.board_page import choose, column, heads, names, ranks, said, tick, type_in
 from tests.harness.board_runs import write_run, write_scene
@@ -171,7 +171,7 @@ def test_the_page_in_a_browser(board: Path, tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> None:
-    root = Path(publishing.__file__).parent
+    root = Path(publishing.__file__).parent / "page"
     board = facts(read_board(Path(__file__).parents[2] / "leaderboard"), [], Reported(), [])
     code = (
         f"const document = {{ getElementById: () => ({{ textContent: {json.dumps(json.dumps(board))} }}) }};"

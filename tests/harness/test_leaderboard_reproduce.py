@@ -14,10 +14,10 @@ import pytest
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.harness.leaderboard.board import read_board
-from ambiguous_wild.harness.leaderboard.reproduce import command, preparation
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
+from ambiguous_wild.report.board import read_board
+from ambiguous_wild.report.board_reproduce import command, preparation
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec_file import parse_spec, plain_spec
 from tests.tiny_scene import write_tiny_scene

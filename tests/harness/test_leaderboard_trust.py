@@ -16,16 +16,16 @@ from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.audit.table import REPORTED
-from ambiguous_wild.harness.leaderboard.board import read_board, write_board
-from ambiguous_wild.harness.leaderboard.edit import check, remove
-from ambiguous_wild.harness.leaderboard.publish import publish
-from ambiguous_wild.harness.leaderboard.reproduce import command as command_of
+from ambiguous_wild.harness.cell import config_identity
 from ambiguous_wild.harness.measures import measure_images, metrics
-from ambiguous_wild.harness.running.cell import config_identity
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import lpips
+from ambiguous_wild.report.audit_numbers import REPORTED
+from ambiguous_wild.report.board import read_board, write_board
+from ambiguous_wild.report.board_edit import check, remove
+from ambiguous_wild.report.board_publish import publish
+from ambiguous_wild.report.board_reproduce import command as command_of
 from tests.harness.board_runs import change_result, write_run, write_scene
 
 

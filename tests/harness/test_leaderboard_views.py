@@ -12,8 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 from ambiguous_wild.cli.leaderboard import command
-from ambiguous_wild.harness.leaderboard.edit import check, remove
-from ambiguous_wild.harness.leaderboard.publish import publish
+from ambiguous_wild.report.board_edit import check, remove
+from ambiguous_wild.report.board_publish import publish
 from tests.chromium import Browser, needs_chromium
 from tests.harness.board_page import choose, column, heads, names, said, type_in
 from tests.harness.board_runs import write_run
@@ -249,7 +249,7 @@ def downloads(page: Browser, files: Path) -> None:
 
 def test_sources_that_are_no_such_file_are_refused(board: Path, tmp_path: Path) -> None:
     from ambiguous_wild.core import AwError
-    from ambiguous_wild.harness.leaderboard.page_facts import read_sources
+    from ambiguous_wild.report.board_publish import read_sources
 
     path = tmp_path / "sources.json"
     assert read_sources(path) == {}

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from ambiguous_wild.harness.running import meter as machine
-from ambiguous_wild.harness.running.grid import plan_cells, run_cells
-from ambiguous_wild.harness.running.meter import Meter, Presence
-from ambiguous_wild.harness.running.timing import in_reference_seconds
+from ambiguous_wild.harness import meter as machine
+from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.meter import Meter, Presence
+from ambiguous_wild.harness.timing import in_reference_seconds
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import KERNELS, Calibration, Reading, Size
 from ambiguous_wild.splat.cpu.compile import threads
@@ -217,7 +217,7 @@ def test_runs_count_each_other_and_forget_the_dead(tmp_path):
         assert one.count() == 1
     code = (
         "import os, sys\nfrom pathlib import Path\n"
-        "from ambiguous_wild.harness.running.meter import Presence\n"
+        "from ambiguous_wild.harness.meter import Presence\n"
         "p = Presence('cpu', Path(sys.argv[1]))\np.here().__enter__()\nprint(p.count(), flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
     )

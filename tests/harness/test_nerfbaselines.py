@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.grid import plan_cells, run_cells
+from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb
-from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.external import nerfbaselines
+from ambiguous_wild.methods import nerfbaselines, registry
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.pictures import sheets
-from ambiguous_wild.harness.pictures.sheets import write_contact
-from ambiguous_wild.harness.pictures.training import (
+from ambiguous_wild.harness import sheets
+from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.pictures import (
     CELL,
     MOMENTS,
     ROWS,
@@ -19,7 +19,7 @@ from ambiguous_wild.harness.pictures.training import (
     draw_density,
     strip,
 )
-from ambiguous_wild.harness.running.grid import plan_cells, run_cells
+from ambiguous_wild.harness.sheets import write_contact
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.palette import ramp
 from ambiguous_wild.io.scene_folder import load_scene

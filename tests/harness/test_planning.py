@@ -10,22 +10,21 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
-from ambiguous_wild.harness.planning import decide as decide_module
-from ambiguous_wild.harness.planning import evidence as evidence_module
-from ambiguous_wild.harness.planning import probe
-from ambiguous_wild.harness.planning.decide import (
+from ambiguous_wild.harness import effects_plan, residual_probe
+from ambiguous_wild.harness import effects_plan as decide_module
+from ambiguous_wild.harness.choosing import check_wanted
+from ambiguous_wild.harness.effects_plan import (
     FEW_PHOTOS,
     OUTWARD,
     Plan,
     decide,
+    measure,
     plan_without_training,
     read_plan,
 )
-from ambiguous_wild.harness.planning.evidence import measure
-from ambiguous_wild.harness.planning.probe import Occlusion, summarise, unexplained, with_occlusion
-from ambiguous_wild.harness.running.choosing import check_wanted
-from ambiguous_wild.harness.running.grid import cell_folder, choose, plan_cells, run_cells
-from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.harness.grid import cell_folder, choose, plan_cells, run_cells
+from ambiguous_wild.harness.residual_probe import Occlusion, summarise, unexplained, with_occlusion
+from ambiguous_wild.io.files import write_json
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
@@ -147,12 +146,12 @@ def test_what_lies_behind_the_scene_calls_for_a_skybox(uncovered, skybox):
 
 def test_the_uncovered_share_is_where_no_points_lie():
     scene, _ = synthetic()
-    share = evidence_module.uncovered(scene)
+    share = effects_plan.uncovered(scene)
     corners = scene.points.xyz[np.abs(scene.points.xyz).max(axis=1) > 0.5]
     wide = np.concatenate([corners * 40 + [0, 0, 60.0], scene.points.xyz])  # a far wall behind the dots
     assert 0.3 < share < 0.8
-    assert evidence_module.uncovered(with_points(scene, wide)) < share / 2
-    assert math.isnan(evidence_module.uncovered(dataclasses.replace(scene, views=())))
+    assert effects_plan.uncovered(with_points(scene, wide)) < share / 2
+    assert math.isnan(effects_plan.uncovered(dataclasses.replace(scene, views=())))
 
 
 def with_points(scene, xyz):
@@ -171,12 +170,12 @@ def test_a_long_strip_is_as_covered_as_a_short_one():
     short = with_points(scene, wall)
     elsewhere = np.full((400_000, 3), [1000.0, 0.0, 3.0])  # what other photos look at
     long = with_points(scene, np.concatenate([wall, elsewhere]))
-    assert evidence_module.uncovered(long) == evidence_module.uncovered(short) < 0.05
+    assert effects_plan.uncovered(long) == effects_plan.uncovered(short) < 0.05
 
 
 def test_with_hardly_any_points_nothing_is_said_of_the_background():
     scene, _ = synthetic()
-    assert math.isnan(evidence_module.uncovered(with_points(scene, scene.points.xyz[:5])))
+    assert math.isnan(effects_plan.uncovered(with_points(scene, scene.points.xyz[:5])))
 
 
 def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
@@ -194,8 +193,8 @@ def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
         np.repeat(np.arange(len(views)), 5).astype(np.int32), np.zeros((count, 2), np.float32),
     )  # fmt: skip
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
-    assert evidence_module.outward(scene) > OUTWARD
-    assert math.isnan(evidence_module.outward(dataclasses.replace(scene, views=tuple(views[:2]))))
+    assert effects_plan.outward(scene) > OUTWARD
+    assert math.isnan(effects_plan.outward(dataclasses.replace(scene, views=tuple(views[:2]))))
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-4])
@@ -209,7 +208,7 @@ def test_cameras_at_one_place_look_neither_inward_nor_outward(jitter):
         camera = dataclasses.replace(view.camera, cam_from_world=pose)
         views.append(dataclasses.replace(view, camera=camera))
     found = dataclasses.replace(
-        measured(), outward=evidence_module.outward(dataclasses.replace(scene, views=tuple(views)))
+        measured(), outward=effects_plan.outward(dataclasses.replace(scene, views=tuple(views)))
     )
     assert math.isnan(found.outward)
     assert decide("dots", found).effects() == ()
@@ -222,7 +221,7 @@ def test_what_stands_before_points_is_no_light_that_differs_by_place(monkeypatch
         row, column = rng.integers(0, HEIGHT - 25), rng.integers(0, WIDTH - 40)
         photo[row : row + 25, column : column + 40] = rng.uniform(0.1, 0.9, 3)
     assert measure(scene, photos).appearance < decide_module.APPEARANCE / 2
-    monkeypatch.setattr(evidence_module, "OUTLYING", math.inf)
+    monkeypatch.setattr(effects_plan, "OUTLYING", math.inf)
     assert measure(scene, photos).appearance > decide_module.APPEARANCE
 
 
@@ -306,8 +305,8 @@ def test_what_stands_out_must_stay_when_a_longer_probe_has_learnt_the_rest(monke
     def bar(total):
         yield SimpleNamespace(update=lambda: ticks.append(total))
 
-    monkeypatch.setattr(probe, "occlusion", instead)
-    left = probe.stays("scene", ("exposure",), bar=bar)
+    monkeypatch.setattr(residual_probe, "occlusion", instead)
+    left = residual_probe.persists("scene", ("exposure",), bar=bar)
     assert left.share == share
     assert left.iterations == sum(rounds)  # what `aw plan` says it cost
     assert made == [("scene", ("exposure",), n) for n in rounds]
@@ -372,7 +371,7 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
 
 def test_options_are_checked_before_a_plan_is_made(tmp_path, monkeypatch):
     scene = write_tiny_scene(tmp_path / "scene")
-    monkeypatch.setattr("ambiguous_wild.harness.running.grid.choose", pytest.fail)
+    monkeypatch.setattr("ambiguous_wild.harness.grid.choose", pytest.fail)
     with pytest.raises(AwError, match="most is at least 0, got -1"):
         plan_cells(
             ["refinesplat"], [scene], [0], TrainConfig(),

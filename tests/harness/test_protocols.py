@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from ambiguous_wild import bench
-from ambiguous_wild.harness.ablation.plan import plan_study
-from ambiguous_wild.harness.running.store import Runs, read_runs
-from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.notes import _fitted
+from ambiguous_wild.harness.ablation import plan_study
+from ambiguous_wild.harness.store import Runs, read_runs
+from ambiguous_wild.report.comparison import comparison
+from ambiguous_wild.report.notes import _fitted
 from ambiguous_wild.splat.pace import TrainConfig
 
 SMALL = ("gs-w.side=16", "gs-w.width=2", "wildgaussians.width=8")

@@ -10,7 +10,7 @@ import pytest
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.harness.measures import measure_images, metrics
-from ambiguous_wild.harness.running.regions import find_regions
+from ambiguous_wild.harness.regions import find_regions
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.masks import psnr_valid
 from ambiguous_wild.vision.sparse_surface import inverse_depth

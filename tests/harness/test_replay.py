@@ -8,9 +8,9 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.main import cli
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells
-from ambiguous_wild.harness.running.replay import replay
-from ambiguous_wild.harness.running.result_file import read_result
+from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
+from ambiguous_wild.harness.replay import replay
+from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.pace import TrainConfig

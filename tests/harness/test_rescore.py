@@ -14,13 +14,14 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.table import rescore_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import bench as bench_module
+from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.bench import Callbacks, bench
 from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
-from ambiguous_wild.harness.rescore import could_be_measured, rescore
-from ambiguous_wild.harness.running import evaluate
-from ambiguous_wild.harness.running.result_file import metrics_of, read_result
+from ambiguous_wild.harness.result_file import metrics_of, read_result
+from ambiguous_wild.harness.store import could_be_measured
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import lpips
+from ambiguous_wild.report.rescore import rescore
 from tests.harness.board_runs import write_run, write_scene
 
 

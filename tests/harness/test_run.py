@@ -12,12 +12,11 @@ import torch
 import yaml
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.grid import cell_folder, plan_cells, run_cells, try_recipes
-from ambiguous_wild.harness.running.result_file import check_model, read_result
-from ambiguous_wild.harness.running.run import refuse_other_config
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells, try_recipes
+from ambiguous_wild.harness.result_file import check_model, read_result
+from ambiguous_wild.harness.run import refuse_other_config
+from ambiguous_wild.io.files import folder_lock, sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
-from ambiguous_wild.io.lock import folder_lock
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.image import flip, psnr, psnr_affine

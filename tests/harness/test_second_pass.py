@@ -8,11 +8,11 @@ import torch
 
 from ambiguous_wild import bench
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.running import training as passes
-from ambiguous_wild.harness.running.training import both_passes
+from ambiguous_wild.harness import training as passes
+from ambiguous_wild.harness.training import both_passes
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.methods.fixed_masks import FixedMasks
+from ambiguous_wild.methods.given_masks import FixedMasks
 from ambiguous_wild.methods.registry import knows_truth
 from tests.methods.baselines import data_of, step_of
 from tests.tiny_scene import TRAIN

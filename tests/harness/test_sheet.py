@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.pictures.sheets import BAR, GAP, write_sheet
-from ambiguous_wild.harness.running.grid import plan_cells, run_cells
-from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.grid import plan_cells, run_cells
+from ambiguous_wild.harness.sheets import BAR, GAP, write_sheet
+from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import HEIGHT, WIDTH, write_tiny_scene

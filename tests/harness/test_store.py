@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.result_file import read_result, write_result
-from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.result_file import read_result, write_result
+from ambiguous_wild.harness.store import read_runs
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.suites import differences, find_scenes, get_suite, scene_id, suites
-from ambiguous_wild.harness.suite import prepare_suite, suite_methods, suite_tables
-from ambiguous_wild.harness.tables.papers import read_reported
 from ambiguous_wild.io.scene_folder import read_scene_json
+from ambiguous_wild.report.papers import read_reported
+from ambiguous_wild.report.suite import prepare_suite, suite_methods, suite_tables
 from tests.command_line import aw
 from tests.datasets import layouts
 

@@ -11,9 +11,9 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.table import table_command as command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.tables.comparison import COLUMNS, tidy
-from ambiguous_wild.harness.tables.plain_formats import to_csv
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.report.comparison import COLUMNS, tidy
+from ambiguous_wild.report.plain_formats import to_csv
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 

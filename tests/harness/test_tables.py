@@ -13,10 +13,10 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MEASURES, measure
-from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.papers import cost_at_the_end
-from ambiguous_wild.harness.tables.plain_formats import (
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.report.comparison import comparison
+from ambiguous_wild.report.papers import cost_at_the_end
+from ambiguous_wild.report.plain_formats import (
     display_width,
     fitted,
     plain,
@@ -24,9 +24,9 @@ from ambiguous_wild.harness.tables.plain_formats import (
     to_text,
     to_wide_csv,
 )
-from ambiguous_wild.harness.tables.table import Cell, Table
-from ambiguous_wild.harness.tables.typeset import to_html as html_of
-from ambiguous_wild.harness.tables.typeset import to_latex as latex_of
+from ambiguous_wild.report.table import Cell, Table
+from ambiguous_wild.report.typeset import to_html as html_of
+from ambiguous_wild.report.typeset import to_latex as latex_of
 from tests.harness.fake_runs import failed, fake_result, save, start
 
 HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'

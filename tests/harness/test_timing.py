@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.running.result_file import read_result, write_result
-from ambiguous_wild.harness.running.store import read_runs
-from ambiguous_wild.harness.running.timing import (
+from ambiguous_wild.harness.result_file import read_result, write_result
+from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.harness.timing import (
     in_reference_seconds,
     seconds_range,
     timing_of,
 )
-from ambiguous_wild.harness.tables.comparison import comparison
-from ambiguous_wild.harness.tables.comparison import table as table_of
-from ambiguous_wild.harness.tables.plain_formats import to_text
+from ambiguous_wild.report.comparison import comparison
+from ambiguous_wild.report.comparison import table as table_of
+from ambiguous_wild.report.plain_formats import to_text
 from tests.harness.fake_runs import fake_result, save
 
 

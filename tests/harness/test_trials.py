@@ -10,15 +10,24 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.harness import make_plan, select_effects
 from ambiguous_wild.harness.bench import Callbacks, bench
-from ambiguous_wild.harness.planning import probed, tried
-from ambiguous_wild.harness.planning.decide import Decision, Plan, decide, read_plan
-from ambiguous_wild.harness.planning.evidence import Evidence
-from ambiguous_wild.harness.planning.probe import Occlusion, with_occlusion
-from ambiguous_wild.harness.planning.probed import LONGEST_ARM, SHARE, SHORTEST_ARM, TIMED, allowance
-from ambiguous_wild.harness.planning.trials import HELD_BACK, Trials, held_back, sampled, without_blocks
-from ambiguous_wild.harness.planning.tried import LEAST_DB_MASKS, LEAST_PHOTOS, Arm, Gain, compare
-from ambiguous_wild.io.atomic import write_json
+from ambiguous_wild.harness.effects_plan import Decision, Evidence, Plan, decide, read_plan
+from ambiguous_wild.harness.make_plan import (
+    HELD_BACK,
+    LONGEST_ARM,
+    SHARE,
+    SHORTEST_ARM,
+    TIMED,
+    Trials,
+    allowance,
+    held_back,
+    sampled,
+    without_blocks,
+)
+from ambiguous_wild.harness.residual_probe import Occlusion, with_occlusion
+from ambiguous_wild.harness.select_effects import LEAST_DB_MASKS, LEAST_PHOTOS, Gain, ProbeResult, compare
+from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.harness.test_planning import synthetic
@@ -32,11 +41,11 @@ def plan_of(**found):
 
 
 def arm(*psnr):
-    return Arm({f"{k}.png": value for k, value in enumerate(psnr)})
+    return ProbeResult({f"{k}.png": value for k, value in enumerate(psnr)})
 
 
 def answers(plan):
-    return {tried.name_of(d): d.decision for d in plan.decisions if tried.name_of(d)}
+    return {select_effects.name_of(d): d.decision for d in plan.decisions if select_effects.name_of(d)}
 
 
 # -- numbers ----------------------------------------------------------------------------------------
@@ -60,15 +69,15 @@ def test_only_what_exceeds_its_noise_pays(db, error, pays):
 
 
 def test_limits_are_the_first_guess():
-    assert tried.candidates(plan_of()) == ()
-    assert tried.candidates(plan_of(sampling=3.0, exposure=0.2)) == ("exposure", "antialias")
-    assert tried.candidates(plan_of(appearance=0.1)) == (
+    assert select_effects.candidates(plan_of()) == ()
+    assert select_effects.candidates(plan_of(sampling=3.0, exposure=0.2)) == ("exposure", "antialias")
+    assert select_effects.candidates(plan_of(appearance=0.1)) == (
         "exposure",
         "appearance",
     )  # the cheaper one beside it
-    assert tried.candidates(plan_of(appearance=0.03)) == ("exposure", "appearance")
-    assert tried.candidates(plan_of(appearance=0.01, exposure=0.03)) == ()
-    assert tried.candidates(plan_of(exposure=math.nan, reprojection_px=2.0)) == ("poses",)
+    assert select_effects.candidates(plan_of(appearance=0.03)) == ("exposure", "appearance")
+    assert select_effects.candidates(plan_of(appearance=0.01, exposure=0.03)) == ()
+    assert select_effects.candidates(plan_of(exposure=math.nan, reprojection_px=2.0)) == ("poses",)
 
 
 def tried_with(plan, gains):
@@ -79,8 +88,8 @@ def tried_with(plan, gains):
         asked.append(effects)
         return arm(*(20.0 + gains["+".join(effects)] + 0.01 * k * len(effects) for k in range(6)))
 
-    names = tried.candidates(plan)
-    found = tried.try_effects(plan, names, train, dict.fromkeys(names, 1.5), said.append)
+    names = select_effects.candidates(plan)
+    found = select_effects.try_effects(plan, names, train, dict.fromkeys(names, 1.5), said.append)
     return found, asked, said
 
 
@@ -93,7 +102,7 @@ def test_each_effect_is_tried_beside_those_that_paid(tmp_path):
     lines = {d.effect: d for d in found.decisions}
     assert lines["antialias"].decision == "off"
     assert lines["antialias"].gain_db == pytest.approx(-0.1 + 0.025)
-    assert lines["antialias"].why == tried.PAYS_NOT and lines["exposure"].cost_ms == 1.5
+    assert lines["antialias"].why == select_effects.PAYS_NOT and lines["exposure"].cost_ms == 1.5
     assert lines["SH degree"].gain_db is None
     assert len(said) == 3 and "antialias off: -0.08" in said[1]  # a line for every decision
     write_json(tmp_path / "plan.json", found.plain())
@@ -108,33 +117,37 @@ def test_the_embedding_must_pay_beyond_exposure(appearance, on):
     found, _, _ = tried_with(plan_of(appearance=0.1, exposure=0.2), gains)
     assert found.effects() == on
     if "appearance" in on:
-        assert {d.effect: d.why for d in found.decisions}["exposure"] == tried.COVERED
+        assert {d.effect: d.why for d in found.decisions}["exposure"] == select_effects.COVERED
 
 
 def test_within_noise_the_limit_decides_on_colour():
     plan = plan_of(sampling=3.0, exposure=0.2, appearance=0.1)
-    names = tried.candidates(plan)
+    names = select_effects.candidates(plan)
 
     def train(effects):  # each effect: +0.2 +- 0.2 dB
         return arm(*(20.0 + len(effects) * (0.2 + 0.5 * (-1) ** k) for k in range(6)))
 
-    found = tried.try_effects(plan, names, train, dict.fromkeys(names, 1.0), print)
+    found = select_effects.try_effects(plan, names, train, dict.fromkeys(names, 1.0), print)
     assert found.effects() == ("exposure",)  # neither antialiasing nor appearance beyond it
-    assert {d.effect: d.why for d in found.decisions}["exposure"] == tried.GUESSED
+    assert {d.effect: d.why for d in found.decisions}["exposure"] == select_effects.GUESSED
     below = plan_of(appearance=0.03, exposure=0.01)  # both are tried, no limit is reached
-    found = tried.try_effects(below, tried.candidates(below), train, dict.fromkeys(names, 1.0), print)
+    found = select_effects.try_effects(
+        below, select_effects.candidates(below), train, dict.fromkeys(names, 1.0), print
+    )
     assert found.effects() == ()
 
 
 def test_too_few_photos_leave_the_limits():
     names = ("exposure", "antialias")
     plan = plan_of(sampling=3.0, exposure=0.2)
-    found = tried.try_effects(plan, names, lambda _: arm(20.0, 21.0), dict.fromkeys(names, 0.0), print)
+    found = select_effects.try_effects(
+        plan, names, lambda _: arm(20.0, 21.0), dict.fromkeys(names, 0.0), print
+    )
     assert answers(found) == {"exposure": "on", "antialias": "off", "appearance": "off", "poses": "off"}
 
 
 def test_a_limit_alone_switches_on_colour_only():
-    found = tried.untried(plan_of(sampling=3.0, exposure=0.2, reprojection_px=3.0), "too short")
+    found = select_effects.untried(plan_of(sampling=3.0, exposure=0.2, reprojection_px=3.0), "too short")
     assert found.effects() == ("exposure",)
     assert [d.why.endswith("not tried: too short") for d in found.decisions if d.effect == "antialias"]
 
@@ -142,12 +155,12 @@ def test_a_limit_alone_switches_on_colour_only():
 def test_masks_are_off_where_leaving_the_patches_out_does_not_pay():
     plan = with_occlusion(plan_of(), Occlusion(0.02, 0.02, 0.1))
     for gain, answer in ((Gain(0.2, 0.05), "on"), (Gain(0.01, 0.005), "off"), (Gain(0.1, 0.2), "off")):
-        found = {d.effect: d for d in tried.with_masks_tried(plan, gain).decisions}
-        assert {found[name].decision for name in tried.MASK_LINES} == {answer}
+        found = {d.effect: d for d in select_effects.with_masks_tried(plan, gain).decisions}
+        assert {found[name].decision for name in select_effects.MASK_LINES} == {answer}
         assert found["masks"].gain_db == gain.db
-    assert tried.with_masks_tried(plan, None) == plan
-    much = with_occlusion(plan_of(), Occlusion(2 * tried.CERTAIN, 0.02, 0.1))
-    found = tried.with_masks_tried(much, Gain(-0.1, 0.05)).decisions[0]
+    assert select_effects.with_masks_tried(plan, None) == plan
+    much = with_occlusion(plan_of(), Occlusion(2 * select_effects.CERTAIN, 0.02, 0.1))
+    found = select_effects.with_masks_tried(much, Gain(-0.1, 0.05)).decisions[0]
     assert found.decision == "on" and found.gain_db == -0.1
 
 
@@ -198,7 +211,7 @@ def test_nothing_of_the_blocks_is_learnt(scene, tmp_path, monkeypatch):
             for photo, block in zip(bench.data.photos, bench.blocks):
                 photo[block] = 1 - photo[block]
         monkeypatch.setattr(
-            "ambiguous_wild.harness.planning.trials.Trainer",
+            "ambiguous_wild.harness.make_plan.Trainer",
             lambda *args, **more: kept.append(trainer(*args, **more)) or kept[-1],
         )
         bench.train((), 20)
@@ -276,13 +289,13 @@ class Counted:
 
 def test_a_plan_goes_on_where_it_was_interrupted(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(Counted, "trained", ())
-    monkeypatch.setattr(probed.trials, "Trials", Counted)
-    monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of(sampling=3.0, exposure=0.2))
-    monkeypatch.setattr(probed, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))
+    monkeypatch.setattr(make_plan, "Trials", Counted)
+    monkeypatch.setattr(make_plan, "plan_without_training", lambda _: plan_of(sampling=3.0, exposure=0.2))
+    monkeypatch.setattr(make_plan, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))
     prepared = []
 
     def make(iterations=30_000):
-        return probed.plan_with_probes(
+        return make_plan.plan_with_probes(
             scene, TrainConfig(iterations=iterations), tmp_path, masks=False,
             prepare=lambda: prepared.append(True),
         )  # fmt: skip
@@ -313,12 +326,12 @@ def test_kept_probes_of_fewer_effects_are_completed(scene, tmp_path, monkeypatch
         timed.append(tuple(names))
         return dict.fromkeys(names, 2.0)
 
-    monkeypatch.setattr(probed.trials, "Trials", Counted)
-    monkeypatch.setattr(probed, "step_costs", costs)
+    monkeypatch.setattr(make_plan, "Trials", Counted)
+    monkeypatch.setattr(make_plan, "step_costs", costs)
 
     def make(**found):
-        monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of(**found))
-        return probed.plan_with_probes(scene, TrainConfig(), tmp_path, masks=False, prepare=lambda: None)
+        monkeypatch.setattr(make_plan, "plan_without_training", lambda _: plan_of(**found))
+        return make_plan.plan_with_probes(scene, TrainConfig(), tmp_path, masks=False, prepare=lambda: None)
 
     make(exposure=0.2)
     plan = make(exposure=0.2, sampling=3.0)  # one more effect is worth a probe
@@ -327,14 +340,14 @@ def test_kept_probes_of_fewer_effects_are_completed(scene, tmp_path, monkeypatch
 
 
 def test_a_run_under_a_budget_goes_on_with_the_probes_it_began(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(probed.trials, "Trials", Counted)
-    monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of(exposure=0.2))
-    monkeypatch.setattr(probed, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))
+    monkeypatch.setattr(make_plan, "Trials", Counted)
+    monkeypatch.setattr(make_plan, "plan_without_training", lambda _: plan_of(exposure=0.2))
+    monkeypatch.setattr(make_plan, "step_costs", lambda data, names, folder: dict.fromkeys(names, 2.0))
 
     def make(slower):
-        monkeypatch.setattr("ambiguous_wild.harness.planning.probed.slowness", lambda: slower)
+        monkeypatch.setattr("ambiguous_wild.harness.make_plan.slowness", lambda: slower)
         config = TrainConfig(budget_s=60.0)
-        return probed.plan_with_probes(scene, config, tmp_path, masks=False, prepare=lambda: None)
+        return make_plan.plan_with_probes(scene, config, tmp_path, masks=False, prepare=lambda: None)
 
     first = make(1.0)
     assert len(Counted.trained) == 2
@@ -343,19 +356,19 @@ def test_a_run_under_a_budget_goes_on_with_the_probes_it_began(scene, tmp_path, 
 
 
 def test_a_scene_that_calls_for_nothing_costs_nothing(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(probed, "plan_without_training", lambda _: plan_of())
+    monkeypatch.setattr(make_plan, "plan_without_training", lambda _: plan_of())
 
     def never():
         raise AssertionError("nothing is to be compiled")
 
-    plan = probed.plan_with_probes(scene, TrainConfig(), tmp_path, masks=False, prepare=never)
+    plan = make_plan.plan_with_probes(scene, TrainConfig(), tmp_path, masks=False, prepare=never)
     assert plan == plan_of() and isinstance(plan, Plan) and isinstance(plan.decisions[0], Decision)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_bench_tries_within_its_own_length_and_keeps_what_it_tried(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        probed,
+        make_plan,
         "plan_without_training",
         lambda found: dataclasses.replace(plan_of(sampling=3.0), scene=found.name),
     )
@@ -372,6 +385,6 @@ def test_bench_tries_within_its_own_length_and_keeps_what_it_tried(scene, tmp_pa
     assert run.outcome == "trained" and run.effects == ()
     said = json.loads((run.folder / "effects.json").read_text())
     why = {d["effect"]: d["why"] for d in said["plan"]["decisions"]}
-    assert why["antialias"].endswith(probed.TOO_SHORT)
-    assert f"scene: antialias not tried: {probed.TOO_SHORT}" in Heard.lines
+    assert why["antialias"].endswith(make_plan.TOO_SHORT)
+    assert f"scene: antialias not tried: {make_plan.TOO_SHORT}" in Heard.lines
     assert list((tmp_path / ".cache" / "plans").glob("scene-*.json"))

@@ -14,16 +14,16 @@ import threading
 import pytest
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.atomic import (
+from ambiguous_wild.io.files import (
     atomic_dir,
     atomic_path,
     check_output,
+    folder_lock,
     sweep,
     sweep_killed,
     write_json,
     write_text,
 )
-from ambiguous_wild.io.lock import folder_lock
 
 
 def test_a_failing_write_leaves_the_old_file(tmp_path):
@@ -81,7 +81,7 @@ def test_json_refuses_nan_and_keeps_the_old(tmp_path):
 def test_a_locked_folder_names_its_holder_and_is_freed_afterwards(tmp_path):
     folder = tmp_path / "run"
     script = (
-        "import sys; from ambiguous_wild.io.lock import folder_lock\n"
+        "import sys; from ambiguous_wild.io.files import folder_lock\n"
         "with folder_lock(sys.argv[1], 'second'): print('got it')"
     )
     with folder_lock(folder, "aw bench"):
@@ -119,7 +119,7 @@ def test_a_lock_file_unlinked_under_ones_hands_is_not_held(tmp_path, monkeypatch
 
 def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path):
     script = (
-        "import os, sys\nfrom ambiguous_wild.io.atomic import atomic_dir, atomic_path\n"
+        "import os, sys\nfrom ambiguous_wild.io.files import atomic_dir, atomic_path\n"
         "with atomic_path(sys.argv[1] + '/a.txt') as a, atomic_dir(sys.argv[1] + '/d') as d:\n"
         "    a.write_text('half'); (d / 'x').write_text('half'); os._exit(9)"
     )

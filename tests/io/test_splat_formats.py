@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io import compressed_ply, gltf, sog, spz
 from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
-from ambiguous_wild.io.splat_formats import compressed_ply, gltf, sog, spz
-from ambiguous_wild.io.splat_formats.arrays import finite
+from ambiguous_wild.io.splat_arrays import finite
 
 THEIRS = Path(__file__).parent / "data" / "splats"
 Arrays = dict[str, np.ndarray]

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
-from ambiguous_wild.splat import device as devices
+from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
+from ambiguous_wild.splat import backend
 from tests.methods.test_refinesplat_policy import (
     FAST,
     VIEWS,
@@ -82,4 +82,4 @@ def differing(a: torch.Tensor, b: torch.Tensor) -> float:
 
 def on(monkeypatch, accelerated: bool) -> None:
     """Take an accelerator's path, or the CPU's, from now on."""
-    monkeypatch.setattr(devices, "accelerated", lambda device: accelerated)
+    monkeypatch.setattr(backend, "accelerated", lambda device: accelerated)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.methods.gsw import net as gsw_net
-from ambiguous_wild.methods.gsw.recipe import GswAppearance, GswConfig, Visibility
+from ambiguous_wild.methods import gsw as gs_w
+from ambiguous_wild.methods.gsw import GswAppearance, GswConfig, Visibility
 from ambiguous_wild.methods.masking_common import d_keep
 from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed
 from ambiguous_wild.splat.density import DensityConfig
@@ -123,7 +123,7 @@ def gsw(scene, tmp_path_factory):
 def test_a_map_is_sampled_between_its_cells():
     maps = torch.arange(12.0).reshape(1, 3, 4)
     at = torch.tensor([[-0.25, 0.0], [5.0, -9.0]])  # column 1, row 1; outside: the corner
-    assert gsw_net.sample(maps, at)[:, 0].tolist() == pytest.approx([5.0, 3.0])
+    assert gs_w.sample(maps, at)[:, 0].tolist() == pytest.approx([5.0, 3.0])
 
 
 def shot_of(data, view=0, **changes):
@@ -146,7 +146,7 @@ def test_colours_by_a_second_implementation(gsw):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(effect, "config", replace(effect.config, residual=False))
         published = effect.forward(visible, leaf, shot)
-    maps = gsw_net.maps_of(data.photos[0], leaf, 32).numpy()
+    maps = gs_w.maps_of(data.photos[0], leaf, 32).numpy()
     assert maps.shape[:2] == (3, 16)
 
     def bilinear(grid, x, y):
@@ -193,8 +193,8 @@ def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show
         pixels, z = projected(visible.means, view)
         at = pixels / torch.tensor([view.width, view.height])
         shown = ((z > 0) & (at > 0).all(1) & (at < 1).all(1)).float()[:, None]
-        map_ = gsw_net.maps_of(photo, leaf, 32)[2]
-        total, count = total + shown * gsw_net.sample(map_, 2.0 * at - 1.0), count + shown
+        map_ = gs_w.maps_of(photo, leaf, 32)[2]
+        total, count = total + shown * gs_w.sample(map_, 2.0 * at - 1.0), count + shown
     assert count.min() >= 1 and count.max() > 1
     torch.testing.assert_close(found, total / count)
 
@@ -350,7 +350,7 @@ def test_means_over_what_is_seen_are_the_same_on_an_accelerator(swag, monkeypatc
     seen, values = in_picture(g.means, view), random(len(g), 2)
     assert 0 < int(seen.sum()) < len(g)
     on_cpu = mean_of_seen(values[seen], g.means[seen], view)
-    monkeypatch.setattr("ambiguous_wild.splat.device.accelerated", lambda device: True)
+    monkeypatch.setattr("ambiguous_wild.splat.backend.accelerated", lambda device: True)
     torch.testing.assert_close(mean_of_seen(values, g.means, view), on_cpu)
     torch.testing.assert_close(mean_of_seen(values[:, 0], g.means, view), values[seen, 0].mean())
 

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.methods.asymgs import AsymGsConfig, AsymMask
-from ambiguous_wild.splat.effects.slow import SlowAverage, SlowDensity, slow, slow_gaussians
-from ambiguous_wild.vision.mask_ops import standing, unsupported
+from ambiguous_wild.methods.asymgs import (
+    AsymGsConfig,
+    AsymMask,
+    SlowAverage,
+    SlowDensity,
+    slow,
+    slow_gaussians,
+)
+from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
 from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import gaussians
 
@@ -55,7 +61,7 @@ def test_instances_more_suspect_than_the_photo_go_by_hand():
     suspect = torch.zeros(3, 4, dtype=torch.bool)
     suspect[0, 0] = suspect[0, 2] = suspect[0, 3] = suspect[2, 2] = True
     suspect[1, 0] = True  # shares: photo 5/12, label 1 2/4, label 2 1/4, label 3 1/2
-    assert standing(labels, suspect).tolist() == [[1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 0, 0]]
+    assert keep_unsuspicious(labels, suspect).tolist() == [[1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 0, 0]]
 
 
 def test_instances_with_points_are_static():

@@ -90,4 +90,4 @@ def test_both_models_grow_under_effects_and_keep_their_skybox(scene, tmp_path):
     first = trainer.effects.facts()["skybox"]["points"]
     assert sum(r.split for r in other.density.log.rounds) > 0 and first > 0
     for field in (trainer.field, other):
-        assert int(field.density.spares(field.gaussians.means).sum()) == first
+        assert int(field.density.protected(field.gaussians.means).sum()) == first

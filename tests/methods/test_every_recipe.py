@@ -191,8 +191,8 @@ def test_masks_that_read_an_effect_are_not_grafted_without_it(scene, tmp_path, m
 @pytest.mark.parametrize("method", sorted(entry.name for entry in BUILTIN))
 def test_what_a_mask_policy_reads_is_an_effect_of_its_method(method):
     parts = parts_of(method)
-    read = [parts.mask.reads(), parts.mask.losses_read()]
-    read += [] if parts.fields is None else [parts.fields.reads()]
+    read = [parts.mask.required_effect(), parts.mask.loss_effect()]
+    read += [] if parts.fields is None else [parts.fields.required_effect()]
     assert all(effect is None or any(effect is own for own in parts.effects) for effect in read)
 
 

@@ -11,14 +11,13 @@ from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.cli.table import table_command as table
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
+from ambiguous_wild.methods.given_masks import GraftedPolicy
 from ambiguous_wild.methods.graft import check_graft, compose, graft_name
-from ambiguous_wild.methods.grafted_policy import GraftedPolicy
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
-from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
-from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
-from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask
+from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
+from ambiguous_wild.methods.robustsplat import RobustSplatConfig, RobustSplatMask
 from ambiguous_wild.methods.truth import TruthMask
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.methods import dronesplat
-from ambiguous_wild.methods.robustsplat import policy as robustsplat
-from ambiguous_wild.methods.robustsplat import supervision
-from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
-from ambiguous_wild.methods.robustsplat.net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
-from ambiguous_wild.splat import checkpoint, device
+from ambiguous_wild.methods import dronesplat, masking_common, robustsplat
+from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
+from ambiguous_wild.methods.robustsplat import RobustSplatConfig
+from ambiguous_wild.splat import backend, checkpoint
 from ambiguous_wild.splat.step import Step
 from tests.host_reads import READ, moved, no_transfers
 from tests.methods.baselines import data_of, parts_of, same, step_of
@@ -55,7 +53,7 @@ def drawn(monkeypatch):
 
 
 def on_accelerator(monkeypatch, yes=True):
-    monkeypatch.setattr(device, "accelerated", lambda _: yes)
+    monkeypatch.setattr(backend, "accelerated", lambda _: yes)
 
 
 def renders(data, steps=STEPS):
@@ -89,11 +87,11 @@ def test_the_histogram_and_its_percentiles_are_the_cpus_bits(monkeypatch):
 
     def run():
         histogram = torch.zeros(1000, dtype=torch.float64)
-        found = [supervision.percentile(histogram, 0.6)]
+        found = [masking_common.percentile(histogram, 0.6)]
         for e in residuals:
-            histogram = supervision.update_histogram(histogram, e, 0.95)
-            found += [supervision.percentile(histogram, share) for share in (0.01, 0.6, 0.8, 1.0)]
-        return histogram, found, supervision.bound(residuals[0], found[-2])
+            histogram = masking_common.update_histogram(histogram, e, 0.95)
+            found += [masking_common.percentile(histogram, share) for share in (0.01, 0.6, 0.8, 1.0)]
+        return histogram, found, masking_common.bound(residuals[0], found[-2])
 
     histogram, numbers, bound = run()
     on_accelerator(monkeypatch)

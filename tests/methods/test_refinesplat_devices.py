@@ -9,12 +9,16 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from ambiguous_wild.methods.refinesplat import merging, ranks, regions, structure
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
+from ambiguous_wild.methods.refinesplat import merging, pixels, ranks, structure
+from ambiguous_wild.methods.refinesplat.density import (
+    EntropyAwareDensity,
+    EntropyDensityConfig,
+    Support,
+    SupportConfig,
+)
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
-from ambiguous_wild.methods.refinesplat.support import Support, SupportConfig
+from ambiguous_wild.splat import gpu_kernels
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gpu import nearest
 from ambiguous_wild.splat.optim import SplatAdam
 from tests.methods.on_device import LOOK, MOST, PLAIN, capture, differing, made, noise, on, tensor, visit
 from tests.methods.test_refinesplat_pixels import asked, others_of, store
@@ -188,7 +192,7 @@ def same_parts(found: np.ndarray, expected: np.ndarray) -> bool:
 def test_components_are_opencvs_at_the_size_of_a_photo(shape, accelerated):
     mask = np.ascontiguousarray(SHAPES[shape](378, 504))
     for connectivity in (4, 8):
-        found = regions.components(tensor(mask)[None], connectivity).numpy().reshape(mask.shape)
+        found = pixels.components(tensor(mask)[None], connectivity).numpy().reshape(mask.shape)
         _, expected = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
         assert same_parts(found, expected)
         assert np.array_equal(found > 0, mask)
@@ -196,14 +200,14 @@ def test_components_are_opencvs_at_the_size_of_a_photo(shape, accelerated):
 
 def test_too_few_rounds_leave_a_maze_in_parts(monkeypatch, accelerated):
     mask = maze(2, 378, 504)
-    monkeypatch.setattr(regions, "rounds_for", lambda pixels: 4)
-    found = regions.components(tensor(mask)[None], 4).numpy()
+    monkeypatch.setattr(pixels, "rounds_for", lambda pixels: 4)
+    found = pixels.components(tensor(mask)[None], 4).numpy()
     assert len(np.unique(found)) > 2
-    assert regions.rounds_for(10**9) == 4
+    assert pixels.rounds_for(10**9) == 4
 
 
 def test_larger_photos_get_more_rounds_and_small_ones_no_fewer():
-    assert [regions.rounds_for(n) for n in (1, 504 * 378, 4 * 504 * 378, 17 * 504 * 378)] == [8, 8, 9, 11]
+    assert [pixels.rounds_for(n) for n in (1, 504 * 378, 4 * 504 * 378, 17 * 504 * 378)] == [8, 8, 9, 11]
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -213,8 +217,8 @@ def test_hysteresis_and_filled_gaps_are_the_cpus(seed, monkeypatch):
     results = []
     for there in (False, True):
         on(monkeypatch, there)
-        found = regions.hysteresis(tensor(np.stack([values, values[::-1]])), low, high)
-        holes = [regions.fill_holes(m, share) for share in (0.003, 0.05, 1.0) for m in (found[0], ~found[0])]
+        found = pixels.hysteresis(tensor(np.stack([values, values[::-1]])), low, high)
+        holes = [pixels.fill_holes(m, share) for share in (0.003, 0.05, 1.0) for m in (found[0], ~found[0])]
         results.append(torch.stack([*found, *holes]))
     assert torch.equal(*results)
     assert 0 < results[0][0].float().mean() < 1
@@ -338,8 +342,8 @@ def test_neighbours_are_those_of_a_tree(kind, monkeypatch):
         xyz[:, 2] = 0.5
     if kind == "outlier":
         xyz[count // 3] = 1e5
-    monkeypatch.setattr(nearest, "BOX", 32)  # many boxes, so that the first look is not enough for all
-    found = nearest.nearest(torch.from_numpy(xyz), min(9, count)).numpy()
+    monkeypatch.setattr(gpu_kernels, "BOX", 32)  # many boxes, so that the first look is not enough for all
+    found = gpu_kernels.nearest(torch.from_numpy(xyz), min(9, count)).numpy()
     distances = np.linalg.norm(xyz[:, None].astype(float) - xyz[found], axis=2)
     expected = cKDTree(xyz.astype(float)).query(xyz.astype(float), k=min(9, count))[0]
     np.testing.assert_allclose(distances, expected, rtol=1e-4, atol=1e-6 * np.abs(xyz).max())
@@ -347,10 +351,10 @@ def test_neighbours_are_those_of_a_tree(kind, monkeypatch):
 
 
 def test_coincident_points_have_neighbours(monkeypatch):
-    monkeypatch.setattr(nearest, "BOX", 16)
+    monkeypatch.setattr(gpu_kernels, "BOX", 16)
     points = torch.zeros(100, 3)
     points[50:] = torch.rand(50, 3) + 5
-    found = nearest.nearest(points, 9)
+    found = gpu_kernels.nearest(points, 9)
     assert int(found.min()) >= 0 and int(found.max()) < 100
     assert (found[:50] < 50).all()
 

@@ -8,10 +8,18 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.refinesplat import evidence as maps_of
-from ambiguous_wild.methods.refinesplat import masks, regions
+from ambiguous_wild.methods.refinesplat import masks, pixels
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
-from ambiguous_wild.methods.refinesplat.entropy import contrast, entropy, surprise
-from ambiguous_wild.methods.refinesplat.threshold import TEMPERATURE, learnt, objective, pool_of, t_ent
+from ambiguous_wild.methods.refinesplat.threshold import (
+    TEMPERATURE,
+    contrast,
+    entropy,
+    learnt,
+    objective,
+    pool_of,
+    surprise,
+    t_ent,
+)
 from tests.methods.on_device import tensor
 
 
@@ -282,7 +290,7 @@ def test_a_fixed_global_threshold_and_the_adaptive_one_by_hand():
 
 
 def grown(mask: np.ndarray, config: MaskConfig, evidence: np.ndarray) -> np.ndarray:
-    return regions.grown(tensor(mask), config, tensor(evidence)).numpy()
+    return pixels.grown(tensor(mask), config, tensor(evidence)).numpy()
 
 
 def test_the_mask_is_bounded_and_the_surest_pixels_go():
@@ -311,7 +319,7 @@ def test_gaps_are_not_filled_where_nearly_all_would_be_masked():
     evidence = np.where(lines, 5.0, 1.0)
     evidence[1, 1] = 4.0
     config = MaskConfig(most=(lines.sum() + 1) / 1600, fill=0.05, dilation=1)
-    assert regions.fill_holes(tensor(lines), 0.05).float().mean() > 0.9
+    assert pixels.fill_holes(tensor(lines), 0.05).float().mean() > 0.9
     assert np.array_equal(grown(np.ones((40, 40), bool), config, evidence), lines)
 
 
@@ -320,7 +328,7 @@ def test_hysteresis_keeps_weak_pixels_that_touch_strong_ones():
     values[1:4, 1:5], values[2, 2], values[1:4, 8:11] = 5.0, 9.0, 5.0
 
     def found(low, high):
-        return regions.hysteresis(values[None], torch.tensor(low), torch.tensor(high))[0]
+        return pixels.hysteresis(values[None], torch.tensor(low), torch.tensor(high))[0]
 
     assert found(4.0, 8.0)[1:4, 1:5].all() and found(4.0, 8.0).sum() == 12
     assert not found(4.0, math.inf).any()
@@ -331,8 +339,8 @@ def test_small_gaps_are_filled_and_large_ones_are_not():
     mask = torch.zeros(40, 40, dtype=torch.bool)
     mask[5:15, 5:15], mask[8:10, 8:10] = True, False
     mask[20:38, 5:35], mask[22:36, 8:32] = True, False
-    found = regions.fill_holes(mask, 0.01)
+    found = pixels.fill_holes(mask, 0.01)
     assert found[8:10, 8:10].all() and not found[22:36, 8:32].any()
     assert found.sum() == mask.sum() + 4
-    assert regions.fill_holes(mask, 0.0) is mask
-    assert not regions.fill_holes(torch.zeros(4, 4, dtype=torch.bool), 0.5).any()
+    assert pixels.fill_holes(mask, 0.0) is mask
+    assert not pixels.fill_holes(torch.zeros(4, 4, dtype=torch.bool), 0.5).any()

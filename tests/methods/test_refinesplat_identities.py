@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.methods.refinesplat.association import associate
-from ambiguous_wild.methods.refinesplat.identity import PsiConfig, train_psi
+from ambiguous_wild.methods.refinesplat.identity import PsiConfig, associate, train_psi
 from ambiguous_wild.methods.refinesplat.inputs import static_instances
 
 

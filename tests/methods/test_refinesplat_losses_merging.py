@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.merging import (
     MergeConfig,
     clusters,
@@ -15,6 +14,7 @@ from ambiguous_wild.methods.refinesplat.merging import (
     merge_pairs,
     overlap,
 )
+from ambiguous_wild.methods.refinesplat.recipe import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from ambiguous_wild.methods.refinesplat.regions import GAPS
+from ambiguous_wild.methods.refinesplat.pixels import GAPS
 from tests.methods.on_device import capture
 from tests.methods.test_refinesplat_policy import FAST, HEIGHT, WIDTH, fresh, step_of
 

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.masks import MaskStore
-from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
-from ambiguous_wild.splat import device as devices
+from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
+from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.vision.sparse_surface import static_surfaces
 from tests.host_reads import READ
@@ -124,7 +124,7 @@ def test_a_look_of_density_control_reads_nothing_back(monkeypatch, with_keep):
     control = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
     control.observe(step, gradients, keep)
     assert control.support.looked.device == META
-    monkeypatch.setattr(devices, "accelerated", lambda device: False)
+    monkeypatch.setattr(backend, "accelerated", lambda device: False)
     with pytest.raises((RuntimeError, NotImplementedError), match=READ):
         control.observe(step, gradients, keep)
 

@@ -14,10 +14,14 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.inputs import untracked
-from ambiguous_wild.methods.refinesplat.losses import consistency_loss, identity_loss, instance_matrix
 from ambiguous_wild.methods.refinesplat.paper import PaperConfig, PrintedConfig
-from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
-from ambiguous_wild.methods.refinesplat.recipe import build
+from ambiguous_wild.methods.refinesplat.recipe import (
+    RefineSplatMask,
+    build,
+    consistency_loss,
+    identity_loss,
+    instance_matrix,
+)
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.vision import backends
 from tests.methods.test_refinesplat_policy import (

@@ -12,7 +12,7 @@ import torch
 from ambiguous_wild.core import Camera, Points, Scene, View
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
-from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.checkpoint import load, save
 from ambiguous_wild.splat.step import Step, TrainData
 

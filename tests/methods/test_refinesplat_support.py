@@ -7,8 +7,12 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
-from ambiguous_wild.methods.refinesplat.support import Support, SupportConfig
+from ambiguous_wild.methods.refinesplat.density import (
+    EntropyAwareDensity,
+    EntropyDensityConfig,
+    Support,
+    SupportConfig,
+)
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients

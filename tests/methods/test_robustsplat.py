@@ -9,12 +9,10 @@ import torch
 from scipy import ndimage
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.methods import masking_common
+from ambiguous_wild.methods.mask_net import MaskNet
 from ambiguous_wild.methods.refinesplat.inputs import train_tracks
-from ambiguous_wild.methods.robustsplat import supervision
-from ambiguous_wild.methods.robustsplat.config import RobustSplatConfig
-from ambiguous_wild.methods.robustsplat.net import MaskNet
-from ambiguous_wild.methods.robustsplat.policy import RobustSplatMask, _fit, coarse_spec
-from ambiguous_wild.methods.robustsplat.recipe import build
+from ambiguous_wild.methods.robustsplat import RobustSplatConfig, RobustSplatMask, _fit, build, coarse_spec
 from ambiguous_wild.vision import backends
 from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, step_of, trained
@@ -56,32 +54,32 @@ def truth(view: int) -> np.ndarray:
 def test_percentiles_are_numpys_within_a_bin():
     rng = np.random.default_rng(0)
     values = rng.beta(1.5, 6.0, 5000)
-    histogram = supervision.update_histogram(
+    histogram = masking_common.update_histogram(
         torch.zeros(10_000, dtype=torch.float64), torch.from_numpy(values).float(), 0.95
     )
     assert float(histogram.sum()) == 5000
     for share in (0.01, 0.6, 0.8, 1.0):
         exact = np.quantile(values, share, method="inverted_cdf")
-        assert 0 <= supervision.percentile(histogram, share) - exact <= 1e-4 + 1e-6
+        assert 0 <= masking_common.percentile(histogram, share) - exact <= 1e-4 + 1e-6
 
 
 def test_percentile_is_the_smallest_edge_that_holds_the_share():
     ten = torch.tensor([1.0] * 10, dtype=torch.float64)
-    assert supervision.percentile(ten, 0.6) == pytest.approx(0.6)
-    assert supervision.percentile(ten, 0.61) == pytest.approx(0.7)
-    assert supervision.percentile(torch.zeros(10, dtype=torch.float64), 0.6) == 1.0
+    assert masking_common.percentile(ten, 0.6) == pytest.approx(0.6)
+    assert masking_common.percentile(ten, 0.61) == pytest.approx(0.7)
+    assert masking_common.percentile(torch.zeros(10, dtype=torch.float64), 0.6) == 1.0
 
 
 def test_the_histogram_forgets_as_it_should():
     histogram = torch.zeros(4, dtype=torch.float64)
     for value in (0.1, 0.6, 1.0):
-        histogram = supervision.update_histogram(histogram, torch.full((8,), value), 0.5)
+        histogram = masking_common.update_histogram(histogram, torch.full((8,), value), 0.5)
     assert histogram.tolist() == [2.0, 0.0, 4.0, 8.0]  # 1.0 falls into the last bin
 
 
 def test_bounds_against_loops():
     e = torch.from_numpy(np.random.default_rng(1).random((9, 13)).astype(np.float32))
-    got = supervision.bound(e, 0.45).numpy()
+    got = masking_common.bound(e, 0.45).numpy()
     inlier = np.pad(e.numpy() < 0.45, 1).astype(float)
     for y in range(9):
         for x in range(13):
@@ -91,28 +89,28 @@ def test_bounds_against_loops():
 
 def test_the_cosine_target_is_the_printed_formula():
     c = torch.linspace(-1, 1, 41)
-    assert torch.allclose(supervision.cosine_target(c), (2 * c - 1).clamp(0, 1), atol=1e-6)
+    assert torch.allclose(masking_common.cosine_target(c), (2 * c - 1).clamp(0, 1), atol=1e-6)
 
 
 def test_the_calibrated_cosine_is_zero_at_normal_units():
     unit = 0.002
     cosine = 1 - unit * torch.tensor([0.0, 2.5, 5.0, 10.0, 40.0], dtype=torch.float64)
-    got = supervision.calibrated(cosine, unit, 10.0)
+    got = masking_common.calibrated(cosine, unit, 10.0)
     assert torch.allclose(got, torch.tensor([1.0, 0.75, 0.5, 0.0, -1.0], dtype=torch.float64))
-    assert torch.allclose(supervision.cosine_target(got)[:3], torch.tensor([1.0, 0.5, 0.0]).double())
+    assert torch.allclose(masking_common.cosine_target(got)[:3], torch.tensor([1.0, 0.5, 0.0]).double())
 
 
 def test_the_relative_target_is_one_up_to_the_usual_distance():
     distance = torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 9.0])
-    got = supervision.relative_target(0.004 * distance, 0.004, 3.0)
+    got = masking_common.relative_target(0.004 * distance, 0.004, 3.0)
     assert torch.allclose(got, torch.tensor([1.0, 1.0, 1.0, 0.75, 0.5, 0.0, 0.0]))
-    assert torch.equal(supervision.relative_target(torch.zeros(3), 0.0, 3.0), torch.ones(3))
+    assert torch.equal(masking_common.relative_target(torch.zeros(3), 0.0, 3.0), torch.ones(3))
 
 
 def test_the_mask_loss_is_the_printed_sum():
     rng = np.random.default_rng(2)
     m, t, low, up = rng.random((4, 6, 8))
-    got = supervision.mask_loss(*map(torch.from_numpy, (m, t, low, up)), nominal=3000.0)
+    got = masking_common.mask_loss(*map(torch.from_numpy, (m, t, low, up)), nominal=3000.0)
     bounds = np.maximum(m - up, 0) + np.maximum(low - m, 0)
     want = 0.5 * np.abs(m - t).mean() + 0.5 * bounds.mean() + 2 * np.exp(-1.5) * (1 - m).mean()
     assert float(got) == pytest.approx(want, rel=1e-12)
@@ -121,7 +119,7 @@ def test_the_mask_loss_is_the_printed_sum():
 def test_the_static_region_is_eroded_by_three_pixels():
     mask = torch.full((30, 40), 0.26)
     mask[10:15, 20:24] = 0.25  # not above the threshold
-    keep = supervision.keep_of(mask, 0.25, 7).numpy()
+    keep = masking_common.keep_of(mask, 0.25, 7).numpy()
     want = ndimage.binary_dilation(mask.numpy() <= 0.25, np.ones((7, 7)))
     assert np.array_equal(keep == 0, want)
 

@@ -8,8 +8,7 @@ import torch
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.masking_common import annealed, hashed_uniform, sampled
-from ambiguous_wild.methods.spotlesssplats.density import PruningDensity, SpotLessDensityConfig
-from ambiguous_wild.methods.spotlesssplats.net import PlacedNet, placed
+from ambiguous_wild.methods.spotlesssplats import PlacedNet, PruningDensity, SpotLessDensityConfig, placed
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.vision.segments import ward_clusters
 from tests.methods.baselines import data_of, parts_of, step_of, trained

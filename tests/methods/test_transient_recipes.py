@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.methods.forestsplats.nets import fill
+from ambiguous_wild.methods.forestsplats import fill
 from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
 from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary, kept
 from ambiguous_wild.methods.t3dgs import Head, divergence, inverse_depth, likelihood_loss, variation

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate import world as world_module
 from ambiguous_wild.simulate.distractors import Placement, shapes_of

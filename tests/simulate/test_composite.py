@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
-from ambiguous_wild.simulate.composite.composite_scene import composite
-from ambiguous_wild.simulate.composite.cutouts import project, read_cutouts
-from ambiguous_wild.simulate.composite.placement import (
+from ambiguous_wild.simulate.composite_scene import composite
+from ambiguous_wild.simulate.cutouts import project, read_cutouts
+from ambiguous_wild.simulate.placement import (
     CompositeConfig,
     local_colours,
     place,

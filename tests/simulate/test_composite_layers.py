@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.simulate.composite.cutouts import (
+from ambiguous_wild.simulate.cutouts import (
     Cutout,
     CutoutPlacement,
     composed,

@@ -15,11 +15,11 @@ from PIL import Image
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.cli.simulate import composite_command as command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.photos import Exif, read_photo
-from ambiguous_wild.simulate.composite.composite_photos import _write_jpeg, composite_photos
-from ambiguous_wild.simulate.composite.placement import CompositeConfig
+from ambiguous_wild.simulate.composite_photos import _write_jpeg, composite_photos
+from ambiguous_wild.simulate.placement import CompositeConfig
 
 NAMES = [f"p{i:02d}" for i in range(13)]
 TEST = ["p03", "p09"]

@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture
-from ambiguous_wild.simulate.camera_path import look_at
+from ambiguous_wild.simulate.capture import look_at
 from ambiguous_wild.simulate.distractors import movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import PLANS, CaptureSpec

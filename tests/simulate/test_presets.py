@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture
-from ambiguous_wild.simulate.camera_path import look_at
+from ambiguous_wild.simulate.capture import look_at
 from ambiguous_wild.simulate.distractors import Placement, movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import CaptureSpec, Distractor

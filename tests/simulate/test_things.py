@@ -9,15 +9,15 @@ import pytest
 from PIL import Image
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate import capture, volumes
-from ambiguous_wild.simulate.camera_path import look_at
+from ambiguous_wild.simulate import capture, shapes
+from ambiguous_wild.simulate.capture import look_at
 from ambiguous_wild.simulate.distractors import lay_out
 from ambiguous_wild.simulate.kernels import QUAD, VOLUME
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, shape_table
 from ambiguous_wild.simulate.spec import PLANS, STATUES, Distractor, Thing
-from ambiguous_wild.simulate.things import circle_of, shapes_of_thing
 from ambiguous_wild.simulate.tracer import Light, build_atlas, trace
+from ambiguous_wild.simulate.world import circle_of, shapes_of_thing
 
 ATLAS = build_atlas({"stone": np.full((4, 4, 3), 0.5, np.float32)})
 LIGHT = Light(np.array([[0.0, -0.6, 0.8]]), np.ones(3), np.full(3, 0.3), np.full(3, 0.3))
@@ -26,7 +26,7 @@ CAMERA = Camera(120, 120, 240.0, 240.0, 60.0, 60.0, look_at(EYE, np.zeros(3), 0.
 
 
 def test_a_ball_of_distances_is_seen_where_the_ball_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(volumes.STATUES, "test ball", lambda p: np.linalg.norm(p, axis=-1) - 0.7)
+    monkeypatch.setitem(shapes.STATUES, "test ball", lambda p: np.linalg.norm(p, axis=-1) - 0.7)
     shape = Shape(VOLUME, (0.1, 0.0, -0.2), (1.5, 1.5, 1.5), "stone", volume="test ball")
     wall = Shape(QUAD, (0, 3, 0), (9, 9, 0), "stone", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
     seen = trace(
@@ -48,10 +48,10 @@ def test_a_ball_of_distances_is_seen_where_the_ball_is(monkeypatch: pytest.Monke
 def test_a_statue_is_one_solid_on_its_foot_inside_its_sphere(name: str) -> None:
     from scipy import ndimage
 
-    values = volumes.grid(name)
+    values = shapes.grid(name)
     solid = values < 0
     assert 0.02 < solid.mean() < 0.35 and ndimage.label(solid)[1] == 1
-    axis = np.linspace(-1, 1, volumes.SIZE)
+    axis = np.linspace(-1, 1, shapes.SIZE)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     assert max(np.abs(a[solid]).max() for a in (x, y, z)) < 0.95
     assert z[solid].min() == pytest.approx(-0.9, abs=0.035)

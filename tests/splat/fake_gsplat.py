@@ -10,8 +10,7 @@ import types
 
 import torch
 
-from ambiguous_wild.splat import device
-from ambiguous_wild.splat.gpu import gsplat_seam
+from ambiguous_wild.splat import backend, gsplat_seam
 from ambiguous_wild.splat.reference import harmonics, rotations
 
 _BOX = 3.33  # deviations a radius has at most
@@ -158,7 +157,7 @@ def installed(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "gsplat", module())
         _forget()
-        patch.setattr(device, "accelerated", lambda _: True)
+        patch.setattr(backend, "accelerated", lambda _: True)
         yield
     _forget()
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.splat.gpu import kernels
-from ambiguous_wild.splat.gpu.kernels import compiled
+from ambiguous_wild.splat import gpu_kernels
+from ambiguous_wild.splat.gpu_kernels import compiled
 from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.records import SAMPLED, Clock, GpuClock, clock_for
@@ -257,10 +257,10 @@ def test_the_fused_loss_reads_nothing_and_is_one_graph_for_a_compiler():
     a, b, keep = (t.to("meta") for t in pictures(17, 23))
     assert photometric(a, b, keep).d_image.shape == a.shape
     # `fullgraph` raises where tracing would have to fall back to Python in between
-    traced = torch.compile(kernels._loss, fullgraph=True, backend="eager")
+    traced = torch.compile(gpu_kernels._loss, fullgraph=True, backend="eager")
     a, b, keep = pictures(17, 23)
     for mask, inside in ((None, False), (keep, False), (keep, True)):
-        for x, y in zip(traced(a, b, mask, 0.2, inside), kernels._loss(a, b, mask, 0.2, inside)):
+        for x, y in zip(traced(a, b, mask, 0.2, inside), gpu_kernels._loss(a, b, mask, 0.2, inside)):
             assert torch.equal(x, y)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat import backend as backends
 from ambiguous_wild.splat.backend import Backend, GpuBackend, backend_of
 from ambiguous_wild.splat.rendered import check_needs
 from tests.host_reads import no_transfers
@@ -17,7 +17,7 @@ CPU, GPU = Backend(), GpuBackend()
 def test_a_tensor_has_the_back_end_of_its_device(monkeypatch):
     assert type(backend_of("cpu")) is Backend
     assert {type(backend_of(there)) for there in ("cuda:1", torch.device("meta"))} == {GpuBackend}
-    monkeypatch.setattr(device, "accelerated", lambda _: True)  # as tests run the GPU's calls on the CPU
+    monkeypatch.setattr(backends, "accelerated", lambda _: True)  # as tests run the GPU's calls on the CPU
     assert type(backend_of("cpu")) is GpuBackend
 
 

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core import Points, Scene, View
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import RowAdam
@@ -29,7 +29,7 @@ SIZE = 24, 18
 
 
 def on_accelerator(monkeypatch, yes=True):
-    monkeypatch.setattr(device, "accelerated", lambda _: yes)
+    monkeypatch.setattr(backend, "accelerated", lambda _: yes)
 
 
 def data_of(views=3):

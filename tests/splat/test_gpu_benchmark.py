@@ -27,7 +27,7 @@ def case(name, error):
 def test_every_measurement_is_in_the_results(gpu, tmp_path, monkeypatch, errors, code):
     monkeypatch.setattr(table, "CASES", tuple(case(f"case {k}", e) for k, e in enumerate(errors)))
     monkeypatch.setattr(gpu, "BLOCK", 2)
-    monkeypatch.setattr("ambiguous_wild.harness.running.evaluate.FPS_SECONDS", 0.01)
+    monkeypatch.setattr("ambiguous_wild.harness.evaluate.FPS_SECONDS", 0.01)
     scene, results = write_tiny_scene(tmp_path / "scene"), tmp_path / "gpu.json"
     words = f"--scene {scene} --work {tmp_path} --results {results} --iterations 6 --warm-up 1 --turns 1"
     assert gpu.main([*words.split(), "--device", "cpu"]) == code

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from ambiguous_wild.splat import gpu_kernels
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.gpu import kernels
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
@@ -90,7 +90,7 @@ def test_growth_waits_for_the_next_photo_where_one_is_all_masked(scene, tmp_path
     """As on the CPU, which returns before growth; the round is made at the next step."""
     counts, trainer = growing(scene, tmp_path / "gpu", 6)
     with monkeypatch.context() as patch:
-        patch.setattr("ambiguous_wild.splat.device.accelerated", lambda device: str(device) != "cpu")
+        patch.setattr("ambiguous_wild.splat.backend.accelerated", lambda device: str(device) != "cpu")
         cpu, other = growing(scene, tmp_path / "cpu", 6)
     assert counts[5] == 60 and counts[6] > 60
     assert [n > 60 for n in counts] == [n > 60 for n in cpu]
@@ -107,10 +107,10 @@ def test_every_size_of_the_run_is_compiled_before_it_starts(scene, tmp_path, fak
     def record(render, photo, keep, lambda_dssim, weighting):
         seen.append((*render.shape[:2], keep is not None))
 
-    monkeypatch.setattr(kernels, "compiles", lambda device: True)
-    monkeypatch.setattr(kernels, "photometric_fused", record)
+    monkeypatch.setattr(gpu_kernels, "compiles", lambda device: True)
+    monkeypatch.setattr(gpu_kernels, "photometric_fused", record)
     monkeypatch.setattr("ambiguous_wild.splat.pace.SMALLEST_SIDE", 10)
-    kernels.prepare.cache_clear()
+    gpu_kernels.prepare.cache_clear()
     trainer = trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
     sizes = {(48 // d, 64 // d) for d in trainer.pace.divisors}
     assert len(sizes) > 1
@@ -118,4 +118,4 @@ def test_every_size_of_the_run_is_compiled_before_it_starts(scene, tmp_path, fak
     before = len(seen)
     trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
     assert len(seen) == before  # once a process
-    kernels.prepare.cache_clear()
+    gpu_kernels.prepare.cache_clear()

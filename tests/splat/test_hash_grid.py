@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.methods.swag import hash_encoding, in_torch
 from ambiguous_wild.splat.cpu.compile import one_thread
-from ambiguous_wild.splat.effects.hash_grid import hash_encoding, in_torch
 
 
 def random(*shape, seed=0):

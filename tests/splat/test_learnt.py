@@ -10,10 +10,10 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.base import hurried
+from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.step import Shot
@@ -36,7 +36,7 @@ class Everything(Learnt):
         }
 
     def rows(self, gaussians):
-        return {"code": Row(0.1 * torch.ones(len(gaussians), 3), rate=0.01)}
+        return {"code": GaussianAttribute(0.1 * torch.ones(len(gaussians), 3), rate=0.01)}
 
     def forward(self, visible: Visible, leaf: Mapping[str, torch.Tensor], shot: Shot):
         inputs = torch.cat([visible.base, visible.extra["code"] * leaf["tint"]], dim=1)
@@ -145,5 +145,7 @@ def test_names_are_told_apart(scene, tmp_path):
 def test_rates_rise_with_the_root_of_how_much_shorter_a_run_is(length, factor):
     for iteration in (1, length // 2, length):
         shot = Shot(iteration=iteration, nominal=iteration / length * 30_000, view=0, camera=camera())
-        assert hurried(0.002, 70_000, shot) == pytest.approx(0.002 * factor)
-    assert hurried(0.002, 70_000, Shot(iteration=1, nominal=0.0, view=0, camera=camera())) == 0.002
+        assert rate_for_run_length(0.002, 70_000, shot) == pytest.approx(0.002 * factor)
+    assert (
+        rate_for_run_length(0.002, 70_000, Shot(iteration=1, nominal=0.0, view=0, camera=camera())) == 0.002
+    )

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import device
+from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
@@ -272,7 +272,7 @@ def accelerated(monkeypatch):
 
     def make(model):
         with monkeypatch.context() as patch:
-            patch.setattr(device, "accelerated", lambda _: True)
+            patch.setattr(backend, "accelerated", lambda _: True)
             return SplatAdam(model, RATES)
 
     return make

@@ -10,10 +10,10 @@ from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS
-from ambiguous_wild.splat.gpu.render import render_cuda
+from ambiguous_wild.splat.gpu_render import render_cuda
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients
 from tests.tiny_scene import with_points
@@ -66,7 +66,7 @@ class Tint(Effect):
         self.weight = torch.tensor([0.9, 1.0, 0.7], device=data.device)
 
     def rows(self, gaussians):
-        return {"tint": Row(0.1 * gaussians.means.sin(), rate=1e-3)}
+        return {"tint": GaussianAttribute(0.1 * gaussians.means.sin(), rate=1e-3)}
 
     def shade(self, gaussians, rows, base, shot):
         return shade_of(gaussians, self.weight)(base, rows)

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import readiness
-from ambiguous_wild.splat.gpu import gsplat_seam
+from ambiguous_wild.splat import gsplat_seam, readiness
 from ambiguous_wild.splat.readiness import GpuFacts, choose, why_not
 
 TORCH = {

@@ -11,7 +11,7 @@ from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
@@ -80,7 +80,10 @@ class Number(Effect):
 
     def rows(self, gaussians):
         n = torch.arange(len(gaussians), dtype=torch.float32)
-        return {"number": Row(n[:, None].repeat(1, 2)), "weight": Row(torch.zeros(len(gaussians)), rate=0.1)}
+        return {
+            "number": GaussianAttribute(n[:, None].repeat(1, 2)),
+            "weight": GaussianAttribute(torch.zeros(len(gaussians)), rate=0.1),
+        }
 
 
 EARLY = DensityConfig(start=0, every=1, min_every=20, grow_grad=1e-9, min_reset_spacing=10**9)
@@ -115,7 +118,7 @@ class Carried(Effect):
     name = "carried"
 
     def rows(self, gaussians):
-        return {"gain": Row(torch.zeros(len(gaussians), 1), rate=0.01)}
+        return {"gain": GaussianAttribute(torch.zeros(len(gaussians), 1), rate=0.01)}
 
     def shade(self, gaussians, rows, base, shot):
         gain = gaussians.extra["gain"][rows]

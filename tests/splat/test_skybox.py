@@ -130,7 +130,7 @@ def test_losses_on_size_and_opacity_leave_it_alone(data, tmp_path, method):
     zeros = (torch.zeros_like(getattr(g, name)) for name in PARAMETERS)
     nothing = Gradients(*zeros, screen=torch.zeros(len(g), 2))
     pulled = trainer.density.before_step(SimpleNamespace(gaussians=g), nothing)
-    far = trainer.density.spares(g.means)
+    far = trainer.density.protected(g.means)
     assert far.any() and not pulled.log_scales[far].any() and (pulled.log_scales[~far] > 0).all()
     assert not pulled.opacity_logits[far].any()
     weights = trainer.density.weights(g)
@@ -163,7 +163,7 @@ def test_a_scene_without_points_is_refused_with_a_skybox_too(data, tmp_path):
 def test_without_room_nothing_is_spared(data, tmp_path):
     trainer = trainer_for(data, tmp_path, Parts(density_config=DensityConfig(max_gaussians=100)))
     assert trainer.effects.facts()["skybox"] == {"points": 0}
-    assert not trainer.density.spares(torch.full((3, 3), 1e6)).any()
+    assert not trainer.density.protected(torch.full((3, 3), 1e6)).any()
 
 
 def test_what_is_nowhere_is_removed_with_a_skybox_too(data, tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ambiguous_wild.harness.running.grid import plan_cells
+from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import MaskPolicy, Parts

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.study import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.study.ranking import agreement, bradley_terry
+from ambiguous_wild.study.scores import agreement, bradley_terry
 from tests.study.studies import METHODS, panel, panel_key, write_key, write_panel
 
 STRENGTHS = {"refinesplat": 0.9, "robustsplat": 0.1, "3dgs": -1.0}

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.harness.showing.read import Viewer, view_runs
+from ambiguous_wild.harness.models import Viewer, view_runs
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.viewing.model import Look, Renderer
+from ambiguous_wild.viewing.model import Renderer, RenderSettings
 from ambiguous_wild.viewing.video import fitted
 from tests.chromium import Browser, needs_chromium
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
@@ -109,7 +109,7 @@ def ours(runs: Path, label: str, view: str, size: tuple[int, int]) -> np.ndarray
     camera = next(v.camera for v in scene.views if v.name == view)
     seed = 0 if label == "3dgs" else 1
     (ply,) = (runs / "runs").glob(f"porch/*/seed{seed}/point_cloud.ply")
-    return Renderer(read_splat_ply(ply), Look())(fitted(camera, size, camera.cam_from_world))
+    return Renderer(read_splat_ply(ply), RenderSettings())(fitted(camera, size, camera.cam_from_world))
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

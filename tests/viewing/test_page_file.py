@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.showing.read import Viewer, read_look, view_runs
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.harness.models import Viewer, read_render_settings, view_runs
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.io.splat_formats.spz import read_spz
+from ambiguous_wild.io.spz import read_spz
 from ambiguous_wild.viewing import page_file
-from ambiguous_wild.viewing.model import Look
+from ambiguous_wild.viewing.model import RenderSettings
 from ambiguous_wild.viewing.page_file import importance, reduced
 from tests.command_line import aw
 from tests.harness.board_runs import change_result
@@ -219,10 +219,10 @@ def test_a_notebook_shows_the_page_in_a_frame(runs: Path) -> None:
 def test_a_stranger_s_method_name_imports_no_file(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef recipe(options): ...\n")
     config = {"method": f"{tmp_path / 'evil.py'}:recipe", "options": {}}
-    look, note = read_look(config)
-    assert not (tmp_path / "ran").exists() and look == Look() and "--plugin" in note
-    assert read_look({"method": "3dgs", "options": {}, "effects": ["antialias"]})[0].antialias
-    assert read_look({"method": "3dgs", "options": {"gone": 1}})[1] != ""
+    look, note = read_render_settings(config)
+    assert not (tmp_path / "ran").exists() and look == RenderSettings() and "--plugin" in note
+    assert read_render_settings({"method": "3dgs", "options": {}, "effects": ["antialias"]})[0].antialias
+    assert read_render_settings({"method": "3dgs", "options": {"gone": 1}})[1] != ""
 
 
 def test_photos_and_masks_stay_below_their_share_of_the_page(runs: Path, tmp_path: Path) -> None:

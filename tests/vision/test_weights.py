@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.hashing import sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.vision import fetch, weights
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import locate

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from ambiguous_wild.cli import checks
 from ambiguous_wild.cli.weights import command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.lock import folder_lock
+from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.vision import fetch, weight_files, weights
 from ambiguous_wild.vision.backends import make_features

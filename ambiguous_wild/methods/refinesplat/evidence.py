@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, Spread
-from ambiguous_wild.methods.refinesplat.entropy import Statistic, contrast, entropy, surprise
 from ambiguous_wild.methods.refinesplat.identity import Psi
 from ambiguous_wild.methods.refinesplat.ranks import spread_of
 from ambiguous_wild.methods.refinesplat.structure import box, resized
+from ambiguous_wild.methods.refinesplat.threshold import Statistic, contrast, entropy, surprise
 
 _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 

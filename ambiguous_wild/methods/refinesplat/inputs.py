@@ -10,9 +10,15 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Scene
-from ambiguous_wild.methods.refinesplat.association import Identities, associate
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.identity import Psi, psi_arrays, psi_from_arrays, train_psi
+from ambiguous_wild.methods.refinesplat.identity import (
+    Identities,
+    Psi,
+    associate,
+    psi_arrays,
+    psi_from_arrays,
+    train_psi,
+)
 from ambiguous_wild.methods.refinesplat.masks import instance_means
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.mask_ops import add_new

@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
+from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig, SupportConfig
 from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig
-from ambiguous_wild.methods.refinesplat.support import SupportConfig
 from ambiguous_wild.vision.backends import BY_MACHINE, first_here
 
 # Masks by entropy (Eqs. 3 to 7). Two forms are repaired: Kapur's for the additive objective of T_ent, and the

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ambiguous_wild.io.atomic import atomic_path
+from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig

@@ -2,15 +2,329 @@
 
 Source: "Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios" (WACV 2027
 submission).
+
+RefineSplat's mask policy: when masks are made and refreshed, what is learnt and saved.
+
+L_id and the consistency regulariser L_cr (RefineSplat, Eq. 13), and their gradient to the image.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
+from ambiguous_wild.methods.masking_common import PausingMask, upsampled
+from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
-from ambiguous_wild.methods.refinesplat.policy import RefineSplatMask
+from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, silence
+from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look, masked_share
+from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
+from ambiguous_wild.methods.refinesplat.masks import Judged, Masks, MaskStore
+from ambiguous_wild.methods.refinesplat.threshold import Variant
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
-from ambiguous_wild.splat.parts import Parts, Schedule
+from ambiguous_wild.splat.data import shrink_keep
+from ambiguous_wild.splat.losses import photometric
+from ambiguous_wild.splat.parts import Parts, Schedule, State
+from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.vision.backends import make_features, make_instances
+from ambiguous_wild.vision.moving import moving_labels, moving_map
+from ambiguous_wild.vision.protocols import Features, Instances
+from ambiguous_wild.vision.segments import GraphSegments
+from ambiguous_wild.vision.sparse_surface import static_surfaces
+
+
+def identity_loss(
+    logits: Tensor,  # [n, P]
+    identities: Tensor,  # [n] int64 in 0..P; 0 = none
+    weights: Tensor,  # [n] >= 0, the keep map at these cells
+    variant: Variant = "sigmoid",
+) -> Tensor:
+    """L_id = CE(psi(phi(render)), identities), a mean over cells weighted by keep.
+
+    Without weights it would make the render show the distractor. sigmoid: binary cross-entropy, one against
+    rest, summed over identities; cells without identity are ignored.
+    """
+    counts = weights * (identities > 0)
+    index = (identities - 1).clamp(min=0)[:, None]
+    if variant == "sigmoid":
+        # sum_k softplus(E_k) - E_target: binary cross-entropy against a one-hot target
+        cells = F.softplus(logits).sum(1) - logits.gather(1, index)[:, 0]
+    elif variant == "softmax":
+        cells = -F.log_softmax(logits, 1).gather(1, index)[:, 0]
+    else:
+        raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
+    return (counts * cells).sum() / counts.sum().clamp(min=1e-6)
+
+
+def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoid") -> Tensor:
+    """L_cr = 1/K sum_j mean_{p,q in j} KL(sigma(E(p)) || sigma(E(q))), in O(N).
+
+    Printed as a double loop over pixel pairs. With s = sigma(E), the mean of s_p (log s_p - log s_q) over
+    pairs is mean_p[s log s] - mean_p[s] mean_q[log s], per channel; with the same for 1 - s, the covariance
+    of s and E.
+
+    Args:
+        logits: [n, P].
+        one_hot: [K, n] float, membership of each cell in each instance (weights are allowed: keep).
+            Instances without cells are ignored.
+        variant: sigmoid sums both sides of each channel; softmax has one distribution.
+    """
+    sizes = one_hot.sum(1)
+    used = sizes > 0
+    # instances without cells stay, with weights of 0: which they are is not read on the host
+    weights = one_hot / torch.where(used, sizes, 1.0)[:, None]
+    # logits beyond +-1e4 are saturated; the clamp keeps products finite
+    logits = logits.clamp(-1e4, 1e4)
+    if variant == "sigmoid":
+        # both sides of a channel in one: log s - log(1 - s) is the logit
+        s, log_s = torch.sigmoid(logits), logits
+    elif variant == "softmax":
+        s, log_s = torch.softmax(logits, 1), F.log_softmax(logits, 1)
+    else:
+        raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
+    of = one_hot.argmax(0)  # the instance of each cell; cells without one have weight 0
+    with torch.no_grad():  # the means have no gradient: deviations from them sum to 0
+        middle, middle_log = (weights @ s)[of], (weights @ log_s)[of]
+    # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: if the cells agree, the first form is a
+    # difference of numbers that are equal to seven digits
+    total = weights @ ((s - middle) * (log_s - middle_log)).sum(1)
+    return total.sum() / used.sum().clamp(min=1)
+
+
+def instance_matrix(labels: Tensor, count: int, weights: Tensor | None = None) -> Tensor:
+    """Membership [count, n] float32 of cells in instances 1..count; labels [n], 0 = none.
+
+    A dense matrix instead of scatter adds: sums by matmul repeat bit for bit.
+    """
+    ids = torch.arange(1, count + 1, device=labels.device)
+    matrix = (labels[None, :] == ids[:, None]).float()
+    return matrix if weights is None else matrix * weights[None, :]
+
+
+class RefineSplatMask(PausingMask):
+    """Entropy-aware local and global masks, cached per view and refreshed as the render improves."""
+
+    config: RefineSplatConfig
+    inputs: FrozenInputs
+    masks: MaskStore  # makes and keeps them
+
+    def __init__(
+        self,
+        config: RefineSplatConfig,
+        features: Features | None = None,
+        instances: Instances | None = None,
+    ) -> None:
+        self.config = config
+        self.features = features or make_features(config.features)
+        self.instances = instances or _instances(config)
+        self.visits: dict[int, int] = {}  # view: steps since masks began
+        self.points: dict[str, MotionPoints] = {}  # of the scene, by the photo's name
+        self.looks: dict[int, FirstLook] = {}  # view: its comparison with other photos, if there is one
+
+    def setup(self, data: TrainData) -> None:
+        self.data = data
+        self.inputs = FrozenInputs(data, self.features, self.instances, self.config)
+        config = self.config
+        if self._reads_identities:
+            _ = self.inputs.semantics  # computed now, as a cost of the method before its first step
+        photos = [photo.cpu().numpy() for photo in data.photos]
+        surfaces = static_surfaces(data.cameras, data.scene.points.sure_xyz)
+        if config.first_look.on:
+            moving = self._moving(surfaces) if config.first_look.motion > 0 else None
+            found = first_look(data.cameras, photos, surfaces, config.first_look, moving)
+            self.looks = {view: look for view, look in enumerate(found) if look is not None}
+        self.masks = MaskStore(
+            config, photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
+            data.device, self.compare, data.photos,
+        )  # fmt: skip
+        # view: keep map before masks begin, [H, W] float32; absent if everything is kept
+        self.first = {
+            view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
+            for view, look in self.looks.items()
+            if (keep := look.keep(photos[view].shape[:2])) is not None
+        }
+
+    def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
+        """What moves in each photo, of its surface's shape; None where nothing is known."""
+        points = self.points = read_motion_points(self.data.scene.root)
+        data = self.data
+        found: list[np.ndarray | None] = [None] * len(surfaces)
+        for k, (view, surface) in enumerate(zip(data.scene.train, surfaces, strict=True)):
+            known, photo, labels = points.get(view.name), data.photos[k], self.inputs.labels[k]
+            if known is not None and surface is not None:
+                labels = moving_labels(self.instances, photo, labels, known, data.cache_dir)
+                found[k] = moving_map(known, labels, surface.shape)
+        return found
+
+    def keep(self, step: Step) -> Tensor | None:
+        if not self.begun(step):
+            first = self.first.get(step.view)
+            return None if first is None else shrink_keep(first, step.divisor)
+        visit = self.visits.get(step.view, 0)
+        due = step.view not in self.masks.keeps or visit % self.config.mask_every == 0
+        if due and not self.paused(step):
+            self.masks.renew(step)
+        self.visits[step.view] = visit + 1
+        keep = self.masks.keeps.get(step.view)
+        if keep is not None and self.config.factor == "transient":
+            keep = 1.0 - keep
+        return None if keep is None else shrink_keep(keep, step.divisor)
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
+        """d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
+        config = self.config
+        if not self.regularises() or not self.begun(step) or step.iteration % config.entropy_every:
+            return None
+        if self.inputs.semantics.psi is None:
+            return None
+        image = step.rendered.image.detach().clone().requires_grad_(True)
+        with torch.enable_grad():
+            loss = self._entropy_terms(image, step, keep)
+            (gradient,) = torch.autograd.grad(loss, image)
+        return self._limited(gradient, step, keep) * config.entropy_every
+
+    def _limited(self, gradient: Tensor, step: Step, keep: Tensor | None) -> Tensor:
+        """The entropy terms' gradient, no longer than `entropy_limit` times that of L_GS (L2, all pixels)."""
+        config = self.config
+        if config.entropy_limit <= 0:
+            return gradient
+        photo = photometric(
+            step.rendered.image, step.photo, keep, lambda_dssim=config.lambda_dssim, weighting=config.ssim
+        )
+        longest = config.entropy_limit * torch.linalg.vector_norm(photo.d_image)
+        # a product, not a test: on an accelerator the host does not wait for it
+        return gradient * (longest / torch.linalg.vector_norm(gradient).clamp(min=1e-30)).clamp(max=1.0)
+
+    def regularises(self) -> bool:
+        return self.config.lambda_id > 0 or self.config.lambda_cr > 0
+
+    def predict(self, step: Step) -> Tensor | None:
+        if not self.begun(step):
+            return None
+        return shrink_keep(self.masks.examine(step)[1].keep, step.divisor)
+
+    def facts(self) -> dict[str, Any]:
+        shares = self.shares
+        rows = np.array([shares[view] for view in sorted(shares)], dtype=np.float64).reshape(-1, 4)
+        finite = rows[np.isfinite(rows[:, 3]), 3]
+        mean = rows[:, :3].mean(axis=0) if len(rows) else np.zeros(3)
+        return {
+            "masked_share": float(mean[0]),
+            "masked_share_local": float(mean[1]),
+            "masked_share_global": float(mean[2]),
+            "t_ent_mean": float(finite.mean()) if len(finite) else None,
+            "w2": self.w2,
+            # of a photo, in the mean: what the first look masks
+            "first_look_share": masked_share([look.passing for look in self.looks.values()]),
+            # pictures may read identities that the training never used
+            "identities": self.inputs.semantics.found.count if self._reads_identities else None,
+        }
+
+    @property
+    def _reads_identities(self) -> bool:
+        """Whether masks or losses do; pictures do anyway."""
+        return self.config.mask.needs_identities or self.regularises()
+
+    @property
+    def w2(self) -> float:
+        """Weight of T_ent's lower subset, learnt or fixed."""
+        return self.masks.w2
+
+    @property
+    def shares(self) -> dict[int, tuple[float, float, float, float]]:
+        """View: share masked in all, locally, globally, and T_ent when its mask was last made."""
+        return self.masks.shares
+
+    @property
+    def judged(self) -> dict[int, Judged]:
+        """View: its instances when its mask was last made."""
+        return self.masks.judged
+
+    def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
+        """The maps of the step's view and its masks at the photo's own size.
+
+        Args:
+            step: of any train view.
+            remember: whether the evidence is stored for other views; else nothing is kept.
+        """
+        return self.masks.examine(step, remember=remember)
+
+    @torch.no_grad()
+    def compare(self, step: Step) -> Maps:
+        """Entropy and distances on the feature grid, from the step's render."""
+        found, mask = self.inputs.semantics, self.config.mask
+        features = self.inputs.features
+        image = upsampled(step.rendered.image, *self.data.photos[step.view].shape[:2])
+        maps = compare(found.phi[step.view], features(image), found.psi, features.unit, mask)
+        h, w = maps.distance.shape
+        alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
+        return silence(maps, alpha < mask.least_alpha)
+
+    def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
+        inputs, config = self.inputs.semantics, self.config
+        assert inputs.psi is not None  # cotangent returned before
+        logits = inputs.psi(self.inputs.features(upsampled(image, *self.data.photos[step.view].shape[:2])))
+        h, w, channels = logits.shape
+        flat = logits.reshape(-1, channels)
+        # unweighted, the capture's own masks still hold
+        own = self.data.user_keep[step.view]
+        everywhere = _cells(None if own is None else shrink_keep(own, step.divisor), h, w, image)
+        kept = _cells(keep, h, w, image)
+        variant = config.mask.variant
+        loss = (flat * 0.0).sum()
+        if config.lambda_id > 0:
+            ids = inputs.identities[step.view].reshape(-1)
+            weights = kept if config.weigh_id else everywhere
+            loss = loss + config.lambda_id * identity_loss(flat, ids, weights, variant)
+        count = self.inputs.counts[step.view]
+        if config.lambda_cr > 0 and count:
+            weights = kept if config.weigh_cr else everywhere
+            member = instance_matrix(inputs.grid[step.view].reshape(-1), count, weights)
+            loss = loss + config.lambda_cr * consistency_loss(flat, member, variant)
+        return loss
+
+    def panels(self, step: Step) -> dict[str, np.ndarray]:
+        return pictures.panels(self, step, begun=self.begun(step))
+
+    def draw(self, folder: Path) -> list[Path]:
+        return pictures.draw_entropies(self, folder)
+
+    def state_dict(self) -> State:
+        psi = self.inputs.semantics.psi if self.inputs.has_semantics else None
+        return {
+            **self.masks.state_dict(),
+            "visits": {str(view): count for view, count in self.visits.items()},
+            "last_reset": self.last_reset,
+            # the last bits of psi's training may differ on another machine: a run goes on with the same one
+            "psi": None if psi is None else dict(psi.state_dict()),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        self.masks.load_state_dict(state)
+        self.visits = {int(v): int(count) for v, count in state["visits"].items()}
+        self.last_reset = int(state["last_reset"])
+        if state["psi"] is not None and self.inputs.semantics.psi is not None:
+            self.inputs.semantics.psi.load_state_dict(state["psi"])
+
+
+def _cells(keep: Tensor | None, h: int, w: int, like: Tensor) -> Tensor:
+    """Weights [h * w] of cells under a keep map [H, W]: a cell counts only if every pixel in it is kept."""
+    if keep is None:
+        return torch.ones(h * w, device=like.device)
+    return -F.adaptive_max_pool2d(-keep[None, None], (h, w)).reshape(-1)
+
+
+def _instances(config: RefineSplatConfig) -> Instances:
+    return GraphSegments(config.segments) if config.instances == "graph" else make_instances(config.instances)
+
 
 Config = RefineSplatConfig
 

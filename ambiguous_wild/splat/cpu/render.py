@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.cpu import bins, blend, harmonics, project, reverse
+from ambiguous_wild.splat.cpu import bins, blend, project, reverse
 from ambiguous_wild.splat.cpu.buffers import Pool
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -221,7 +221,7 @@ def render_cpu(
     if gaussians.postponed is not None:
         gaussians.postponed.make(ids[slots])
     base = None if shade is None else np.empty((n, 3), np.float32)
-    harmonics.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii, base)
+    project.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii, base)
     slots = bins.visible_slots(ids, counts)
     shaded = None if shade is None or base is None else _shade(shade, base, ids, slots, records)
     order = bins.depth_order(slots, records)

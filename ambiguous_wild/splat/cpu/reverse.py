@@ -22,13 +22,15 @@ from ambiguous_wild.splat.cpu.blend import (
     SUM_SQUARED,
 )
 from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
-from ambiguous_wild.splat.cpu.harmonics import C0, basis, direction_gradient
 from ambiguous_wild.splat.cpu.project import (
     BLUE,
+    C0,
     CHUNK,
     GREEN,
     GROUP,
     RED,
+    basis,
+    direction_gradient,
     footprint,
     in_camera,
     shape_of,

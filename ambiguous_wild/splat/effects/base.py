@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import (
     Cotangents,
@@ -56,7 +56,7 @@ class Effect:
     def setup(self, data: TrainData) -> None:
         """Called once before the first step, and again when a run resumes."""
 
-    def rows(self, gaussians: Gaussians) -> Mapping[str, Row]:
+    def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
         """What every Gaussian carries for this effect from the start, by name: `Gaussians.extra`."""
         return {}
 
@@ -190,7 +190,7 @@ def decayed(first: float, last: float, progress: float) -> float:
     return float(first * (last / first) ** progress)
 
 
-def hurried(rate: float, made_for: int, shot: Shot) -> float:
+def rate_for_run_length(rate: float, made_for: int, shot: Shot) -> float:
     """A learning rate of Adam for a run of another length than the rate was published for.
 
     Times the root of how many times shorter the run is, at most 10; a longer run gets the rate itself. Adam's

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat.effects.base import Effect, State
-from ambiguous_wild.splat.field import Row
+from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import frames_of, renders_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
@@ -58,13 +58,13 @@ class Chain:
     def _with(self, hook: str, without: Collection[str] = ()) -> tuple[Effect, ...]:
         return tuple(e for e in self.effects if e.name not in without and e.acts(hook))
 
-    def rows(self, gaussians: Gaussians) -> dict[str, Row]:
+    def rows(self, gaussians: Gaussians) -> dict[str, GaussianAttribute]:
         """What every Gaussian carries for the effects.
 
         Raises:
             AwError: two effects carry something under the same name.
         """
-        found: dict[str, Row] = {}
+        found: dict[str, GaussianAttribute] = {}
         for effect in self._with("rows"):
             for name, row in effect.rows(gaussians).items():
                 if name in found:
@@ -74,8 +74,8 @@ class Chain:
                 found[name] = row
         return found
 
-    def spares(self) -> Callable[[Tensor], Tensor] | None:
-        """Which rows density control leaves alone, from means [N, 3]; None = no effect spares any."""
+    def protected(self) -> Callable[[Tensor], Tensor] | None:
+        """Which rows density control leaves alone, from means [N, 3]; None = no effect protected any."""
         sparing = self._with("spared")
         if not sparing:
             return None
@@ -94,7 +94,7 @@ class Chain:
         pulls = []
         for effect in self._with("model", without):
             changed, pull = effect.model(gaussians, shot)
-            gaussians = changed.settling_like(gaussians)
+            gaussians = changed.share_pending_updates(gaussians)
             pulls.append(pull)
         return gaussians, pulls
 
@@ -113,7 +113,7 @@ class Chain:
             frame, pull = effect.image(frame, shot)
             frame_pulls.append(pull)
         posing = () if shot.view is None else self._with("pose", without)
-        return Drawn(rendered, frame.image, frame.alpha, drawn, shot, model_pulls, frame_pulls, posing)
+        return EffectRender(rendered, frame.image, frame.alpha, drawn, shot, model_pulls, frame_pulls, posing)
 
     def _shade(self, drawn: Gaussians, shot: Shot, without: Collection[str]) -> Shade | None:
         shading = self._with("shade", without)
@@ -210,7 +210,7 @@ def _pull_all(pulls: Sequence[ShadePull], d_colours: Tensor) -> ShadeGradients:
     return found
 
 
-class Drawn:
+class EffectRender:
     """A `Rendered` whose picture went through the image effects and whose gradients go back through all."""
 
     def __init__(

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, hurried
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, rate_for_run_length
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.rendered import (
     Cotangents,
@@ -41,7 +41,9 @@ class Leaf:
     final: float = 1.0  # it decays exponentially to this share
     per_photo: bool = False  # a row for every photo, and one for a test photo
     fit_rate: float = 0.1  # Adam's while a test photo's row is fitted (WildGaussians)
-    made_for: int | None = None  # iterations that the rate is for: shorter runs get more, see `hurried`
+    made_for: int | None = (
+        None  # iterations that the rate is for: shorter runs get more, see `rate_for_run_length`
+    )
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,7 @@ class Learnt(Effect):
             row = shot.view if leaf.per_photo else 0
             assert row is not None
             rate = decayed(leaf.rate, leaf.rate * leaf.final, shot.progress)
-            rate = rate if leaf.made_for is None else hurried(rate, leaf.made_for, shot)
+            rate = rate if leaf.made_for is None else rate_for_run_length(rate, leaf.made_for, shot)
             self._adam[name].step(row, gradient, rate, called_off)
 
     def begin_fit(self) -> None:

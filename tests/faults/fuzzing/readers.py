@@ -19,15 +19,15 @@ import numpy as np
 import yaml
 
 from ambiguous_wild.core.weight_files import read_tensors
-from ambiguous_wild.harness.audit.table import read_tables
-from ambiguous_wild.harness.leaderboard import board, pictures
-from ambiguous_wild.harness.planning.decide import read_plan
-from ambiguous_wild.harness.running.run import refuse_other_config
-from ambiguous_wild.harness.running.store import read_runs
+from ambiguous_wild.harness.effects_plan import read_plan
+from ambiguous_wild.harness.run import refuse_other_config
+from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io import archive, images, ply, scene_folder
 from ambiguous_wild.io.photos import read_photo
+from ambiguous_wild.report import board, board_pictures
+from ambiguous_wild.report.audit_numbers import read_tables
 from ambiguous_wild.simulate import capture, spec_file
-from ambiguous_wild.simulate.composite.cutouts import read_cutouts
+from ambiguous_wild.simulate.cutouts import read_cutouts
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.study.answers import read_answers, read_key
 from ambiguous_wild.vision.label_maps import read_labels
@@ -95,8 +95,8 @@ def _scene_json(path: Path) -> None:
 
 
 def _result(path: Path) -> None:
-    from ambiguous_wild.harness.tables.comparison import comparison
-    from ambiguous_wild.harness.tables.plain_formats import to_wide_csv
+    from ambiguous_wild.report.comparison import comparison
+    from ambiguous_wild.report.plain_formats import to_wide_csv
 
     runs = valid.workshop() / "results" / "scene" / "m" / "seed0"
     runs.mkdir(parents=True, exist_ok=True)
@@ -123,7 +123,7 @@ def _board_images(path: Path) -> None:
     kept = path.parent / "board" / "measured" / "images"
     kept.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, kept / "index.csv")
-    pictures.read_index(kept.parent.parent)
+    board_pictures.read_index(kept.parent.parent)
 
 
 def _answer(path: Path) -> None:

@@ -24,10 +24,10 @@ import numpy as np
 import torch
 import yaml
 
-from ambiguous_wild.harness.leaderboard import pictures
-from ambiguous_wild.harness.leaderboard.board import Entry, board_csv, wide
 from ambiguous_wild.io import images, ply
 from ambiguous_wild.io.colmap_model import write_model
+from ambiguous_wild.report import board_pictures
+from ambiguous_wild.report.board import Entry, board_csv, wide
 from ambiguous_wild.simulate import spec_file
 from ambiguous_wild.simulate.presets import preset
 from ambiguous_wild.splat import checkpoint
@@ -152,7 +152,7 @@ def configs() -> list[bytes]:
 
 @functools.cache
 def scene_jsons() -> list[bytes]:
-    from ambiguous_wild.io.hashing import sha256_file
+    from ambiguous_wild.io.files import sha256_file
 
     path = scene("scene.json") / "images" / "0.png"
     file = {"sha256": sha256_file(path), "bytes": path.stat().st_size}
@@ -170,7 +170,7 @@ def results() -> list[bytes]:
 
 @functools.cache
 def plans() -> list[bytes]:
-    from ambiguous_wild.harness.planning.decide import SCHEMA, Decision
+    from ambiguous_wild.harness.effects_plan import SCHEMA, Decision
 
     row = dict.fromkeys(Decision.__dataclass_fields__, "x")
     row |= {"decision": "on", "value": 0.5, "threshold": 0.1}  # type: ignore[dict-item]
@@ -243,11 +243,11 @@ def boards() -> list[bytes]:
 
 @functools.cache
 def board_images() -> list[bytes]:
-    place = pictures._Place("tiny", "a, b", "1.png", "=m", "2000 iterations")
-    kept = pictures.folder_of(workshop() / "board")
-    pictures._write(workshop() / "board", place, encoded(".png", picture()), "0", 20.5, index := {})
-    pictures._write_index(workshop() / "board", index.values())
-    return [(kept / pictures.INDEX).read_bytes()]
+    place = board_pictures._Place("tiny", "a, b", "1.png", "=m", "2000 iterations")
+    kept = board_pictures.folder_of(workshop() / "board")
+    board_pictures._write(workshop() / "board", place, encoded(".png", picture()), "0", 20.5, index := {})
+    board_pictures._write_index(workshop() / "board", index.values())
+    return [(kept / board_pictures.INDEX).read_bytes()]
 
 
 @functools.cache

@@ -1,0 +1,253 @@
+"""`aw package`: scenes as archives with checksums, Croissant metadata and a data card.
+
+Two packages of the same scenes have the same bytes: files are stored uncompressed, sorted by name, with one
+fixed time, and nothing of the machine is written.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.names import check_name
+from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
+from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, ambiguity_line, card, croissant
+from ambiguous_wild.io.files import atomic_dir, check_output, list_names, refuse_foreign_files
+from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
+
+FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
+PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
+FIXED = ("README.md", "croissant.json", "files.csv", "photos.csv", "checksums.sha256", "checksums.md5")
+_TIME = (1980, 1, 1, 0, 0, 0)  # the earliest that zip can hold
+_DROPPED = ("seconds",)  # keys of scene.json that differ between two builds of one scene
+_PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic")
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A finished package."""
+
+    folder: Path
+    scenes: tuple[str, ...]
+    lacking: tuple[str, ...]  # fields that keep it from release
+    bytes: int
+    stripped: int  # photos that lost metadata
+    people: tuple[str, ...] | None  # photos in which a person may be seen
+
+
+def package_scenes(
+    scenes: Sequence[Path],
+    output: Path,
+    info: ReleaseInfo,
+    *,
+    keep_metadata: bool = False,
+    look_for_people: bool = True,
+    jobs: int = 1,
+    progress: bool = False,
+) -> Packed:
+    """Pack scene folders into `output`, which appears complete or not at all.
+
+    Args:
+        scenes: scene folders with scene.json.
+        output: the folder to make; an earlier package in it is replaced.
+        info: licence, consent and the rest.
+        keep_metadata: leave EXIF with places and serial numbers in the photos.
+        look_for_people: run the detectors of `people`.
+        jobs: threads.
+        progress: show bars.
+
+    Raises:
+        AwError: a scene is damaged, has no scene.json, or two have one name.
+    """
+    opened = [_open(Path(path)) for path in scenes]
+    names = [name for _, name, _ in opened]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise AwError(f"two scenes are called {twice[0]}: their archives would be one file; rename one")
+    check_output(output)
+    if output.is_dir() and any(output.iterdir()):
+        ours = {*FIXED, *(n for n in list_names(output) if n.endswith(".zip"))}
+        if not (output / "croissant.json").is_file():
+            raise AwError(f"{output} exists and is no package; choose another -o")
+        refuse_foreign_files(output, ours)
+    bar = Bar(progress)
+    file_rows: list[list[Any]] = []
+    photo_rows: list[list[Any]] = []
+    packed: list[PackedFile] = []
+    stripped = 0
+    with atomic_dir(output) as folder:
+        for root, name, scene_info in opened:
+            found = _people(root, scene_info, jobs, bar) if look_for_people else {}
+            rows, photos = _pack(root, name, scene_info, folder / f"{name}.zip", keep_metadata, bar)
+            file_rows += rows
+            for photo in photos:
+                stripped += bool(photo[5])
+                photo_rows.append([*photo, found.get(photo[1], "")])
+            packed.append(_described(folder / f"{name}.zip", "application/zip"))
+        for table, head, rows in (("files.csv", FILES, file_rows), ("photos.csv", PHOTOS, photo_rows)):
+            (folder / table).write_text(_csv(head, rows), encoding="utf-8")
+            packed.append(_described(folder / table, "text/csv"))
+        people = [f"{r[0]}/{r[1]}" for r in photo_rows if r[6]] if look_for_people else None
+        facts = [_facts(name, scene_info) for _, name, scene_info in opened]
+        lines = [ambiguity_line(f["name"], f["ambiguity"]) for f in facts]
+        made = croissant(info, names, packed, {"files.csv": FILES, "photos.csv": PHOTOS}, lines)
+        (folder / "croissant.json").write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n", "utf-8")
+        (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
+        for kind in ("sha256", "md5"):
+            every = [*packed, *(_described(folder / n, "") for n in ("croissant.json", "README.md"))]
+            text = "".join(f"{getattr(f, kind)}  {f.name}\n" for f in sorted(every, key=lambda f: f.name))
+            (folder / f"checksums.{kind}").write_text(text, encoding="utf-8")
+    bar.finish()
+    size = sum(f.bytes for f in packed)
+    return Packed(
+        output, tuple(names), tuple(info.lacking), size, stripped, None if people is None else tuple(people)
+    )
+
+
+def _open(root: Path) -> tuple[Path, str, dict[str, Any]]:
+    info = read_scene_json(root)
+    if info is None:
+        raise AwError(
+            f"{root} has no scene.json: import it with 'aw import', or build it with 'aw build-scene'"
+        )
+    verify_files(root, info)
+    load_scene(root, verify=False)
+    return root, check_name("scene name", str(info.get("name", root.name))), dict(info)
+
+
+def _people(root: Path, info: dict[str, Any], jobs: int, bar: Bar) -> dict[str, str]:
+    """Photo -> what the detectors found; only photos with a find."""
+    views = load_scene(root, verify=False).views
+    bar.start("looking for people", len(views))
+
+    def one(path: Path) -> str:
+        found = may_show_person(path)
+        bar.step()
+        return found
+
+    with ThreadPoolExecutor(jobs) as pool:
+        found = list(pool.map(one, [v.image_path for v in views]))
+    bar.finish()
+    return {v.name: text for v, text in zip(views, found) if text}
+
+
+def _pack(
+    root: Path, name: str, info: dict[str, Any], archive: Path, keep_metadata: bool, bar: Bar
+) -> tuple[list[list[Any]], list[list[Any]]]:
+    """Write one archive; rows of files.csv and of photos.csv."""
+    split = {
+        line: side
+        for side in ("train", "test")
+        if (root / f"{side}_list.txt").is_file()
+        for line in (root / f"{side}_list.txt").read_text(encoding="utf-8").splitlines()
+    }
+    stems = {str(PurePosixPath(n).with_suffix("")): n for n in split}
+    removed: dict[str, set[str]] = {}
+    rows = []
+    names = sorted(info["files"])
+    bar.start(f"packing {name}", len(names))
+    listed = {}
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as target:
+        for path in names:
+            data = (root / path).read_bytes()
+            photo = _photo_of(path, stems)
+            if not keep_metadata and _is_photo(path):
+                data, dropped = strip_metadata(data, str(root / path))
+                if dropped and photo is not None:
+                    removed.setdefault(photo, set()).update(dropped)
+            listed[path] = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+            _add(target, f"{name}/{path}", data)
+            role, side = _role(path), split.get(photo or "", "")
+            rows.append([name, archive.name, path, role, side, listed[path]["sha256"], len(data)])
+            bar.step()
+        kept = {k: v for k, v in info.items() if k not in (*_DROPPED, "files")}
+        record = json.dumps({**kept, "files": listed}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        data = record.encode("utf-8")
+        _add(target, f"{name}/scene.json", data)
+        rows.append(
+            [name, archive.name, "scene.json", "record", "", hashlib.sha256(data).hexdigest(), len(data)]
+        )
+    bar.finish()
+    known: Any = info.get("photos")
+    photos = []
+    for photo, side in sorted(split.items()):
+        fact = known.get(photo) if isinstance(known, dict) else None
+        fact = fact if isinstance(fact, dict) else {}
+        done = "; ".join(map(str, fact.get("notes") or [])) or "undistorted and stored as PNG where needed"
+        dropped_here = ", ".join(sorted(removed.get(photo, ())))
+        photos.append([name, photo, side, fact.get("source", ""), done, dropped_here])
+    return rows, photos
+
+
+def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    entry = zipfile.ZipInfo(name, _TIME)
+    entry.compress_type, entry.create_system, entry.external_attr = zipfile.ZIP_STORED, 3, 0o644 << 16
+    archive.writestr(entry, data)
+
+
+def _is_photo(path: str) -> bool:
+    return path.lower().endswith(_PHOTO_KINDS)
+
+
+def _photo_of(path: str, stems: dict[str, str]) -> str | None:
+    """The listed photo that a file under images*/ or masks/train is of."""
+    parts = PurePosixPath(path).parts
+    if len(parts) < 2 or not parts[0].startswith(("images", "masks")):
+        return None
+    rest = parts[2:] if parts[0] == "masks" else parts[1:]
+    return stems.get(str(PurePosixPath(*rest).with_suffix(""))) if rest else None
+
+
+def _role(path: str) -> str:
+    top = path.partition("/")[0]
+    roles = {"sparse": "model", "masks": "mask", "truth": "truth"}
+    if top.startswith("images"):
+        return "photo"
+    return roles.get(top, "list" if path.endswith(".txt") else "record")
+
+
+def _facts(name: str, info: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "name": name,
+        "license": str(info.get("license", "not stated")),
+        "counts": info.get("counts") if isinstance(info.get("counts"), dict) else {},
+        "factor": info["factor"],
+        "ambiguity": info.get("ambiguity") if isinstance(info.get("ambiguity"), dict) else None,
+    }
+
+
+def _described(path: Path, kind: str) -> PackedFile:
+    sha256, md5, size = hashlib.sha256(), hashlib.md5(usedforsecurity=False), 0
+    with open(path, "rb") as f:
+        while chunk := f.read(1 << 20):
+            sha256.update(chunk)
+            md5.update(chunk)
+            size += len(chunk)
+    return PackedFile(path.name, sha256.hexdigest(), md5.hexdigest(), size, kind)
+
+
+def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """CSV whose cells no spreadsheet takes for formulas."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    for row in rows:
+        writer.writerow([_cell(value) for value in row])
+    return out.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, int):
+        return value
+    text = "".join(c if c.isprintable() else " " for c in str(value))
+    return "'" + text if text[:1] in ("=", "+", "-", "@") else text

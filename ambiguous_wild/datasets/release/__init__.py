@@ -1,1 +1,0 @@
-"""Scenes packed for release, and the check of such a package."""

@@ -1,0 +1,183 @@
+"""`aw verify`: check a package, or one archive of it, that may come from anybody."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.datasets.package import FILES, FIXED
+from ambiguous_wild.datasets.release_facts import NOT_FOR_RELEASE, VERSION
+from ambiguous_wild.io.archive import extract
+from ambiguous_wild.io.files import list_names, sha256_file
+from ambiguous_wild.io.images import image_size
+from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
+
+_LARGEST = 50_000_000  # bytes of a text file of a package
+
+
+@dataclass
+class Verified:
+    """What was checked."""
+
+    scenes: list[str] = field(default_factory=list)
+    files: int = 0
+    warnings: list[str] = field(default_factory=list)  # it is whole, but not ready for release
+
+
+def verify(path: Path, *, scratch: Path | None = None) -> Verified:
+    """Check checksums, tables, metadata and every scene of a package folder, or one scene's archive.
+
+    Archives are unpacked into a temporary folder, which is removed.
+
+    Args:
+        path: the folder or the .zip.
+        scratch: where to unpack; None = the system's temporary folder.
+
+    Raises:
+        AwError: the first thing that is wrong, with its file.
+    """
+    if path.is_file():
+        found = Verified()
+        _scene(path, None, found, scratch)
+        return found
+    if not path.is_dir():
+        raise AwError(f"there is no package {path}")
+    absent = [name for name in FIXED if not (path / name).is_file()]
+    if absent:
+        raise AwError(f"{path} is no whole package: {shortlist(absent)} absent; copy it again")
+    sums = _checksums(path / "checksums.sha256")
+    extra = sorted(set(list_names(path)) - set(sums) - {"checksums.sha256", "checksums.md5"})
+    if extra:
+        raise AwError(
+            f"{path} holds files that its checksums do not list: {shortlist(extra)}; do not trust it"
+        )
+    for name, digest in sums.items():
+        file = path / name
+        if not file.is_file() or file.is_symlink():
+            raise AwError(f"{file} is absent or a link; copy the package again")
+        if sha256_file(file) != digest:
+            raise AwError(f"{file} is not what checksums.sha256 recorded: damaged or changed; copy it again")
+    _check_md5(path)
+    _check_croissant(path, sums)
+    rows = _rows(path / "files.csv")
+    found = Verified()
+    for name in sorted(sums):
+        if name.endswith(".zip"):
+            _scene(path / name, {r["path"]: r for r in rows if r["archive"] == name}, found, scratch)
+    if not found.scenes:
+        raise AwError(f"{path} holds no scene")
+    if NOT_FOR_RELEASE in (path / "README.md").read_text(encoding="utf-8"):
+        found.warnings.append("licence, consent or other fields are not stated: not for release")
+    return found
+
+
+def _checksums(path: Path, digits: int = 64) -> dict[str, str]:
+    found = {}
+    for number, line in enumerate(_read(path).splitlines(), start=1):
+        match = re.fullmatch(rf"([0-9a-f]{{{digits}}})  ([^/\\\x00-\x1f]+)", line)
+        if match is None or match[2].startswith(".") or match[2] in found:
+            raise AwError(
+                f"{path}, line {number}, is no checksum of a file beside it; do not trust the package"
+            )
+        found[match[2]] = match[1]
+    return found
+
+
+def _check_md5(path: Path) -> None:
+    import hashlib
+
+    for name, digest in _checksums(path / "checksums.md5", 32).items():
+        with open(path / name, "rb") as f:
+            if hashlib.file_digest(f, lambda: hashlib.md5(usedforsecurity=False)).hexdigest() != digest:
+                raise AwError(f"{path / name} has another md5 than checksums.md5 records")
+
+
+def _check_croissant(path: Path, sums: dict[str, str]) -> None:
+    where = path / "croissant.json"
+    try:
+        data: Any = json.loads(_read(where))
+    except (ValueError, RecursionError) as error:
+        raise AwError(f"{where} is no JSON ({error})") from error
+    if not isinstance(data, dict) or data.get("conformsTo") != VERSION:
+        raise AwError(f"{where} is not in Croissant 1.1")
+    listed = {}
+    entries = data.get("distribution")
+    for entry in entries if isinstance(entries, list) else []:
+        if isinstance(entry, dict) and entry.get("@type") == "cr:FileObject":
+            listed[str(entry.get("contentUrl"))] = entry.get("sha256")
+    wanted = {n: d for n, d in sums.items() if n.endswith((".zip", ".csv"))}
+    if listed != wanted:
+        odd = sorted(str(n) for n in set(listed) ^ set(wanted)) or sorted(
+            n for n in wanted if listed[n] != wanted[n]
+        )
+        raise AwError(f"{where} and checksums.sha256 contradict each other: {shortlist(odd)}")
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        reader = csv.DictReader(_read(path).splitlines(), strict=True)
+        rows = list(reader)
+    except csv.Error as error:
+        raise AwError(f"{path} is malformed: {error}") from error
+    if tuple(reader.fieldnames or ()) != FILES or any(None in r or None in r.values() for r in rows):
+        raise AwError(f"{path} has not the columns {', '.join(FILES)}")
+    return rows
+
+
+def _read(path: Path) -> str:
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise AwError(f"{path} is larger than {_LARGEST // 10**6} MB")
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise AwError(f"{path} is no text in UTF-8") from error
+
+
+@contextmanager
+def _unpacked(archive: Path, scratch: Path | None) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="aw-verify-", dir=scratch) as temporary:
+        folder = Path(temporary) / "scene"
+        extract(archive, folder)
+        yield folder
+
+
+def _scene(
+    archive: Path, rows: dict[str, dict[str, str]] | None, found: Verified, scratch: Path | None
+) -> None:
+    with _unpacked(archive, scratch) as folder:
+        tops = sorted(p.name for p in folder.iterdir())
+        if len(tops) != 1 or not (folder / tops[0] / "scene.json").is_file():
+            raise AwError(f"{archive} does not hold one scene: {shortlist(tops) or 'nothing'}")
+        if tops[0] != archive.stem and rows is not None:
+            raise AwError(f"{archive} holds the scene {tops[0]!r}, not {archive.stem!r}")
+        root = folder / tops[0]
+        names = list_names(root)
+        try:
+            info = read_scene_json(root)
+            if info is None:
+                raise AwError(f"{archive} has no scene.json")
+            extra = sorted(set(names) - set(info["files"]) - {"scene.json"})
+            if extra:
+                raise AwError(f"{archive} holds files that scene.json does not list: {shortlist(extra)}")
+            verify_files(root, info)
+            scene = load_scene(root, verify=False)
+            for view in scene.views:
+                image_size(view.image_path)
+        except AwError as error:
+            # The temporary folder's name tells nobody anything.
+            raise AwError(str(error).replace(str(folder), str(archive))) from error
+        if rows is not None:
+            hashes = {n: sha256_file(root / n) for n in names}
+            odd = sorted({*rows, *names} - {n for n in names if n in rows and rows[n]["sha256"] == hashes[n]})
+            if odd:
+                raise AwError(f"{archive} and files.csv contradict each other: {shortlist(odd)}")
+        found.scenes.append(scene.name)
+        found.files += len(names)

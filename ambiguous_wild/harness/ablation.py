@@ -1,0 +1,319 @@
+"""Plan an ablation study. Every variant is ordinary cells: runs resume, and `aw table` reads them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NotRequired, TypedDict
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
+from ambiguous_wild.harness.cell import Cell
+from ambiguous_wild.harness.grid import cell_folder, plan_cells
+from ambiguous_wild.harness.measures import MASK_LABELS, Measure, measure
+from ambiguous_wild.harness.result_file import FAILED, RESULT, RunResult, mean_of, read_result
+from ambiguous_wild.harness.timing import timing_of
+from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
+from ambiguous_wild.methods.describe import BACK_ENDS
+from ambiguous_wild.methods.registry import MethodEntry, get_method
+from ambiguous_wild.splat.pace import TrainConfig
+
+
+class StudyFacts(TypedDict):
+    """Facts that two studies must share before one report can hold both."""
+
+    method: str
+    settings: list[str]  # on top of the defaults, in every row
+    train: dict[str, Any]  # fields of `TrainConfig`; the seed is None
+    scenes: list[str]
+    seeds: list[int]
+
+
+class GroupFacts(TypedDict):
+    """A group of variants."""
+
+    name: str
+    title: str
+    source: str  # in the paper; empty without
+
+
+class Summary(TypedDict):
+    """Mean and sample deviation over the runs of a variant; None = missing."""
+
+    mean: float | None
+    spread: float | None
+
+
+class VariantRow(TypedDict):
+    """A variant: its values, its differences to the default, its runs."""
+
+    group: str
+    variant: str
+    settings: list[str]
+    text: str
+    status: Literal["ok", "failed", "missing"]
+    reason: str  # of another status than ok
+    same_as: str
+    values: dict[str, Summary]  # by key of `plan.METRICS`
+    differences: dict[str, Summary]  # by key of `plan.DIFFERENCES`
+    runs: list[dict[str, Any]]  # scene, seed, folder, error, untimed, and `plan.METRICS`
+
+
+class StudyReport(StudyFacts):
+    """ablation.json."""
+
+    schema: int
+    made_by: str  # the command
+    note: NotRequired[str]  # what the method says about itself
+    groups: list[GroupFacts]
+    rows: list[VariantRow]
+
+
+REPORT = "ablation.json"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A variant and its cells, scene by scene and seed by seed."""
+
+    group: str
+    variant: Variant
+    cells: tuple[Cell, ...]
+    missing: str = ""  # why there are none
+    same_as: str = ""  # its settings are those of the default, or of a variant planned before
+
+    @property
+    def is_default(self) -> bool:
+        return self.variant.name == DEFAULT
+
+
+@dataclass(frozen=True)
+class Study:
+    """An ablation study, ready to run."""
+
+    method: str
+    groups: tuple[Group, ...]
+    settings: tuple[str, ...]  # on top of the defaults, in every row
+    default: tuple[Cell, ...]
+    rows: tuple[Planned, ...]  # in the order of the groups; each group begins with the default
+
+    @property
+    def note(self) -> str:
+        """What the method says about itself, with the options of the default rows."""
+        return get_method(self.method).about([flatten(to_plain(self.default[0].options))])
+
+    def facts(self) -> StudyFacts:
+        """Facts that two studies must share before one report can hold both."""
+        return {
+            "method": self.method,
+            "settings": list(self.settings),
+            "train": to_plain(self.default[0].train) | {"seed": None},
+            "scenes": list(dict.fromkeys(cell.scene.name for cell in self.default)),
+            "seeds": list(dict.fromkeys(cell.train.seed for cell in self.default)),
+        }
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells to train, each once, the default first."""
+        unique: dict[tuple[str, str, int], Cell] = {}
+        for cell in (*self.default, *(cell for row in self.rows for cell in row.cells)):
+            unique.setdefault((cell.method.name, cell.scene.name, cell.train.seed), cell)
+        return list(unique.values())
+
+
+def plan_study(
+    method: str,
+    scenes: Sequence[Path],
+    seeds: Sequence[int],
+    train: TrainConfig,
+    *,
+    groups: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    device: str = "cpu",
+    factor: int | None = None,
+) -> Study:
+    """Every variant on every scene with every seed; nothing is trained.
+
+    A variant whose method, option or weights are missing becomes a row with the reason. Variants of equal
+    settings share their runs, whatever groups are chosen.
+
+    Args:
+        method: a name of `aw methods` that declares ablations.
+        scenes: scene folders.
+        seeds: of training.
+        train: length and bookkeeping.
+        groups: names; empty = all.
+        settings: "key=value" on top of the defaults, in every row, the default's included.
+        device: "cpu" or "cuda".
+        factor: which images_N; None = what the scene was built for.
+
+    Raises:
+        AwError: unknown method, group, option in `settings` or scene.
+    """
+    entry = get_method(method)
+    every = entry.ablation_groups()
+    chosen = choose_groups(method, every, groups)
+    own = [f"{method}.{text}" for text in settings]
+    default = tuple(plan_cells([method], scenes, seeds, train, settings=own, device=device, factor=factor))
+    names = _Names(entry, default[0].options, every)
+    rows = []
+    for group in chosen:
+        rows.append(Planned(group.name, Variant(DEFAULT), default))
+        for variant in group.variants:
+            try:
+                if variant.method:
+                    _check_features(variant)
+                    host = variant.method.partition("@")[0] == method
+                    given = own if host else _settings_of(variant, method, settings)
+                    cells = plan_cells(
+                        [variant.method], scenes, seeds, train, settings=given, device=device, factor=factor
+                    )
+                    if given or variant.settings:  # at its defaults the run has the method's own name
+                        of_graft = variant.settings if host else ()
+                        cells = _renamed(cells, variant.method, of_graft, folder_name(method, group, variant))
+                    rows.append(Planned(group.name, variant, tuple(cells)))
+                    continue
+                options = names.options(variant)
+                _check_features(variant)
+            except AwError as error:
+                rows.append(Planned(group.name, variant, (), missing=str(error)))
+                continue
+            name = names.of[config_hash(options)]
+            renamed = dataclasses.replace(entry, name=name)
+            cells = [dataclasses.replace(cell, method=renamed, options=options) for cell in default]
+            own_name = folder_name(method, group, variant)
+            same = "" if name == own_name else DEFAULT if name == method else name.partition("@")[2]
+            rows.append(Planned(group.name, variant, tuple(cells), same_as=same))
+    return Study(method, chosen, tuple(settings), default, tuple(rows))
+
+
+def _settings_of(variant: Variant, method: str, settings: Sequence[str]) -> list[str]:
+    """Settings of a variant that is another method.
+
+    Those of the study where its method is the donor of the graft, and the study's networks where the other
+    method has such options: networks of its own would decide the comparison. Then the variant's own.
+    """
+    peer, name = get_method(variant.method), variant.method.partition("@")[0]
+    shared = [f"{method}.{text}" for text in settings if peer.option_keys(method, "key")]
+    known = to_plain(get_method(name).options())
+    both = [key for key in BACK_ENDS if key in known]
+    nets = [f"{name}.{text}" for text in settings if text.partition("=")[0] in both]
+    return [*shared, *nets, *(f"{method}.{text}" for text in variant.settings)]
+
+
+def earlier_groups(study: Study, output: Path) -> list[str]:
+    """Groups that an earlier report in the folder holds and this study does not; all else is equal.
+
+    A report that cannot be read, or of another scene, seed, length or setting, has none.
+    """
+    try:
+        known = json.loads((output / REPORT).read_text(encoding="utf-8"))
+        same = all(known[key] == value for key, value in study.facts().items())
+        names = [str(group["name"]) for group in known["groups"]] if same else []
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+    there = {group.name for group in get_method(study.method).ablation_groups()}
+    return [n for n in names if n in there and n not in {group.name for group in study.groups}]
+
+
+def _renamed(cells: Sequence[Cell], method: str, settings: Sequence[str], name: str) -> list[Cell]:
+    """Cells of another method with these options on top, under a name of their own."""
+    given = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
+    options = with_options(cells[0].options, given, f"option of {method}")
+    entry = dataclasses.replace(cells[0].method, name=name)
+    return [dataclasses.replace(cell, method=entry, options=options) for cell in cells]
+
+
+class _Names:
+    """Names of runs by their options: the first variant of all groups with these options gives the name.
+
+    Groups that were not chosen count too, so that a run keeps its folder when other groups are chosen.
+    """
+
+    def __init__(self, entry: MethodEntry, default: Any, groups: Sequence[Group]) -> None:
+        self.entry, self.default = entry, default
+        self.of = {config_hash(default): entry.name}
+        for group in groups:
+            for variant in group.variants:
+                if variant.method:
+                    continue
+                try:
+                    key = config_hash(self.options(variant))
+                except AwError:  # the method has no such option
+                    continue
+                self.of.setdefault(key, folder_name(entry.name, group, variant))
+
+    def options(self, variant: Variant) -> Any:
+        pairs = [setting.partition("=") for setting in variant.settings]
+        return with_options(self.default, {key: value for key, _, value in pairs}, "option")
+
+
+def _check_features(variant: Variant) -> None:
+    """Raise AwError where the features the variant needs cannot be made: no weights, no package."""
+    if variant.features:
+        from ambiguous_wild.vision.backends import make_features
+
+        make_features(variant.features)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of one cell."""
+
+    scene: str
+    seed: int
+    folder: Path
+    result: RunResult | None  # as in metrics.json; None: failed or not run
+    error: str = ""
+
+    def value(self, metric: str) -> float | None:
+        """One number of the run, see `METRICS`; None where it is missing."""
+        if self.result is None:
+            return None
+        cost: Mapping[str, Any] = self.result["cost"]
+        masks: Mapping[str, Any] = self.result["masks"] or {}
+        if metric in MASK_LABELS:
+            return masks.get(metric)
+        if metric == "total_s":
+            parts = (cost.get("train_s"), cost.get("setup_s"))
+            known = [part for part in parts if part is not None]
+            return sum(known) if len(known) == len(parts) else None
+        if metric in cost:
+            return cost[metric]
+        mean = mean_of(self.result, metric)
+        return None if math.isnan(mean) else mean
+
+    @property
+    def untimed(self) -> str:
+        """Why its times are not ranked; empty for a run that was alone, or has none."""
+        timing = timing_of(self.result["cost"]) if self.result else None
+        return f"{timing.verdict}: {timing.reason}" if timing and timing.verdict != "alone" else ""
+
+
+# What is tabulated of every variant; keys as in ablation.json.
+METRICS = (
+    *map(measure, ("psnr", "ssim", "lpips_alex")),
+    *(Measure(key, f"mask {label}", "higher", 3) for key, label in MASK_LABELS.items()),
+    *map(measure, ("gaussians", "model_mb", "ms_per_iteration", "setup_s")),
+    Measure("total_s", "total s", "lower", 1, per_image=False, timed=True),
+)
+DIFFERENCES = tuple(m for m in METRICS if m.key in ("psnr", "iou", "ms_per_iteration"))
+
+
+def read_outcomes(cells: Sequence[Cell], output: Path) -> list[Outcome]:
+    """The results of cells as they lie on disk."""
+    found = []
+    for cell in cells:
+        folder = cell_folder(output, cell)
+        where = (cell.scene.name, cell.train.seed, folder)
+        if (folder / RESULT).is_file():
+            found.append(Outcome(*where, read_result(folder / RESULT)))
+        elif (folder / FAILED).is_file():
+            found.append(Outcome(*where, None, str(read_result(folder / FAILED)["error"])))
+        else:
+            found.append(Outcome(*where, None, "not run"))
+    return found

@@ -1,1 +1,0 @@
-"""Ablations: a study of variants, and its report."""

@@ -1,1 +1,0 @@
-"""Find entries of a table of results that cannot be right, without knowing the right values."""

@@ -1,0 +1,126 @@
+"""Where runs are made, and what a caller is told meanwhile. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ambiguous_wild.core.errors import AwError, install_command
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.cell import Cell, CellReport
+    from ambiguous_wild.splat.trainer import Trainer
+
+_RAY_ONLY = ("address", "cpus_per_cell", "gpus_per_cell", "memory_per_cell")
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where cells run, and how many at a time."""
+
+    engine: Literal["local", "ray"] = "local"
+    jobs: int | None = None  # cells at a time on this machine; None = 1, on cuda one a GPU
+    address: str | None = None  # of a Ray cluster; None = $RAY_ADDRESS, else a Ray of our own
+    cpus_per_cell: float | None = None  # Ray; None = the threads, else 1
+    gpus_per_cell: float | None = None  # Ray; None = 1 on cuda
+    memory_per_cell: float | None = None  # Ray; GB
+    retries: int = 3  # of a cell whose process or node was lost
+    transfer: Literal["shared", "store"] = "shared"  # Ray; "store": scenes and runs travel
+    transfer_limit: float = 4000.0  # Ray; MB of the largest scene or run that travels
+
+    def check(self) -> None:
+        """Raise AwError for settings that exclude each other, before anything heavy is loaded."""
+        stray = [f"--{name.replace('_', '-')}" for name in _RAY_ONLY if getattr(self, name) is not None]
+        if self.engine == "local" and (stray or self.transfer != "shared"):
+            raise AwError(
+                f"{', '.join(stray) or '--transfer'} is for a cluster: add --engine ray, or leave it out"
+            )
+        if self.engine == "ray":
+            if importlib.util.find_spec("ray") is None:
+                raise AwError(f"--engine ray needs Ray: {install_command('ray')}")
+            if self.jobs is not None and self.address is not None:
+                raise AwError("--jobs is for this machine: a cluster at --address runs as many cells as fit")
+
+    @property
+    def remote(self) -> bool:
+        """Whether it is a running cluster, not a Ray that this process starts."""
+        return self.engine == "ray" and bool(self.address or os.environ.get("RAY_ADDRESS"))
+
+
+class Callbacks:
+    """Called while runs are made; does nothing. A subclass overrides what it needs."""
+
+    def say(self, text: str) -> None:
+        """One line: effects that a plan chose, a warning, what is compiled, the cluster."""
+
+    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
+        """Before the first run. `one_by_one`: in this process; only then is `tick` called."""
+
+    def started(self, cell: Cell, folder: Path) -> None:
+        """A run begins, or begins again after its process died. A Ray cluster does not tell."""
+
+    def tick(self, trainer: Trainer) -> None:
+        """After every iteration, with the clock of the run stopped."""
+
+    def ended(self, cell: Cell, report: CellReport) -> None:
+        """A run was trained, kept, skipped or failed."""
+
+
+class Lines(Callbacks):
+    """Writes a line where a run begins and one where it ends."""
+
+    def __init__(self, write: Callable[[str], None] = print) -> None:
+        self.write = write
+        self.total = self.done = 0
+
+    def say(self, text: str) -> None:
+        self.write(text)
+
+    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
+        self.total, self.done = len(cells), 0
+
+    def started(self, cell: Cell, folder: Path) -> None:
+        self.write(f"begins: {run_name(cell)}")
+
+    def ended(self, cell: Cell, report: CellReport) -> None:
+        self.done += 1
+        self.write(f"[{self.done}/{self.total}] {run_name(cell)}: {outcome_line(report)} -> {report.folder}")
+
+
+def run_name(cell: Cell) -> str:
+    """ "3dgs on courtyard, seed 0"."""
+    return f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
+
+
+def outcome_line(report: CellReport) -> str:
+    """What became of a run, in one line."""
+    if report.outcome == "kept":
+        return "finished before, kept"
+    if report.outcome == "skipped":
+        return "exists, left as it is (--overwrite never)"
+    if report.outcome == "failed":
+        return "failed: " + " ".join(report.error.split())
+    if report.result is None:
+        return "trained"
+    from ambiguous_wild.harness.timing import timing_of
+
+    cost: Mapping[str, Any] = report.result["cost"]
+    values = [float(v) for row in report.result["per_image"] if (v := row.get("psnr")) is not None]
+    parts = [f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views"] if values else []
+    # Of an external program not everything is known.
+    known = {
+        "train_s": "{:.0f} s training",
+        "ms_per_iteration": "{:.1f} ms/iteration",
+        "gaussians": "{:,} Gaussians",
+    }
+    parts += [text.format(cost[name]) for name, text in known.items() if cost.get(name) is not None]
+    effects: Mapping[str, Mapping[str, Any]] = report.result["facts"].get("effect_facts", {})
+    bare = [name for name, facts in effects.items() if facts.get("points") == 0]
+    parts += [f"no point of {' and '.join(bare)} (no room under --max-gaussians?)"] if bare else []
+    timing = timing_of(cost)
+    parts += [f"time not ranked: {timing.reason}"] if timing.verdict == "contended" else []
+    return ", ".join(parts)

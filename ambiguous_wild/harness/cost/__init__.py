@@ -1,1 +1,0 @@
-"""Accuracy against cost: time to reach a PSNR, dB per minute, Pareto-optimal methods."""

@@ -1,0 +1,214 @@
+"""Renders, masks and numbers of a trained model; every number comes from the saved 8-bit images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
+from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.result_file import Cost, MaskScores
+from ambiguous_wild.io.files import atomic_dir
+from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
+from ambiguous_wild.metrics import image as image_metrics
+from ambiguous_wild.metrics import masks as mask_metrics
+from ambiguous_wild.splat import backend
+from ambiguous_wild.splat.cpu.compile import threads
+from ambiguous_wild.splat.trainer import Trainer
+
+FPS_ROUNDS = 5
+FPS_SECONDS = 2.0  # of all rounds together: long enough to average over scheduling noise
+
+
+class Picture(Protocol):
+    """What `Renderable.render` gives."""
+
+    @property
+    def image(self) -> torch.Tensor:
+        """[H, W, 3] float32 in [0, 1] after clamping."""
+        ...
+
+
+class Renderable(Protocol):
+    """Draws test views: a trained model, splats that a program left, or the pictures that it left."""
+
+    def render(self, camera: Camera) -> Picture:
+        """The picture of a test view's camera."""
+        ...
+
+    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+        """The picture [H, W, 3] after colour effects, if there are any, were fitted to a part of the photo.
+
+        Args:
+            camera: of the test view.
+            photo: [H, W, 3] float32 in [0, 1], on the CPU.
+            keep: [H, W] float32 on the CPU, 1 where the fit may look.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class TestPhoto:
+    """A test view with its photo, [H, W, 3] uint8."""
+
+    __test__ = False  # the name is the field's term, not a pytest class
+
+    view: View
+    photo: np.ndarray
+
+
+def load_test_photos(scene: Scene) -> list[TestPhoto]:
+    """The test views' photos as 8-bit RGB.
+
+    Raises:
+        AwError: one is too small to be measured; said here, before anything is trained.
+    """
+    for view in scene.test:
+        image_metrics.check_size(view.camera.height, view.camera.width)
+    return [TestPhoto(view, read_png_rgb(view.image_path)) for view in scene.test]
+
+
+def mean_psnr(truth: Sequence[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> float:
+    """Mean PSNR in dB over the test views, from 8-bit images."""
+    return float(np.mean([image_metrics.psnr(to_uint8(draw(t.view.camera)), t.photo) for t in truth]))
+
+
+def render_and_measure(
+    model: Renderable,
+    truth: list[TestPhoto],
+    folder: Path,
+    *,
+    scene: Scene,
+    half: bool = False,
+) -> tuple[list[ImageRow], dict[str, str]]:
+    """Render the test views to PNG and measure what was written.
+
+    Args:
+        model: draws the test views.
+        truth: the test photos.
+        folder: for the PNG files.
+        scene: what the metrics of regions are about.
+        half: NeRF-W's protocol: colour effects are fitted on the left half of each test photo, columns
+            0 to ceil(W / 2), everything else stays, and the right half, from W // 2, is measured.
+
+    Returns:
+        Per-image metrics, and for each metric that is missing the reason.
+    """
+    if not truth:
+        return [], dict.fromkeys(metrics(), "the scene has no test views")
+
+    def pictures() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        for t in truth:
+            path = temporary / Path(t.view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            image = _fitted(model, t) if half else model.render(t.view.camera).image
+            write_png(path, to_uint8(image.cpu().numpy()))
+            yield t.view.name, read_png_rgb(path), t.photo
+
+    with atomic_dir(folder) as temporary:
+        return measure_images(pictures(), metrics().values(), scene, half=half, around=kernel_threads)
+
+
+def refuse_empty(truth: Sequence[TestPhoto], folder: Path) -> None:
+    """Raise AwError if every render is of one colour and some photo is not: the model shows nothing.
+
+    Args:
+        truth: the test photos.
+        folder: of the renders.
+    """
+    renders = (read_png_rgb(folder / Path(t.view.name).with_suffix(".png")) for t in truth)
+    if any(np.ptp(t.photo, axis=(0, 1)).any() for t in truth) and not any(
+        np.ptp(render, axis=(0, 1)).any() for render in renders
+    ):
+        raise AwError(
+            f"all {len(truth)} test renders are of one colour: no Gaussian lies in front of the test "
+            "cameras; check poses, focal lengths, principal points and points of the scene"
+        )
+
+
+@contextmanager
+def kernel_threads() -> Iterator[None]:
+    """Let torch use as many threads as the CPU kernels; drawing keeps those it had."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads())
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _fitted(model: Renderable, test: TestPhoto) -> torch.Tensor:
+    photo = torch.from_numpy(test.photo.astype(np.float32) / 255.0)
+    keep = torch.zeros(photo.shape[:2])
+    keep[:, : -(-photo.shape[1] // 2)] = 1.0
+    return model.render_fitted(test.view.camera, photo, keep)
+
+
+def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
+    """Write every train view's keep map and score it, see `write_keeps`."""
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
+        for index, view in enumerate(trainer.data.scene.train):
+            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
+            keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
+            if keep is not None:
+                yield view, (keep > 0.5).cpu().numpy()
+
+    return write_keeps(trainer.data.scene, keeps(), folder)
+
+
+def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path) -> MaskScores | None:
+    """Write keep maps [H, W] bool of train views (white = keep) and score them where the truth is known.
+
+    Returns:
+        IoU, precision and recall of the distractor pixels, counted over all photos together (a photo
+        where nothing is masked has no precision of its own), or None without truth.
+    """
+    counts = []
+    with atomic_dir(folder) as temporary:
+        for view, keep in keeps:
+            path = temporary / Path(view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, keep.astype(np.uint8) * 255)
+            truth = true_distractor(scene, view)
+            if truth is not None:
+                counts.append(mask_metrics.confusion(keep, ~truth))
+    if not counts:
+        return None
+    total = mask_metrics.pooled(counts)
+    return {"iou": total.iou, "precision": total.precision, "recall": total.recall, "images": len(counts)}
+
+
+def frames_per_second(trainer: Trainer) -> Cost:
+    """Rendered frames a second over the views of the scene, after a warm-up.
+
+    Returns:
+        fps, the median of several rounds, and fps_low and fps_high, the slowest and the fastest of them.
+    """
+    cameras = [v.camera for v in (trainer.data.scene.test or trainer.data.scene.train)]
+    with torch.no_grad():
+        for camera in cameras[:3]:
+            trainer.render(camera)
+    backend.wait(trainer.data.device)
+    rounds = [_frames_per_second(trainer, cameras, FPS_SECONDS / FPS_ROUNDS) for _ in range(FPS_ROUNDS)]
+    return {"fps": float(np.median(rounds)), "fps_low": min(rounds), "fps_high": max(rounds)}
+
+
+@torch.no_grad()
+def _frames_per_second(trainer: Trainer, cameras: list[Camera], least_s: float) -> float:
+    frames, begin = 0, time.perf_counter()
+    while True:
+        trainer.render(cameras[frames % len(cameras)])
+        backend.wait(trainer.data.device)
+        frames += 1
+        seconds = time.perf_counter() - begin
+        if seconds >= least_s:
+            return frames / seconds

@@ -1,0 +1,201 @@
+"""Run an external method as a cell: its program trains and renders, its files are measured as any other."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
+from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness.cell import Cell
+from ambiguous_wild.harness.choosing import NOT_OURS
+from ambiguous_wild.harness.meter import Meter, cores, own_s
+from ambiguous_wild.harness.result_file import Cost, MaskScores, RunResult
+from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
+from ambiguous_wild.io.ply import read_splat_ply, splat_count, write_splat_ply
+from ambiguous_wild.methods.external_process import LOGS, WORK, Produced, Program, Task
+from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.rendered import Rendered
+
+
+def run_program(cell: Cell, folder: Path) -> RunResult:
+    """Run the method's program and measure what it left; the result as in metrics.json.
+
+    Raises:
+        AwError: the program failed, or a picture is missing, no 8-bit PNG, or of another size.
+    """
+    program = cell.method.program
+    if program is None:
+        raise AwError(f"{cell.method.name} is no external method")
+    check_program(cell)
+    (folder / WORK).mkdir(exist_ok=True)
+    task = Task(
+        scene=cell.scene,
+        options=cell.options,
+        seed=cell.train.seed,
+        iterations=cell.train.iterations,
+        budget_s=cell.train.budget_s,
+        device=cell.device,
+        folder=folder,
+        work=folder / WORK,
+        logs=folder / LOGS,
+    )
+    produced, time_cost = _timed(program, task)
+    truth = evaluate.load_test_photos(cell.scene)
+    drawn: evaluate.Renderable
+    if produced.drawn_by_us:
+        drawn = _Splats(produced, cell.device)
+    else:
+        drawn = _Files(truth, produced.renders)
+    per_image, missing = evaluate.render_and_measure(
+        drawn, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
+    )
+    evaluate.refuse_empty(truth, folder / "renders" / "test")
+    return cell.result(
+        per_image=per_image,
+        missing=missing,
+        masks=_masks(cell.scene, produced.masks, folder / "masks"),
+        facts=dict(produced.facts)
+        | {"no_effects": NOT_OURS}
+        | ({"drawn_by": "ambiguous_wild"} if produced.drawn_by_us else {})
+        | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
+        cost=cast(
+            Cost, {"device": cell.device, **produced.cost, **time_cost, **_model(cell, produced, folder)}
+        ),
+    )
+
+
+def check_program(cell: Cell) -> None:
+    """Raise AwError if the method's program is not on this machine."""
+    program, method = cell.method.program, cell.method
+    if program is not None and (lacking := program.missing(cell.options)):
+        raise AwError(
+            f"{method.name} needs {method.needs}: there is no program {lacking!r}; install it, or name "
+            "another program in a copy of the description (docs/external-methods.md)"
+        )
+
+
+def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
+    """Run the program between two calibrations; its output, and what is known of its time.
+
+    Nothing is known where its training ended before this call, or where the kernel cannot run here: a program
+    has packages of its own.
+    """
+    meter, begin, before = Meter(task.device, cores()), time.perf_counter(), own_s()
+    try:
+        meter.begin(0.0)
+    except AwError:
+        meter.end(0.0)
+        return program.run(task), {}
+    try:
+        produced = program.run(task)
+        trained, spent = produced.cost.get("train_s"), time.perf_counter() - begin
+        if trained is None or trained > spent:
+            return produced, {}
+        meter.look(trained)
+    finally:
+        meter.end(0.0)
+    return produced, {**meter.cost(trained), "cpu_s": own_s() - before}
+
+
+@dataclass(frozen=True)
+class _Picture:
+    image: torch.Tensor  # [H, W, 3] float32 in [0, 1]
+
+
+class _Files:
+    """The pictures that the program wrote."""
+
+    def __init__(self, truth: list[evaluate.TestPhoto], renders: Mapping[str, Path]) -> None:
+        # Every view has a camera object of its own, which identifies the view.
+        self.paths = {id(t.view.camera): (t.view, renders[t.view.name]) for t in truth}
+
+    def render(self, camera: Camera) -> _Picture:
+        view, path = self.paths[id(camera)]
+        _check_picture(view, path, "render")
+        return _Picture(torch.from_numpy(read_png_rgb(path).astype(np.float32) / 255.0))
+
+    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+        """The plain render: effects of a program cannot be fitted here."""
+        return self.render(camera).image
+
+
+class _Splats:
+    """The program's splats, drawn by our renderer on a black background."""
+
+    def __init__(self, produced: Produced, device: str) -> None:
+        """
+        Raises:
+            AwError: the file of splats cannot be read.
+        """
+        assert produced.ply is not None
+        known: dict[str, Any] = {
+            name: torch.from_numpy(values) for name, values in read_splat_ply(produced.ply).items()
+        }
+        self.gaussians = Gaussians(**known).to(device)
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendered:
+        return render(self.gaussians, camera, sh_degree=self.gaussians.sh_degree)
+
+    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+        """The plain render: splats have no colours of a photo."""
+        return self.render(camera).image
+
+
+def _check_picture(view: View, path: Path, what: str) -> None:
+    """Raise AwError unless the file is a PNG of 8 bits at the size of the view."""
+    with open(path, "rb") as f:
+        head = f.read(25)
+    if head[:8] != b"\x89PNG\r\n\x1a\n":
+        raise AwError(f"{what} {path} is no PNG: what is measured must not have lost anything on the way")
+    if head[24] != 8:
+        raise AwError(f"{what} {path} has {head[24]} bits a channel; write 8, as every method does")
+    width, height = image_size(path)
+    if (width, height) != (view.camera.width, view.camera.height):
+        raise AwError(
+            f"{what} {path} is {width}x{height}, its photo {view.name} {view.camera.width}x"
+            f"{view.camera.height}: nothing is resized, so let the program work at that size ({{images}}, "
+            "{factor}) or run with --factor"
+        )
+
+
+def _masks(scene: Scene, masks: Mapping[str, Path], folder: Path) -> MaskScores | None:
+    """Copy the keep maps of the train views and score them where the truth is known."""
+    if not masks:
+        return None
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
+        for view in scene.train:
+            if view.name in masks:
+                _check_picture(view, masks[view.name], "mask")
+                yield view, read_gray(masks[view.name]) >= 128
+
+    return evaluate.write_keeps(scene, keeps(), folder)
+
+
+def _model(cell: Cell, produced: Produced, folder: Path) -> dict[str, float]:
+    """Number and size of the splats, which become point_cloud.ply of the run."""
+    if produced.ply is None:
+        return {}
+    target = folder / "point_cloud.ply"
+    with atomic_path(target) as temporary:
+        temporary.unlink()
+        try:
+            if cell.scene.place != UNMOVED:
+                write_splat_ply(temporary, read_splat_ply(produced.ply), cell.scene.place)
+            else:
+                os.link(produced.ply, temporary)
+        except OSError:  # another file system, or one without hard links
+            shutil.copyfile(produced.ply, temporary)
+    return {"gaussians": splat_count(target), "model_mb": target.stat().st_size / 1e6}

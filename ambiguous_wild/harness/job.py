@@ -1,0 +1,208 @@
+"""A job: a cell as plain values, which another process or machine turns into the cell again and runs.
+
+A `Cell` holds code (a method's recipe) and an opened scene. What travels is how to get them: names, options,
+paths and the sources of plugins. Whoever runs it compares the identity of what it made with the one it was
+sent, so that another version of the code, of a plugin or of the scene is an error and never a number.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import platform
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
+from ambiguous_wild.harness.choosing import Chosen
+from ambiguous_wild.harness.measures import load_metrics
+from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
+from ambiguous_wild.harness.run import error_line, run_cell
+from ambiguous_wild.io.files import folder_lock, patient_lock
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.graft import split_graft
+from ambiguous_wild.methods.references import reference_file, with_file
+from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
+from ambiguous_wild.methods.second_pass import trained_once
+from ambiguous_wild.splat.pace import TrainConfig
+
+# A node that is lost keeps its lock until the file server forgets it (NFS: 90 s by default).
+LOCK_WAIT_S = 150.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """Code that a run needs: a plugin, metrics, or a reference such as ``recipe.py:my_recipe``."""
+
+    text: str  # the reference as typed, or the file's path
+    kind: str  # "plugin", "metric" or "method"
+    path: str = ""  # absolute path of its file, if it has one
+    content: bytes = b""
+
+
+@dataclass(frozen=True)
+class Job:
+    """How to make a cell again, and how to run it."""
+
+    config: RunConfig
+    chosen: Chosen
+    identity: str
+    scene: str  # absolute path
+    folder: str  # absolute path of the run folder
+    options: RunOptions
+    sources: tuple[Source, ...]
+    threads: int | None  # of the CPU kernels; None = as many as there are
+    code: str  # `code_hash` of the sender
+    token: str = ""  # a file that the runner must see, see `check_storage`
+
+
+def read_sources(
+    plugins: Sequence[str | Path], methods: Sequence[str], metrics: Sequence[str | Path] = ()
+) -> tuple[Source, ...]:
+    """The code of plugins, and of methods and metrics given as files; names of `aw methods` need none."""
+    sources = [_source(str(path), "plugin", Path(path)) for path in plugins]
+    sources += [_source(str(path), "metric", Path(path)) for path in metrics]
+    for name in methods:
+        # A graft may have a reference as its host.
+        host, _ = split_graft(trained_once(name))
+        file = reference_file(host)
+        if file is not None:
+            sources.append(_source(host, "method", file))
+        elif host.startswith("nerfbaselines:"):
+            sources.append(Source(host, "method"))
+    return tuple(sources)
+
+
+def _source(text: str, kind: str, path: Path) -> Source:
+    return Source(text, kind, str(path.resolve()), path.read_bytes())
+
+
+def make_job(
+    cell: Cell,
+    folder: Path,
+    options: RunOptions,
+    sources: tuple[Source, ...] = (),
+    threads: int | None = None,
+) -> Job:
+    """The job of a cell whose method `get_method` finds once the sources are loaded."""
+    config, scene = cell.config, str(cell.scene.root.resolve())
+    options = RunOptions(options.cache_dir.absolute(), options.overwrite, options.pictures)
+    identity, place = cell.identity, str(folder.absolute())
+    return Job(config, cell.chosen, identity, scene, place, options, sources, threads, code_hash())
+
+
+def run_job(job: Job) -> CellReport:
+    """Make the cell and run it as `aw bench` does in one process; every error is a report."""
+    from ambiguous_wild.splat import readiness
+    from ambiguous_wild.splat.calibration import prepare_cpu
+
+    folder = Path(job.folder)
+    try:
+        check_storage(job)
+        cell = make_cell(job)
+        if cell.method.program is None and cell.device == "cpu":
+            prepare_cpu(job.threads)
+        elif cell.method.program is None:
+            readiness.require(readiness.look())
+        with patient_lock(folder, "aw bench", LOCK_WAIT_S):
+            pass
+    except Exception as error:
+        return CellReport(folder, "failed", error=f"on {platform.node()}: {error_line(error)}")
+    return run_cell(cell, folder, job.options)
+
+
+def make_cell(job: Job) -> Cell:
+    """The cell that the job describes.
+
+    Raises:
+        AwError: this process runs other code than the sender, or something on the way differs there.
+    """
+    if job.code != code_hash():
+        raise AwError(
+            "here is another state of ambiguous_wild than on the machine that sent the run: "
+            "install the same on every node"
+        )
+    for source in job.sources:
+        _load(source)
+    config = job.config
+    entry = get_method(config["method"])
+    scene = _scene(job.scene, config["scene"]["factor"])
+    cell = Cell(
+        method=entry,
+        options=from_plain(type(entry.options()), config["options"], f"options of {entry.name}"),
+        scene=scene,
+        scene_id=scene_identity(scene),
+        train=from_plain(TrainConfig, config["train"], "train"),
+        device=config["device"],
+        chosen=job.chosen,
+        protocol="half" if config.get("protocol") == "half" else "full",
+    )
+    if cell.identity != job.identity:
+        raise AwError(
+            f"{entry.name} on {scene.name} would be another run than on the machine that sent it: "
+            f"the scene {job.scene} or a file of the method differs there"
+        )
+    return cell
+
+
+def check_storage(job: Job, wait_s: float = 30.0) -> None:
+    """Make sure that this machine sees the folder that results go to.
+
+    Raises:
+        AwError: it does not see the file that the sender left there.
+    """
+    deadline = time.monotonic() + wait_s
+    while job.token and not Path(job.token).exists():  # NFS remembers for seconds what was not there
+        if time.monotonic() > deadline:
+            raise AwError(
+                f"it does not see {Path(job.token).parent}: give a folder on storage that all "
+                "nodes share as -o, or send scenes and results with --transfer store"
+            )
+        time.sleep(1.0)
+
+
+def record_lost(cell: Cell, folder: Path, error: str) -> CellReport:
+    """Write failed.json for a run whose process died; its checkpoints stay, so that it can go on."""
+    try:
+        with folder_lock(folder, "aw bench"):
+            if folder.is_dir() and not (folder / RESULT).exists():
+                write_result(folder / FAILED, cell.result(error=error))
+    except (AwError, OSError):
+        pass  # the report below has the error in any case
+    return CellReport(folder, "failed", error=error)
+
+
+def _load(source: Source) -> None:
+    if not source.path:
+        load_reference(source.text)
+        return
+    path = _present(source)
+    if source.kind == "plugin":
+        load_plugin(path)
+    elif source.kind == "metric":
+        load_metrics(path)
+    else:
+        load_reference(with_file(source.text, path), given_as=with_file(source.text, Path(source.path)))
+
+
+@functools.cache
+def _present(source: Source) -> Path:
+    """The source's own file where this machine has it, else a copy."""
+    path = Path(source.path)
+    with contextlib.suppress(OSError):  # another user's, or not there
+        if path.read_bytes() == source.content:
+            return path
+    copy = Path(tempfile.mkdtemp(prefix="aw-source-")) / path.name
+    copy.write_bytes(source.content)
+    return copy
+
+
+@functools.lru_cache(maxsize=4)
+def _scene(path: str, factor: int | None) -> Scene:
+    # The sender has compared every hash; a copy with other sizes or another scene.json is found all the same.
+    return load_scene(path, factor=factor, verify="quick")

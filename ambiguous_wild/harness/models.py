@@ -1,0 +1,263 @@
+"""The models of finished runs, with their scene, ready to be shown together; and the page of `aw view`."""
+
+from __future__ import annotations
+
+import html
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.harness.cell import refuse_other_scene, scene_identity
+from ambiguous_wild.harness.choosing import mixed_tests
+from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
+from ambiguous_wild.harness.store import CONFIG, read_config, run_folders
+from ambiguous_wild.io.ply import splat_count
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.references import is_reference
+from ambiguous_wild.methods.registry import get_method, knows_truth
+from ambiguous_wild.viewing.model import Model, RenderSettings
+from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
+
+MASKS = "masks"
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A finished run with its model."""
+
+    run: Path
+    scene: str  # name
+    scene_hash: str
+    model: Model
+    half: bool  # measured on the right half of each test photo
+    note: str = ""  # how it is drawn, where that may not be as in training
+
+
+@dataclass(frozen=True)
+class SceneModels:
+    """Models of one scene."""
+
+    scene: Scene
+    models: tuple[Model, ...]
+    notes: tuple[str, ...]  # what is not shown, and why; what a number means
+
+
+def read_models(
+    paths: Sequence[Path], *, scene: str | None = None, scene_folder: Path | None = None
+) -> SceneModels:
+    """The models of the runs below some folders, and the scene they were trained on.
+
+    Args:
+        paths: run folders, or folders of runs.
+        scene: name of the scene, where the runs are of several.
+        scene_folder: where it lies; None = where the runs say.
+
+    Raises:
+        AwError: no run, no model in any, runs of several scenes, or the scene is not where it was.
+    """
+    found, notes = find_models(paths)
+    names = sorted({f.scene for f in found})
+    if scene is not None:
+        found = [f for f in found if f.scene == scene]
+        if not found:
+            raise unknown("scene", scene, names)
+    elif len(names) > 1:
+        raise AwError(f"these runs are of {len(names)} scenes ({shortlist(names)}): choose one with --only")
+    if len({f.scene_hash for f in found}) > 1:
+        runs = shortlist(sorted(str(f.run) for f in found), 3)
+        raise AwError(
+            f"scene {found[0].scene!r} is not the same for all of these runs: {runs}; name them one by one"
+        )
+    if any(f.half for f in found):
+        notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
+    opened = open_scene(found[0].run, scene_folder)
+    notes += [mixed] if (mixed := mixed_tests(opened)) else []
+    return SceneModels(opened, tuple(f.model for f in found), tuple(notes))
+
+
+def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
+    """Finished runs that have a model, in the order of their paths, and a line for each other run.
+
+    Labels tell runs of the same method apart by seed, then by folder.
+
+    Raises:
+        AwError: no such folder, or no run with a model in any of them.
+    """
+    found: list[TrainedModel] = []
+    notes: list[str] = []
+    for root in paths:
+        if not root.is_dir():
+            raise AwError(
+                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, or a run in it"
+            )
+        for run in dict.fromkeys(run_folders(root)):
+            if any(f.run.samefile(run) for f in found):
+                continue
+            try:
+                found.append(_found(run))
+            except AwError as error:
+                notes.append(f"not shown: {error}")
+                continue
+            if found[-1].note:
+                notes.append(found[-1].note)
+    if not found:
+        why = f" ({notes[0]})" if notes else ""
+        raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
+    return _with_labels(found), notes
+
+
+def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) -> Scene:
+    """The scene of a run, with the photos it was trained on.
+
+    Args:
+        run: its folder.
+        folder: where the scene lies; None = where the run says.
+        verify: whether its files are compared with their hashes, and the scene with the one that the run saw.
+
+    Raises:
+        AwError: it is not there, damaged, or another state of the scene than the run saw.
+    """
+    asked = read_config(run).get("scene")
+    if not isinstance(asked, dict):
+        raise AwError(f"{run} has no {CONFIG} that names its scene: restore it, or run 'aw bench' again")
+    path = Path(str(asked.get("path"))) if folder is None else folder
+    if not path.is_dir():
+        raise AwError(
+            f"the scene of {run} is not at {path}: move the scene back "
+            "('aw view', 'aw video' and 'aw export' take its folder: --scene)"
+        )
+    factor = asked.get("factor")
+    scene = load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)
+    if verify:
+        refuse_other_scene(run, path, scene_identity(scene), str(asked.get("sha256")))
+    return scene
+
+
+def _found(run: Path) -> TrainedModel:
+    result = read_result(run / RESULT)
+    if result["status"] != "ok":
+        raise AwError(f"{run} failed: {result['error']}")
+    ply = run / MODEL
+    if not ply.is_file():
+        raise AwError(f"{run} has no {MODEL}: an external program may keep its model elsewhere")
+    splat_count(ply)
+    check_model(run, result)
+    config = read_config(run)
+    look, note = read_render_settings(config)
+    psnr = {row["name"]: metrics_of(row).get("psnr") for row in result["per_image"]}
+    model = Model(
+        label=result["method"],
+        ply=ply,
+        look=look,
+        psnr={name: float(value) for name, value in psnr.items() if value is not None},
+        masks=run / MASKS if (run / MASKS).is_dir() else None,
+        reference=knows_truth(result["method"]),
+    )
+    half = config.get("protocol") == "half"
+    return TrainedModel(run, result["scene"], result["scene_hash"], model, half, note)
+
+
+def read_render_settings(config: Mapping[str, Any]) -> tuple[RenderSettings, str]:
+    """How the run's method draws, from its recipe with the run's options and effects; and a note, or "".
+
+    A method that is not registered here is drawn as plain 3DGS. The name is the run's, which may be a
+    stranger's: no file that it refers to is imported.
+    """
+    name = str(config.get("method", ""))
+    options = config.get("options")
+    try:
+        if is_reference(name):
+            raise AwError(f"{name} is a file")
+        entry = get_method(name)
+        if entry.program is not None:
+            return RenderSettings(), ""
+        chosen = from_plain(type(entry.options()), options if isinstance(options, dict) else {}, "options")
+        parts = entry.build(chosen)
+    except AwError:
+        known = "drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
+        return RenderSettings(), f"{name}: its recipe is not known here: {known}"
+    antialias = parts.antialias or "antialias" in (config.get("effects") or ())
+    return RenderSettings(parts.sh_degree, antialias, parts.blur, parts.background), ""
+
+
+def _with_labels(found: list[TrainedModel]) -> list[TrainedModel]:
+    """Labels that are one model's each among those of its scene: by seed where need be, then by folder."""
+    labels = [f.model.label for f in found]
+    for names in ([f"{f.model.label}, {f.run.name}" for f in found], [str(f.run) for f in found]):
+        count = Counter((f.scene, label) for f, label in zip(found, labels))
+        labels = [
+            name if count[f.scene, label] > 1 else label for f, label, name in zip(found, labels, names)
+        ]
+    return [replace(f, model=replace(f.model, label=label)) for f, label in zip(found, labels)]
+
+
+def view_runs(
+    paths: Sequence[Path],
+    output: Path,
+    *,
+    scene: str | None = None,
+    scene_folder: Path | None = None,
+    most_gaussians: int = MOST_GAUSSIANS,
+    title: str | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Page:
+    """Write OUTPUT/index.html with the models of runs.
+
+    Args:
+        paths: run folders, or folders of runs, all of one scene.
+        output: folder of the page.
+        scene: name of the scene, where the runs are of several.
+        scene_folder: where it lies; None = where the runs say.
+        most_gaussians: a larger model is reduced to so many, with a note on the page.
+        title: of the page; None = the scene's name.
+        say: told what is done.
+
+    Raises:
+        AwError: no run with a model, several scenes, no scene, or another page in the folder.
+    """
+    check_page_folder(output)
+    shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    return write_page(
+        output,
+        shown.scene,
+        shown.models,
+        title=shown.scene.name if title is None else title,
+        most_gaussians=most_gaussians,
+        notes=shown.notes,
+        say=say,
+    )
+
+
+class Viewer:
+    """The page of one or more runs, shown by a notebook in a frame of its own."""
+
+    def __init__(self, paths: Sequence[Path], *, height: int = 640, scene_folder: Path | None = None) -> None:
+        """
+        Args:
+            paths: run folders, or folders of runs, all of one scene.
+            height: of the frame, px.
+            scene_folder: where the scene lies; None = where the runs say.
+
+        Raises:
+            AwError: as `view_runs`.
+        """
+        shown = read_models(paths, scene_folder=scene_folder)
+        self.labels = tuple(model.label for model in shown.models)
+        self.height = height
+        self.page, _, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
+
+    def __repr__(self) -> str:
+        return f"Viewer of {', '.join(self.labels)}; a notebook shows it, 'aw view' writes it to a file"
+
+    def _repr_html_(self) -> str:
+        """A frame without access to the notebook's page; its scripts run."""
+        page = html.escape(self.page, quote=True)
+        return (
+            f'<iframe sandbox="allow-scripts" srcdoc="{page}" '
+            f'style="width:100%;height:{self.height}px;border:0"></iframe>'
+        )

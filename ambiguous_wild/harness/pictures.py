@@ -1,0 +1,234 @@
+"""Draw the pictures of a run into RUN/pictures.
+
+training_<photo>.png  what the method saw of a train view at fixed moments of the run, a row a moment
+masks.jpg             train photos with what the trained method masks
+density.png           where Gaussians were added and merged, and how many there were
+and whatever the method draws itself (RefineSplat: entropies.png)
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.harness import sheets
+from ambiguous_wild.harness.sheets import write_contact
+from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
+from ambiguous_wild.io.palette import ADDED, MERGED, NEUTRAL, plot_colour, ramp
+from ambiguous_wild.splat.parts import MaskPolicy
+from ambiguous_wild.splat.trainer import Trainer
+
+MOMENTS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)  # shares of the run
+VIEWS = 3
+CELL = 240  # px, width of a picture in a strip
+WORST = 0.5  # error that is drawn red: mean over channels of |photo - render|
+ROWS = ".moments"  # in the run folder while it trains; hidden, as it is no result
+
+
+class Recorder:
+    """Records a strip of each chosen view whenever the run passes a moment.
+
+    Called after an iteration, with the clock stopped. Rows lie on disk until the end, so that a run that was
+    killed and resumed has them all; nothing of it is in the trainer's state.
+    """
+
+    def __init__(self, trainer: Trainer, folder: Path) -> None:
+        views = trainer.data.scene.train
+        chosen = np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)
+        self.views = [int(v) for v in np.unique(chosen)]
+        self.folder = folder
+        self.on = type(trainer.parts.mask).panels is not MaskPolicy.panels  # else there is nothing to see
+        self.passed = self._passed(trainer)
+
+    def _passed(self, trainer: Trainer) -> int:
+        done = trainer.progress(trainer.iteration)
+        return sum(done >= moment for moment in MOMENTS)
+
+    def __call__(self, trainer: Trainer) -> None:
+        """Draw if a moment was passed since the last call."""
+        passed = self._passed(trainer)
+        if not self.on or passed == self.passed:
+            return
+        self.passed = passed
+        for view in self.views:
+            write_png(self._row(trainer, view, passed), strip(trainer, view))
+
+    def _row(self, trainer: Trainer, view: int, moment: int) -> Path:
+        return self.folder / ROWS / file_stem(trainer, view) / f"{moment}.png"
+
+    def finish(self, trainer: Trainer) -> list[Path]:
+        """Put the rows together as pictures/training_<photo>.png; returns what was written."""
+        written = []
+        for view in self.views:
+            paths = [self._row(trainer, view, k) for k in range(1, len(MOMENTS) + 1)]
+            rows = [read_png_rgb(path) for path in paths if path.is_file()]
+            if rows:
+                path = self.folder / "pictures" / f"training_{file_stem(trainer, view)}.png"
+                path.parent.mkdir(exist_ok=True)
+                write_png(path, sheets.stack(rows, 0))
+                written.append(path)
+        shutil.rmtree(self.folder / ROWS, ignore_errors=True)
+        return written
+
+
+def file_stem(trainer: Trainer, view: int) -> str:
+    """A file name for pictures of a train view: photos may lie in folders."""
+    return str(PurePosixPath(trainer.data.scene.train[view].name).with_suffix("")).replace("/", "_")
+
+
+def strip(trainer: Trainer, view: int) -> np.ndarray:
+    """Photo, render, error and the method's own panels of a train view as one row, [h, w, 3] uint8."""
+    spent = dict(trainer.clock.parts_s)
+    step = trainer.make_step(max(trainer.iteration, 1), view, divisor=1)
+    panels = trainer.parts.mask.panels(step)
+    trainer.clock.parts_s = spent  # looking is no part of training
+    photo, render = step.photo.cpu().numpy(), step.rendered.image.detach().cpu().numpy()
+    error = np.abs(photo - np.clip(render, 0.0, 1.0)).mean(axis=2)
+    share = 100 * trainer.progress(trainer.iteration)
+    cells = {
+        f"iteration {trainer.iteration} ({share:.0f} %)": to_uint8(photo),
+        "render": to_uint8(render),
+        f"error, mean {error.mean():.3f}": ramp(error, 0.0, WORST),
+    }
+    return sheets.stack([sheets.cell(name, image, CELL) for name, image in (cells | panels).items()], 1)
+
+
+def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
+    """Every picture of a finished run; returns what was written.
+
+    Args:
+        trainer: after its last step; masks/ lies in the folder already.
+        recorder: that watched it.
+        folder: the run folder.
+    """
+    pictures = folder / "pictures"
+    written = recorder.finish(trainer)
+    written += trainer.parts.mask.draw(pictures)
+    written += draw_density(trainer, pictures / "density.png")
+    written += write_contact(trainer.data.scene, folder / "masks", pictures / "masks.jpg")
+    return written
+
+
+SHOWN = 20_000  # points of a kind in a picture
+
+
+def draw_density(trainer: Trainer, path: Path) -> list[Path]:
+    """Write the picture; returns what was written: nothing where density control never did anything."""
+    log = trainer.density.log
+    if not log.rounds:
+        return []
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 4.6), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    counts, top, view = figure.subplots(1, 3, width_ratios=[1.0, 1.1, 1.4])
+    _counts(counts, trainer)
+    _top_view(top, trainer)
+    _in_a_view(view, trainer)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata={"Software": None})
+    return [path]
+
+
+def _counts(axes: Any, trainer: Trainer) -> None:
+    rounds, rows = trainer.density.log.rounds, trainer.timeline.rows
+    steps = np.array([0] + [r["iteration"] for r in rows] + [r.iteration for r in rounds])
+    count = np.array([trainer.pace.start] + [r["gaussians"] for r in rows] + [r.count for r in rounds])
+    order = np.argsort(steps, kind="stable")
+    axes.plot(steps[order], count[order], color="k", lw=1.5)
+    merges = [r for r in rounds if r.merged]
+    if merges:
+        at, after = [r.iteration for r in merges], [r.count for r in merges]
+        gone = sum(r.merged for r in merges)
+        label = f"{len(merges)} merges, {gone:,} Gaussians fewer"
+        axes.plot(at, after, "v", ms=7, color=plot_colour(MERGED), label=label)
+    axes.set_title(
+        f"{sum(r.cloned for r in rounds):,} cloned, {sum(r.split for r in rounds):,} split, "
+        f"{sum(r.pruned for r in rounds):,} pruned",
+        fontsize=10,
+    )
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("Gaussians")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.25)
+    if merges:
+        axes.legend(fontsize=8, loc="lower right")
+
+
+def _kinds(trainer: Trainer) -> list[tuple[str, np.ndarray, str, tuple[int, int, int], float]]:
+    """(caption, positions, marker, colour, size) of what is drawn over the scene."""
+    log = trainer.density.log
+    return [
+        (f"added: {log.added.passed:,}", log.added.xyz.numpy(), ".", ADDED, 3.0),
+        (f"merged: {log.merged.passed:,}", log.merged.xyz.numpy(), "x", MERGED, 5.0),
+    ]
+
+
+def _top_view(axes: Any, trainer: Trainer) -> None:
+    """From above, where above is the mean of the cameras' own."""
+    poses = np.stack([camera.cam_from_world for camera in trainer.data.cameras])
+    up = -poses[:, 1, :3].mean(axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    right = poses[:, 0, :3].mean(axis=0)
+    right -= up * (right @ up)
+    if np.linalg.norm(right) < 1e-6:  # cameras all around: any direction will do
+        right = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    right /= np.linalg.norm(right)
+    plane = np.stack([right, np.cross(up, right)])
+    everything = _thin(trainer.gaussians.means.detach().cpu().numpy()) @ plane.T
+    centres = np.stack([camera.center for camera in trainer.data.cameras]) @ plane.T
+    axes.scatter(everything[:, 0], everything[:, 1], 0.5, color=plot_colour(NEUTRAL), alpha=0.4, lw=0)
+    for _, xyz, marker, colour, size in _kinds(trainer):
+        if len(xyz):
+            flat = xyz @ plane.T
+            axes.scatter(
+                flat[:, 0], flat[:, 1], size, marker=marker, color=plot_colour(colour), lw=0.5, alpha=0.6
+            )
+    axes.scatter(centres[:, 0], centres[:, 1], 14, marker="^", color="k", label="cameras")
+    # a few strays must not shrink the scene to a dot
+    low = np.minimum(np.quantile(everything, 0.1, axis=0), centres.min(axis=0))
+    high = np.maximum(np.quantile(everything, 0.9, axis=0), centres.max(axis=0))
+    margin = 0.12 * float((high - low).max())
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_title("from above; grey: all Gaussians, triangles: cameras", fontsize=10)
+
+
+def _in_a_view(axes: Any, trainer: Trainer) -> None:
+    index = len(trainer.data.cameras) // 2
+    camera, photo = trainer.data.cameras[index], to_uint8(trainer.data.photos[index].cpu().numpy())
+    faded = (0.35 * photo + 0.65 * 255).astype(np.uint8)
+    axes.imshow(faded, extent=(0, camera.width, camera.height, 0))
+    for caption, xyz, marker, colour, size in _kinds(trainer):
+        uv = _seen(xyz, camera)
+        axes.scatter(*uv.T, size, marker=marker, color=plot_colour(colour), lw=0.5, alpha=0.7, label=caption)
+    axes.set_xlim(0, camera.width)
+    axes.set_ylim(camera.height, 0)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.legend(fontsize=8, loc="lower right", markerscale=3.0)
+    axes.set_title(f"in {trainer.data.scene.train[index].name} (through walls)", fontsize=10)
+
+
+def _seen(xyz: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels [n, 2] of the positions in front of the camera and inside its picture."""
+    local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = local[local[:, 2] > 1e-6]
+    u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+    v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return np.stack([u[inside], v[inside]], axis=1)
+
+
+def _thin(rows: np.ndarray) -> np.ndarray:
+    return rows[:: max(len(rows) // SHOWN, 1)]

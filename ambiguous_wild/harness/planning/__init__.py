@@ -1,1 +1,0 @@
-"""Which optional effects a scene calls for: evidence, threshold, decision, cost."""

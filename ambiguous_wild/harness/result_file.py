@@ -1,0 +1,302 @@
+"""Records that cross files, and one of them: the result of a run, `metrics.json` or `failed.json`.
+
+All are plain dicts, with the keys that the files have. A result is checked when written and when read.
+Per-image values are kept, never only their mean. JSON has no infinity: it is written as the string
+"inf" and read back as a number. A missing value is ``null`` in the file, and its reason stands under
+"missing".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn, NotRequired, Required, TypedDict, cast
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.measures import ImageRow, MetricRecord, measure, remember
+from ambiguous_wild.io.files import sha256_file, write_json
+from ambiguous_wild.metrics import stats
+
+Status = Literal["ok", "failed"]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Count = Annotated[int, Meta(ge=0, le=10**15)]  # more is no number of anything
+Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
+Name = Annotated[str, Meta(pattern=r"\S")]
+
+
+def metrics_of(row: ImageRow) -> dict[str, float | None]:
+    """Every metric of the row, by name."""
+    return {key: cast("float | None", value) for key, value in row.items() if key != "name"}
+
+
+def mean_of(result: RunResult | None, metric: str) -> float:
+    """Mean of an image metric over the test views, of the finite values; NaN where any is missing."""
+    rows = [] if result is None else [metrics_of(row) for row in result["per_image"]]
+    values = [row.get(metric) for row in rows if metric in row or not measure(metric).partial]
+    return stats.mean([math.nan if value is None else value for value in values])
+
+
+class MaskScores(TypedDict, total=False):
+    """Predicted distractor pixels against the exact ones, over all train photos together."""
+
+    iou: float | None
+    precision: float | None
+    recall: float | None
+    images: int
+
+
+# (seconds of training so far, seconds of the kernel)
+Sample = Annotated[list[NotNegative], Meta(min_length=2, max_length=2)]
+
+
+class TimeRecord(TypedDict, total=False):
+    """How far the time of a run can be trusted, see `timing.py`."""
+
+    verdict: Required[Literal["alone", "contended", "unknown"]]
+    reason: Required[str]  # empty for "alone"
+    kernel: str  # of the calibration
+    kernel_reference_s: NotNegative  # its seconds on the reference machine
+    samples: list[Sample]
+    parallel_share: float  # of the time in which several threads worked; the samples allow for it
+    runs: int  # most runs of ours at once on this machine or GPU, this one included
+    others: NotNegative  # processors that other programs used, mean over the run
+
+
+class Cost(TypedDict, total=False):
+    """What a run took. What is unknown is absent: an external program may know little."""
+
+    train_s: float  # wall seconds
+    cpu_s: float  # processor seconds of training, child processes included
+    reference_s: float  # training in seconds of the reference machine, see `timing.py`
+    timing: TimeRecord
+    setup_s: float  # features, masks and compilation before the first step
+    iterations: Count
+    passes: int  # trainings that all of this counts, where there was more than one
+    first_pass_s: float  # of train_s, that of the first
+    ms_per_iteration: float
+    ms_parts: dict[str, float]  # by part of an iteration
+    gaussians: Count
+    peak_rss_mb: float
+    peak_cuda_mb: float
+    device: str
+    threads: int
+    fps: float  # median of several rounds
+    fps_low: float
+    fps_high: float
+    model_mb: float  # of point_cloud.ply, 10^6 bytes
+
+
+class Environment(TypedDict, total=False):
+    """Versions and hardware, as in env.json."""
+
+    ambiguous_wild: str
+    python: str
+    platform: str
+    cpu: str
+    cores: int | None
+    device: str
+    packages: dict[str, str | None]  # None = not installed
+    gpu: str
+    gsplat_max_alpha: float  # differs between sources of gsplat
+
+
+class Provenance(TypedDict):
+    """Where a result was made, from which code, and the command that makes it again."""
+
+    environment: Environment
+    code_hash: str
+    reproduce: str
+
+
+class Rescore(TypedDict):
+    """Metrics that `aw rescore` added to a result, and by which code."""
+
+    metrics: list[str]
+    version: str
+    code_hash: str
+
+
+class RunResult(TypedDict):
+    """A result file: metrics.json, or failed.json of a run that failed."""
+
+    schema: int
+    method: Name
+    scene: Name
+    seed: int
+    status: Status
+    error: str | None
+    options: dict[str, Any]  # of the method
+    per_image: list[ImageRow]
+    missing: dict[str, str]  # metric -> why it is missing
+    masks: MaskScores | None  # None: no masks, or no exact ones to compare with
+    facts: dict[str, Any]  # of the method, its effects and the watchdog
+    cost: Cost
+    config_hash: str
+    scene_hash: str
+    version: str
+    # results of earlier versions lack these
+    environment: NotRequired[Environment]
+    code_hash: NotRequired[str]
+    reproduce: NotRequired[str]
+    rescored: NotRequired[list[Rescore]]
+    metrics: NotRequired[dict[str, MetricRecord]]  # that are not of this package
+    model_sha256: NotRequired[str]  # of point_cloud.ply; also absent where the run has none
+
+
+class SceneConfig(TypedDict):
+    """The scene of a run."""
+
+    name: str
+    sha256: str
+    factor: int | None  # of images_N; None = not known
+    path: str
+
+
+class UnusualConfig(TypedDict, total=False):
+    """Settings of a run that config.yaml holds only where they differ from the usual ones."""
+
+    effects: list[str]
+    protocol: str
+
+
+class RunConfig(UnusualConfig):
+    """config.yaml of a run: everything that decides its result, and where its scene lies."""
+
+    method: str
+    source: str  # hash of a plugin's file; empty for a method of ours
+    options: dict[str, Any]
+    train: dict[str, Any]  # fields of `TrainConfig`
+    scene: SceneConfig
+    device: str
+    version: str
+    config_hash: NotRequired[str]  # added when it is written
+
+
+SCHEMA = 1
+RESULT = "metrics.json"
+FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
+
+
+def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
+    """Check a result and write it atomically.
+
+    Args:
+        path: of the file, by custom RUNS/<scene>/<method>/seed<k>/metrics.json.
+        result: a `RunResult`; infinite numbers become "inf", NaN becomes null.
+
+    Raises:
+        AwError: the result does not follow the schema.
+    """
+    encoded = _encode(result)
+    _checked(encoded, str(path))
+    write_json(path, encoded)
+
+
+def read_result(path: Path | str) -> RunResult:
+    """Read and check a result file.
+
+    Returns:
+        The result with numbers decoded: "inf" is ``math.inf`` again; null stays None.
+
+    Raises:
+        AwError: no such file, no JSON, another schema version, or a field that is absent or of the wrong
+            type; names the file and the field.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
+    except FileNotFoundError:
+        raise AwError(f"no result file {path}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise AwError(f"{path} is damaged ({error}); run 'aw bench' again to replace it") from None
+    return _checked(data, str(path))
+
+
+MODEL = "point_cloud.ply"
+
+
+def model_hash(run: Path) -> dict[str, str]:
+    """`model_sha256` of a run's folder; empty where it has no model."""
+    return {"model_sha256": sha256_file(run / MODEL)} if (run / MODEL).is_file() else {}
+
+
+def check_model(run: Path, result: RunResult) -> None:
+    """Raise AwError if the run's model is not the one that was measured; earlier versions kept no hash."""
+    known = result.get("model_sha256")
+    if known is not None and model_hash(run).get("model_sha256") != known:
+        raise AwError(
+            f"{run / MODEL} is not the model that was measured (another hash than in {RESULT}): restore it, "
+            "or train again with --overwrite always"
+        )
+
+
+def _checked(data: Any, where: str) -> RunResult:
+    """The result with numbers decoded; AwError where it does not follow `RunResult`."""
+    try:
+        if not isinstance(data, dict):
+            raise msgspec.ValidationError("it must hold one JSON object")
+        if data.get("schema") != SCHEMA:
+            raise msgspec.ValidationError(
+                f"schema version {data.get('schema')!r}, this version reads {SCHEMA}"
+            )
+        data = data | {name: _decode(data[name]) for name in ("per_image", "cost", "masks") if name in data}
+        # a number that was not finite is null, and another program may write a count with a point
+        known = data | {name: _plain(data[name]) for name in ("cost", "environment") if name in data}
+        msgspec.convert(known, RunResult)
+        for name, kind in (("cost", Cost), ("masks", MaskScores)):  # what plugins and later versions add
+            more = {k: v for k, v in (known.get(name) or {}).items() if k not in kind.__annotations__}
+            msgspec.convert(more, dict[str, Finite | None])
+        rows = {row["name"]: metrics_of(row) for row in data["per_image"]}
+        if len(rows) < len(data["per_image"]):
+            raise msgspec.ValidationError("an image is there twice - at `$.per_image`")
+        msgspec.convert(rows, dict[str, dict[str, float | None]])  # metrics of plugins and later versions too
+        if any(kernel <= 0.0 for _, kernel in known["cost"].get("timing", {}).get("samples", ())):
+            raise msgspec.ValidationError("a calibration took no time - at `$.cost.timing.samples`")
+        remember(data.get("metrics", {}))
+        if data["status"] == "failed" and not data["error"]:
+            raise msgspec.ValidationError("a failed run must say its error")
+    except (msgspec.ValidationError, RecursionError) as error:
+        why = (
+            str(error)[:300].encode("ascii", "backslashreplace").decode()
+        )  # a value may be long or unprintable
+        raise AwError(
+            f"{where} is no result file of ours: {why}; run 'aw bench' again to replace it"
+        ) from None
+    return cast(RunResult, data)
+
+
+def _plain(value: Any) -> Any:
+    """Without null in objects, and whole numbers as integers."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items() if v is not None}
+    return int(value) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else value
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _encode(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _encode(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_encode(v) for v in value]
+    if isinstance(value, (np.bool_, np.integer, np.floating)):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
+    return value
+
+
+def _decode(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: v if k == "name" else _decode(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_decode(v) for v in value]
+    return float(value) if value in ("inf", "-inf") else value

@@ -1,1 +1,0 @@
-"""One run and many: plan, train, measure, write and read results."""

@@ -1,1 +1,0 @@
-"""Engines: run cells in this process, in several on this machine, or on a Ray cluster."""

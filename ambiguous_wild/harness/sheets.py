@@ -1,0 +1,241 @@
+"""Pictures in a grid with captions: sheets of a capture, of masks, and the one that compares runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.harness.models import open_scene
+from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.page_parts import jpeg_bytes
+from ambiguous_wild.io.palette import ADDED, MASKED, tint
+from ambiguous_wild.metrics.image import psnr
+
+Item = TypeVar("Item")
+GAP, BAR = 6, 20  # px between cells; height of a caption
+FONT, SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
+NAME = "sheet.jpg"
+WIDTH = 320  # px of a photo on the sheets of a capture and of masks
+CAPTURE_COLUMNS, MASK_COLUMNS, MOST_MASKS = 4, 5, 20  # photos in a row; at most
+
+
+def cell(caption: str, image: np.ndarray, width: int | None = None) -> np.ndarray:
+    """The image [H, W, 3] uint8 under its caption, at another width where one is given.
+
+    A caption that is wider than its picture is set smaller, and cut where even that does not do.
+    """
+    if width is not None and image.shape[1] != width:
+        size = (width, max(round(image.shape[0] * width / image.shape[1]), 1))
+        smaller = width < image.shape[1]
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
+    frame = np.full((image.shape[0] + BAR + GAP, image.shape[1] + GAP, 3), 255, np.uint8)
+    frame[BAR : BAR + image.shape[0], : image.shape[1]] = image
+    # OpenCV's fonts are ASCII; anything else would be drawn as question marks
+    text = caption.encode("ascii", "replace").decode()
+    scale = min(SCALE, SCALE * (image.shape[1] - 4) / max(_width(text, SCALE), 1))
+    scale = max(scale, 0.3)
+    while len(text) > 1 and _width(text, scale) > image.shape[1] - 2:
+        text = text[:-1]
+    cv2.putText(frame, text, (2, 14), FONT, scale, (20, 20, 20), 1, cv2.LINE_AA)
+    return frame
+
+
+def _width(text: str, scale: float) -> int:
+    return int(cv2.getTextSize(text, FONT, scale, 1)[0][0])
+
+
+def stack(images: Sequence[np.ndarray], axis: int) -> np.ndarray:
+    """Images below (axis 0) or beside (axis 1) each other, padded with white to a common size."""
+    other = 1 - axis
+    most = max(image.shape[other] for image in images)
+    padded = []
+    for image in images:
+        pad = [(0, 0), (0, 0), (0, 0)]
+        pad[other] = (0, most - image.shape[other])
+        padded.append(np.pad(image, pad, constant_values=255))
+    return np.concatenate(padded, axis=axis)
+
+
+def grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Cells row by row."""
+    return stack([stack(cells[k : k + columns], 1) for k in range(0, len(cells), columns)], 0)
+
+
+def spread(items: Sequence[Item], count: int) -> list[Item]:
+    """At most `count` of the items, evenly chosen, the first and the last among them."""
+    if not items:
+        return []
+    index = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
+    return [items[i] for i in index]
+
+
+def write_jpeg(path: Path, image: np.ndarray, quality: int = 90) -> None:
+    """Write [H, W, 3] uint8 RGB atomically."""
+    data = jpeg_bytes(image, quality)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_capture_sheet(raw: Path, path: Path | None = None) -> Path:
+    """Write a JPEG of eight train photos, two with their truth, and four test photos.
+
+    Args:
+        raw: a capture of `aw simulate`.
+        path: JPEG to write; None: ``RAW/truth/sheet.jpg``, where no builder takes it for a photo.
+
+    Returns:
+        What was written.
+
+    Raises:
+        AwError: a photo of the capture is missing.
+    """
+    facts = json.loads((raw / "truth" / "capture.json").read_text(encoding="utf-8"))
+    train = sorted(facts["photos"])
+    test = sorted(p.name for p in (raw / "test").iterdir())
+    cells = [
+        cell(_caption(name, facts), read_png_rgb(raw / "train" / name), WIDTH)
+        for name in spread(train, 2 * CAPTURE_COLUMNS)
+    ]
+    for name in spread(train, 2):
+        cells += _truth(raw, name)
+    cells += [
+        cell(f"test {name}", read_png_rgb(raw / "test" / name), WIDTH)
+        for name in spread(test, CAPTURE_COLUMNS)
+    ]
+    target = raw / "truth" / NAME if path is None else path
+    write_jpeg(target, grid(cells, CAPTURE_COLUMNS))
+    return target
+
+
+def _caption(name: str, facts: dict[str, Any]) -> str:
+    photo = facts["photos"][name]
+    words = [f"{Path(name).stem} {100 * photo['occlusion']:.0f} %"]
+    for drawn in photo.get("effects", {}).values():
+        words += [f"{key} {value:.2g}" for key, value in drawn.items() if isinstance(value, float)]
+    return ", ".join(words)
+
+
+def _truth(raw: Path, name: str) -> list[np.ndarray]:
+    stem = Path(name).stem
+    mask = read_gray(raw / "truth" / "distractor" / f"{stem}.png") >= 128
+    shown = tint(read_png_rgb(raw / "train" / name), mask, MASKED)
+    shadow = raw / "truth" / "shadow" / f"{stem}.png"
+    if shadow.is_file():
+        shown = tint(shown, read_gray(shadow) >= 128, ADDED)
+    return [
+        cell(f"{stem} mask, shadow" if shadow.is_file() else f"{stem} mask", shown, WIDTH),
+        cell(f"{stem} clean", read_png_rgb(raw / "truth" / "clean" / f"{stem}.png"), WIDTH),
+    ]
+
+
+def write_contact(
+    scene: Scene, masks: Path, path: Path, *, names: Sequence[str] = (), most: int = MOST_MASKS
+) -> list[Path]:
+    """Write a JPEG of train photos, the masked region tinted, each with its masked share.
+
+    Args:
+        scene: whose train photos.
+        masks: RUN/masks: keep maps by the photo's name, white = keep.
+        path: JPEG to write.
+        names: photos to show; empty: up to `most`, evenly chosen among those with a mask.
+        most: photos at most.
+
+    Returns:
+        What was written: nothing where the method masks nothing.
+
+    Raises:
+        AwError: a name that is no train photo.
+    """
+    by_name = {view.name: view for view in scene.train}
+    for name in names:
+        if name not in by_name:
+            raise unknown("train photo", name, by_name)
+    views = [by_name[name] for name in names] or list(scene.train)
+    views = [view for view in views if _mask(masks, view).is_file()]
+    if not views:
+        return []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_jpeg(path, grid([_tinted(scene, view, masks) for view in spread(views, most)], MASK_COLUMNS))
+    return [path]
+
+
+def _mask(folder: Path, view: View) -> Path:
+    return folder / Path(view.name).with_suffix(".png")
+
+
+def _tinted(scene: Scene, view: View, masks: Path) -> np.ndarray:
+    photo, masked = read_png_rgb(view.image_path), read_gray(_mask(masks, view)) < 128
+    caption = f"{view.name}: {100 * masked.mean():.0f} % masked"
+    truth = true_distractor(scene, view)
+    if truth is not None:
+        caption += f", {100 * truth.mean():.0f} % true"
+    return cell(caption, tint(photo, masked, MASKED), WIDTH)
+
+
+def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int = 3) -> int:
+    """Write the sheet of one scene: a column a method (first seed), `views` test and train rows.
+
+    Args:
+        runs: what `read_runs` found.
+        path: PNG to write, or JPG by its ending.
+        scene: its name; None where the runs are of one scene only.
+        views: rows of each kind.
+
+    Returns:
+        The number of methods shown.
+
+    Raises:
+        AwError: several scenes and none named, no finished run, the scene folder has moved, or a
+            run lacks its renders.
+    """
+    finished = runs.runs[runs.runs["status"] == "ok"]
+    names = sorted(finished["scene"].unique())
+    if scene is None and len(names) > 1:
+        raise AwError(f"runs of {len(names)} scenes: name one with --only ({', '.join(names)})")
+    chosen = finished if scene is None else finished[finished["scene"] == scene]
+    if chosen.empty:
+        raise AwError("no finished run to show; 'aw table' lists what is there")
+    first = chosen.sort_values("seed").drop_duplicates("method").sort_values("method")
+    folders = {str(row.method): Path(str(row.folder)) for row in first.itertuples()}
+    source = open_scene(next(iter(folders.values())), verify=False)
+    rows = [_test_row(view, folders) for view in spread(source.test, views)]
+    rows += [_train_row(view, folders) for view in spread(source.train, views)]
+    sheet = stack([stack(row, 1) for row in rows], 0)
+    (write_jpeg if path.suffix.lower() == ".jpg" else write_png)(path, sheet)
+    return len(folders)
+
+
+def _test_row(view: View, folders: dict[str, Path]) -> list[np.ndarray]:
+    photo = read_png_rgb(view.image_path)
+    cells = [cell(f"test photo {view.name}", photo)]
+    for method, folder in folders.items():
+        path = folder / "renders" / "test" / Path(view.name).with_suffix(".png")
+        if not path.is_file():
+            raise AwError(
+                f"the run {folder} lacks its render {path.relative_to(folder)}: restore it, or make the run "
+                "again with 'aw bench --overwrite always'"
+            )
+        render = read_png_rgb(path)
+        cells.append(cell(f"{method}  {psnr(render, photo):.2f} dB", render))
+    return cells
+
+
+def _train_row(view: View, folders: dict[str, Path]) -> list[np.ndarray]:
+    photo = read_png_rgb(view.image_path)
+    cells = [cell(f"train photo {view.name}", photo)]
+    for method, folder in folders.items():
+        path = _mask(folder / "masks", view)
+        masked = read_gray(path) < 128 if path.is_file() else np.zeros(photo.shape[:2], bool)
+        what = f"{100 * masked.mean():.0f} %" if path.is_file() else "nothing"
+        cells.append(cell(f"{method}  masks {what}", tint(photo, masked, MASKED)))
+    return cells

@@ -1,1 +1,0 @@
-"""From run folders to what `viewing` shows and `aw export` writes."""

@@ -1,1 +1,0 @@
-"""Comparisons of runs: one table, its formats, and the layouts of papers."""

@@ -1,0 +1,398 @@
+"""Train the model of a cell, once or twice, write what it renders and masks, and measure that."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.errors import counted
+from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness import pictures as pictures_of_training
+from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
+from ambiguous_wild.harness.meter import Meter
+from ambiguous_wild.harness.result_file import Cost, RunResult, TimeRecord
+from ambiguous_wild.io.files import atomic_dir, write_json
+from ambiguous_wild.io.images import read_keep_map, write_png
+from ambiguous_wild.io.ply import write_splat_ply
+from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
+from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.run import Stopped
+from ambiguous_wild.splat.trainer import Trainer
+
+LOG = logging.getLogger(__name__)
+_PROC = Path("/proc/self")
+_NO_MEMORY = ("CUDA out of memory", "CUDA error: out of memory")
+
+
+def reset_peak(device: str = "cpu") -> None:
+    """Forget the peaks so far: of the process where the system can (Linux), and of a GPU."""
+    if device.startswith("cuda"):
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
+    try:
+        (_PROC / "clear_refs").write_text("5")
+    except OSError:
+        return
+
+
+def peak_memory(device: str = "cpu") -> Cost:
+    """peak_rss_mb, and on a GPU peak_cuda_mb: the most its tensors held at once since `reset_peak`."""
+    rss = peak_rss_mb()
+    peaks: Cost = {"peak_rss_mb": rss} if math.isfinite(rss) else {}
+    if device.startswith("cuda"):
+        import torch
+
+        peaks["peak_cuda_mb"] = torch.cuda.max_memory_allocated(device) / 1e6
+    return peaks
+
+
+def peak_rss_mb() -> float:
+    """Largest resident memory since `reset_peak` in MB.
+
+    Elsewhere than on Linux since the process began; NaN on Windows.
+    """
+    try:
+        for line in (_PROC / "status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    except OSError:
+        pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return math.nan
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6  # bytes there, KiB elsewhere
+
+
+def is_out_of_gpu_memory(error: BaseException) -> bool:
+    """Whether a GPU had no memory left; gsplat's kernels say so by a RuntimeError of another name."""
+    import torch
+
+    if isinstance(error, torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
+
+
+def out_of_gpu_memory(error: BaseException, gaussians: int | None, factor: int | None) -> AwError:
+    """The error as one line with what helps.
+
+    Args:
+        error: what torch raised.
+        gaussians: how many the model had then; None = it was not made yet.
+        factor: which images_N it trained on; None = not known.
+    """
+    wanted = re.search(r"Tried to allocate [\d.]+ \w+", str(error))
+    asked = f", {wanted[0][0].lower()}{wanted[0][1:]}" if wanted else ""
+    had = f" with {gaussians:,} Gaussians" if gaussians else ""
+    helps = []
+    if gaussians:
+        helps.append(f"--max-gaussians {max(gaussians // 2, 4)}")
+    helps.append(f"--factor {2 * (factor or 1)} (smaller photos, where the scene has them)")
+    return AwError(
+        f"out of GPU memory{had}{asked}; what helps: {', '.join(helps)}, a GPU with more memory, or no other "
+        "program on this one"
+    )
+
+
+_SUMS = ("train_s", "cpu_s", "reference_s", "setup_s", "iterations")
+_WORST_FIRST = ("contended", "unknown", "alone")
+_PEAKS = ("peak_rss_mb", "peak_cuda_mb")
+
+
+def cost_of(cell: Cell, trainer: Trainer) -> Cost:
+    """Of the training that a trainer has done."""
+    import numba
+
+    n = max(trainer.iteration, 1)
+    cost: Cost = {
+        "train_s": trainer.clock.now(),
+        "cpu_s": trainer.clock.cpu_s,
+        "setup_s": trainer.setup_s,
+        "iterations": trainer.iteration,
+        "ms_per_iteration": trainer.ms_per_iteration,
+        "ms_parts": {name: 1e3 * seconds / n for name, seconds in trainer.clock.parts_s.items()},
+        "gaussians": len(trainer.gaussians),
+    }
+    if isinstance(trainer.meter, Meter):
+        cost |= trainer.meter.cost(trainer.clock.now())
+    cost |= peak_memory(cell.device)
+    cost["device"] = cell.device
+    cost["threads"] = int(numba.get_num_threads())
+    return cost
+
+
+def both_passes(first: Cost, second: Cost) -> Cost:
+    """Of two trainings that make one result: sums, means over all iterations, and the higher peaks."""
+    one, other = (cast("dict[str, float]", dict(cost)) for cost in (first, second))
+    known = {name: one[name] + other[name] for name in _SUMS if name in one and name in other}
+    known |= {name: max(cost[name] for cost in (one, other) if name in cost)
+              for name in _PEAKS if name in one or name in other}  # fmt: skip
+    share = one["iterations"] / max(known["iterations"], 1)
+
+    def mixed(a: float, b: float) -> float:
+        return share * a + (1.0 - share) * b
+
+    known["ms_per_iteration"] = mixed(one["ms_per_iteration"], other["ms_per_iteration"])
+    parts = {
+        name: mixed(first["ms_parts"].get(name, 0.0), second["ms_parts"].get(name, 0.0))
+        for name in {**first["ms_parts"], **second["ms_parts"]}
+    }
+    extra: dict[str, object] = {"ms_parts": parts, "passes": 2, "first_pass_s": first["train_s"]}
+    if "timing" in first and "timing" in second:
+        extra["timing"] = _both_timings(first["timing"], second["timing"], first["train_s"])
+    return cast(Cost, {**second, **known, **extra})
+
+
+def _both_timings(first: TimeRecord, second: TimeRecord, first_s: float) -> TimeRecord:
+    """The record of both trainings, one after the other: the worse verdict, and all calibrations."""
+    worse = min((first, second), key=lambda record: _WORST_FIRST.index(record["verdict"]))
+    both: TimeRecord = {**second, "verdict": worse["verdict"], "reason": worse["reason"]}
+    both["samples"] = [*first["samples"], *([first_s + s, kernel] for s, kernel in second["samples"])]
+    both["runs"] = max(first["runs"], second["runs"])
+    if "others" in first and "others" in second:
+        both["others"] = max(first["others"], second["others"])
+    return both
+
+
+FOLDER = "first-pass"  # in the run's; holds a checkpoint while it trains, then masks/ and cost.json
+COST, MASKS = "cost.json", "masks"
+Tick = Callable[[Any], None]  # gets the `Trainer` after every iteration, with its clock stopped
+
+
+@dataclass(frozen=True)
+class FirstPass:
+    """What the second training needs of the first."""
+
+    keeps: list[Tensor]  # of the train views, [H, W], 1 = static
+    cost: Cost
+
+
+def of_one_pass(cell: Cell) -> TrainConfig:
+    """Length of each training: all iterations, but half of a budget, which is what the run may take."""
+    budget = cell.train.budget_s
+    if cell.method.passes == 1 or budget is None:
+        return cell.train
+    return replace(cell.train, budget_s=budget / cell.method.passes)
+
+
+def check_passes(cell: Cell) -> None:
+    """Raise AwError if the cell trains twice and its method has no masks."""
+    if cell.method.passes > 1:
+        refuse_without_masks(cell.method.base, cell.method.build(cell.options))
+
+
+def refuse_without_masks(name: str, parts: Parts) -> None:
+    """Raise AwError if the method's mask policy keeps everything."""
+    policy = parts.mask
+    own = type(policy.mask if isinstance(policy, GraftedPolicy) else policy)
+    if own.keep is MaskPolicy.keep and own.predict is MaskPolicy.predict:
+        raise AwError(
+            f"--passes 2 trains again with the final masks, and {name} has none: "
+            "choose another method, or give it masks with --mask METHOD"
+        )
+
+
+def first_pass(cell: Cell, folder: Path, cache_dir: Path, tick: Tick | None) -> FirstPass:
+    """Train the first pass, or go on with it, or read what it left."""
+    place = folder / FOLDER
+    if not (place / COST).is_file():
+        _train(cell, place, cache_dir, tick)
+    masks = [place / MASKS / Path(view.name).with_suffix(".png") for view in cell.scene.train]
+    size = [(view.camera.height, view.camera.width) for view in cell.scene.train]
+    keeps = [torch.from_numpy(read_keep_map(path).astype(np.float32)) for path in masks]
+    for path, keep, wanted in zip(masks, keeps, size):
+        if tuple(keep.shape) != wanted:
+            raise AwError(
+                f"{path} is {list(keep.shape)}, its photo {list(wanted)}; bench with --overwrite always"
+            )
+    return FirstPass(keeps, cast(Cost, json.loads((place / COST).read_text(encoding="utf-8"))))
+
+
+def _train(cell: Cell, place: Path, cache_dir: Path, tick: Tick | None) -> None:
+    trainer = _make_trainer(replace(cell, train=replace(cell.train, probes=0)), place, cache_dir)
+    trainer.resume()
+    trainer.train(tick=tick)
+    cost = cost_of(cell, trainer)
+    shutil.rmtree(place / MASKS, ignore_errors=True)
+    with atomic_dir(place / MASKS) as temporary:
+        for index, view in enumerate(cell.scene.train):
+            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
+            keep = trainer.parts.mask.predict(step)
+            kept = np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
+            path = temporary / Path(view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, kept.astype(np.uint8) * 255)
+    write_json(place / COST, cost)  # last: with it the pass is done
+
+
+STOPPED = "stopped"  # folder of a run that Ctrl-C stopped: the model as it was then; gone when the run ends
+
+
+def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> RunResult:
+    """Train the cell, or go on from its checkpoint; write the run's files; measure the test views.
+
+    Raises:
+        AwError: the GPU has too little memory; says what helps.
+    """
+    trainer: Trainer | None = None
+    problem: AwError
+    try:
+        reset_peak(cell.device)
+        truth = evaluate.load_test_photos(cell.scene)
+        first = None
+        if cell.method.passes > 1:
+            first = first_pass(cell, folder, options.cache_dir, tick)
+        trainer = _make_trainer(cell, folder, options.cache_dir, truth, first)
+        return _train_and_measure(cell, trainer, truth, options, tick, first)
+    except Exception as error:
+        if not is_out_of_gpu_memory(error):
+            raise
+        gaussians = None if trainer is None else len(trainer.gaussians)
+        problem = out_of_gpu_memory(error, gaussians, cell.scene.info.get("loaded_factor"))
+    # Outside of the handler nothing refers to the trainer: its memory is free for the next cell.
+    trainer = None
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+    raise problem
+
+
+def _make_trainer(
+    cell: Cell,
+    folder: Path,
+    cache_dir: Path,
+    truth: Sequence[evaluate.TestPhoto] = (),
+    first: FirstPass | None = None,
+) -> Trainer:
+    """A trainer whose time is measured; without `truth` the test PSNR is not probed on the way."""
+    folder.mkdir(parents=True, exist_ok=True)
+    device = torch.device(cell.device)
+    data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
+    parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
+    if first is not None:
+        parts = replace(parts, mask=FixedMasks(first.keeps))
+
+    def probe(draw: Callable[[Camera], torch.Tensor]) -> float:
+        return evaluate.mean_psnr(truth, lambda camera: draw(camera).cpu().numpy())
+
+    LOG.info("finding start points" if "dense" in cell.chosen.effects else "setting up")
+    before = time.perf_counter()
+    trainer = Trainer(data, parts, of_one_pass(cell), folder=folder, probe=probe if truth else None)
+    # Frozen inputs, instance masks and identities are part of what a method costs.
+    trainer.setup_s = time.perf_counter() - before
+    trainer.meter = Meter.of(cell.device)
+    trainer.whose = {
+        "hash": cell.identity,
+        "about": f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}, "
+        + asked_length(cell.train),
+    }
+    if first is not None:
+        trainer.timeline.before_s = first.cost["train_s"]
+    return trainer
+
+
+def _train_and_measure(
+    cell: Cell,
+    trainer: Trainer,
+    truth: list[evaluate.TestPhoto],
+    options: RunOptions,
+    tick: Tick | None,
+    first: FirstPass | None,
+) -> RunResult:
+    folder = trainer.folder
+    trainer.resume()
+    recorder = pictures_of_training.Recorder(trainer, folder) if options.pictures else None
+
+    def after_iteration(trainer: Trainer) -> None:
+        if recorder is not None:
+            recorder(trainer)
+        if tick is not None:
+            tick(trainer)
+
+    try:
+        trainer.train(tick=after_iteration)
+    except Stopped:
+        raise Stopped(_keep_stopped(cell, trainer, truth)) from None
+    shutil.rmtree(folder / STOPPED, ignore_errors=True)
+    trainer.check_taught()
+    cost = cost_of(cell, trainer)  # now: what follows measures, and is no training
+    if first is not None:
+        cost = both_passes(first.cost, cost)
+    write_splat_ply(
+        folder / "point_cloud.ply",
+        {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()},
+        trainer.data.scene.place,
+    )
+    LOG.info("measuring %s", counted(len(truth), "test view"))
+    per_image, missing = evaluate.render_and_measure(
+        trainer, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
+    )
+    evaluate.refuse_empty(truth, folder / "renders" / "test")
+    LOG.info("drawing masks and pictures")
+    masks = evaluate.write_masks(trainer, folder / "masks")
+    if recorder is not None:
+        pictures_of_training.draw_all(trainer, recorder, folder)
+    facts = trainer.parts.mask.facts() | {"skipped_views": trainer.skipped_views} | trainer.watchdog.facts()
+    cost |= evaluate.frames_per_second(trainer)
+    cost["model_mb"] = (folder / "point_cloud.ply").stat().st_size / 1e6
+    return cell.result(
+        per_image=per_image,
+        missing=missing,
+        masks=masks,
+        facts=facts | _effect_facts(cell, trainer),
+        cost=cost,
+    )
+
+
+def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto]) -> str:
+    """The model as it stood when Ctrl-C came, measured; returns what to tell. Ctrl-C again leaves it out."""
+    folder, train = trainer.folder, cell.train
+    of = f" of {train.iterations}" if train.budget_s is None else f", {train.budget_s:g} s were asked for"
+    done = f"stopped after {trainer.iteration} iterations{of}"
+    end = "the same command goes on"
+    try:
+        with atomic_dir(folder / STOPPED) as kept:
+            model = {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
+            write_splat_ply(kept / "point_cloud.ply", model, trainer.data.scene.place)
+            half = cell.protocol == "half"
+            rows, missing = evaluate.render_and_measure(
+                trainer, truth, kept / "renders", half=half, scene=cell.scene
+            )
+            state = {"iteration": trainer.iteration, "train_s": trainer.clock.now()}
+            write_json(kept / "measured.json", {**state, "per_image": rows, "missing": missing})
+    except KeyboardInterrupt:
+        return f"{done}; {end}"
+    psnr = f": {np.mean([row['psnr'] for row in rows]):.2f} dB over {len(rows)} test views" if rows else ""
+    return f"{done}{psnr}; model and renders in {folder / STOPPED}; {end}"
+
+
+def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:
+    """Which effects were on and what they learnt; empty without any."""
+    facts: dict[str, Any] = {}
+    if cell.protocol == "half":
+        nothing = {"effects": [], "steps": 0}
+        facts |= {
+            "protocol": "half",
+            "fitted": nothing if trainer.effects is None else trainer.effects.fitted(),
+        }
+    if cell.chosen.effects:
+        facts["effects"] = list(cell.chosen.effects)
+    return facts if trainer.effects is None else facts | {"effect_facts": trainer.effects.facts()}

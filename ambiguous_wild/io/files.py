@@ -1,0 +1,382 @@
+"""Atomic writes: files and folders appear under their name complete or not at all, and replace ours only.
+
+`place_of` decides for all commands what may lie where an output goes: nothing, a file, or a link to one.
+Devices and pipes are written into, everything else is refused.
+
+sha256 of files and arrays: what a scene, a run and a cache entry are known by.
+
+Folder locks: one command at a time on one folder; on every system, through filelock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import glob
+import hashlib
+import json
+import os
+import re
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from ambiguous_wild.core.errors import AwError
+
+# Long enough to look again where the holder unlinked the file between our open and our lock.
+_TRY_S, _AGAIN_S = 0.05, 0.005
+
+
+class Busy(AwError):
+    """Another process works on the folder."""
+
+    holder = "another process"
+
+
+class Held(Exception):
+    """Another process holds the file; the text is what it wrote there, or empty."""
+
+
+@contextmanager
+def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
+    """Lock `.<name>.lock` beside the folder; the system frees it even after kill -9.
+
+    Args:
+        folder: it need not exist yet.
+        doing: the command, for the error message of other processes, e.g. ``"aw bench"``.
+
+    Raises:
+        Busy: another process holds it.
+    """
+    folder = Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(file_lock(lock_path(folder), f"{doing} (process {os.getpid()})"))
+        except Held as held:
+            holder = str(held) or Busy.holder
+            busy = Busy(
+                f"{folder} is being worked on by {holder}; wait for it to end, or choose another folder"
+            )
+            busy.holder = holder
+            raise busy from None
+        yield
+
+
+@contextmanager
+def patient_lock(
+    folder: Path | str, doing: str, patience_s: float, waiting: Callable[[str], None] | None = None
+) -> Iterator[None]:
+    """As `folder_lock`, but wait for up to `patience_s` seconds; `waiting` is told once who holds it.
+
+    Raises:
+        Busy: it is locked even then.
+    """
+    deadline = time.monotonic() + patience_s
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(folder_lock(folder, doing))
+                break
+            except Busy as busy:
+                if time.monotonic() > deadline:
+                    raise
+                if waiting is not None:
+                    waiting(busy.holder)
+                    waiting = None
+                time.sleep(0.5)
+        yield
+
+
+def lock_path(folder: Path) -> Path:
+    """The file that is locked for a folder."""
+    return folder.parent / f".{folder.name}.lock"
+
+
+@contextmanager
+def file_lock(path: Path, text: str) -> Iterator[None]:
+    """Lock a file and write `text` into it, for whoever finds it locked; it is removed afterwards.
+
+    Raises:
+        Held: another process, or another call of this one, holds it.
+        OSError: it cannot be written.
+    """
+    lock = FileLock(path, timeout=_TRY_S, thread_local=False)
+    try:
+        lock.acquire(poll_interval=_AGAIN_S)
+    except Timeout:
+        raise Held(_read(path)) from None
+    try:
+        with contextlib.suppress(OSError):  # Windows may refuse a second handle
+            path.write_text(text, encoding="utf-8")
+        yield
+    finally:
+        # Unlinked while it is locked: no stale file is left. Where the system refuses that, afterwards.
+        with contextlib.suppress(OSError):
+            path.unlink()
+        lock.release()
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")[:200].strip()
+    except OSError:
+        return ""
+
+
+def sha256_file(path: Path | str) -> str:
+    """sha256 of the file's bytes, 64 hex digits."""
+    with open(path, "rb") as f:
+        return hashlib.file_digest(f, "sha256").hexdigest()
+
+
+def sha256_array(array: np.ndarray) -> str:
+    """sha256 over dtype, shape and bytes."""
+    contiguous = np.ascontiguousarray(array)
+    digest = hashlib.sha256(f"{contiguous.dtype.str}{contiguous.shape}".encode())
+    digest.update(contiguous.tobytes())
+    return digest.hexdigest()
+
+
+def place_of(path: Path | str) -> tuple[Path, bool]:
+    """Where an output called `path` goes, links followed, and whether it is written into what is there.
+
+    Into it: character devices and pipes. All else is replaced whole; the caller tells a file from a folder.
+
+    Raises:
+        AwError: a link to nowhere, a disk or a socket.
+    """
+    if not os.path.exists(path):
+        if os.path.islink(path):
+            raise AwError(f"cannot write {path}: it is a link to nowhere; remove it or choose another -o")
+        return Path(path), False
+    kind = os.stat(path).st_mode
+    if stat.S_ISCHR(kind) or stat.S_ISFIFO(kind):
+        return Path(path), True  # not its real path: that of a pipe behind /dev/stdout is no path
+    if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+        raise AwError(f"cannot write {path}: a disk or a socket lies there; choose another -o")
+    return Path(os.path.realpath(path) if os.path.islink(path) else path), False
+
+
+@contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary path beside `path` with the same suffix; rename it to `path` on success.
+
+    After an error the temporary file is removed and `path` is unchanged. A link's target is replaced, not
+    the link; a device or a pipe gets the bytes.
+
+    Raises:
+        AwError: a folder, a link to nowhere, a disk, a socket or a pipe that nobody reads lies there.
+        OSError: it cannot be written; names `path`, not the temporary file.
+    """
+    target, into = place_of(path)
+    if target.is_dir():
+        raise AwError(f"cannot write the file {path}: a folder lies there; choose another -o")
+    folder = Path(tempfile.gettempdir()) if into else target.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        start = f".{target.stem}.{os.getpid()}-"
+        handle, name = tempfile.mkstemp(prefix=start, suffix=f".tmp{target.suffix}", dir=folder)
+    except OSError as error:
+        raise _named(error, target) from None
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with open(temporary, "rb") as f:
+            os.fsync(f.fileno())
+        # mkstemp makes private files; here the user's umask applies.
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        if into:
+            _pour(temporary, target)
+            temporary.unlink()
+        else:
+            os.replace(temporary, target)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and error.filename in (None, name, temporary):
+            raise _named(error, target) from error
+        if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' own class
+            raise OSError(int(full[1]), os.strerror(int(full[1])), str(target)) from error
+        raise
+
+
+def _pour(source: Path, target: Path) -> None:
+    """Write the bytes of a file into a device or a pipe."""
+    try:
+        handle = os.open(target, os.O_WRONLY | os.O_NONBLOCK)  # a pipe without a reader would block for ever
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        raise AwError(f"cannot write {target}: nobody reads this pipe; choose another -o") from None
+    os.set_blocking(handle, True)
+    try:
+        with open(source, "rb") as f, open(handle, "wb", buffering=0) as out:
+            shutil.copyfileobj(f, out)
+    except OSError as error:
+        raise _named(error, target) from error
+
+
+def _named(error: OSError, target: Path) -> OSError:
+    """The same error with the target's name; OSError chooses the subclass."""
+    return OSError(error.errno, error.strerror, str(target))
+
+
+@contextmanager
+def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`; rename it to `path` on success, replacing an older folder.
+
+    If `path` is a link, its target is replaced, not the link.
+
+    Raises:
+        AwError: `path` is a file or a link to nowhere; without `replace`, somebody made it meanwhile.
+    """
+    target = Path(os.path.realpath(place_of(path)[0]))
+    refuse_file(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.tmp-", dir=target.parent))
+    umask = os.umask(0)
+    os.umask(umask)
+    os.chmod(temporary, 0o777 & ~umask)
+    try:
+        yield temporary
+        if not replace:
+            try:
+                os.rename(temporary, target)  # onto an empty folder at most
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                raise AwError(
+                    f"another command made {path} meanwhile; nothing of it is replaced: choose another -o"
+                ) from None
+        elif target.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old-", dir=target.parent))
+            os.replace(target, old / target.name)
+            os.replace(temporary, target)
+            shutil.rmtree(old)
+        else:
+            os.replace(temporary, target)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def refuse_file(path: Path | str) -> None:
+    """Raise AwError where `path`, a folder to be made, is a file."""
+    if os.path.exists(path) and not os.path.isdir(path):
+        raise AwError(f"cannot make the folder {path}: a file lies there; move it, or choose another -o")
+
+
+def sweep(folder: Path | str) -> None:
+    """Remove temporary files of killed processes; call it only with the folder locked."""
+    for left in sorted(Path(folder).rglob(".*.tmp*")) + sorted(Path(folder).rglob(".*.old-*")):
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def sweep_killed(path: Path | str) -> None:
+    """Remove temporary files of `atomic_path(path)` whose processes are gone; the folder may be a user's."""
+    target = Path(path)
+    start = f".{target.stem}."
+    for left in target.parent.glob(glob.escape(start) + "*-*.tmp" + glob.escape(target.suffix)):
+        number = left.name.removeprefix(start).partition("-")[0]
+        try:
+            os.kill(int(number), 0)
+        except (ProcessLookupError, OverflowError):
+            left.unlink(missing_ok=True)
+        except (PermissionError, ValueError):  # another user's process, another program's file
+            continue
+
+
+def sweep_siblings(path: Path | str) -> None:
+    """Remove temporary folders of killed `atomic_dir(path)` calls; call it only with `path` locked."""
+    target = Path(path)
+    name = glob.escape(target.name)
+    for pattern in (f".{name}.tmp-*", f".{name}.old-*"):
+        for left in sorted(target.parent.glob(pattern)):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def check_output(path: Path | str) -> Path:
+    """Check, before long work, that `path` can be written; its parent folders are made.
+
+    Returns:
+        The absolute path that will be written: the target of a link.
+
+    Raises:
+        AwError: a parent is a file, the folder is not writable, or `place_of` refuses what is there.
+    """
+    target, into = place_of(path)
+    if into:
+        return target
+    folder = Path(os.path.abspath(target)).parent
+    for part in (folder, *folder.parents):
+        if part.exists() and not part.is_dir():
+            raise AwError(f"cannot write {path}: {part} is a file, not a folder; choose another -o")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.rmdir(tempfile.mkdtemp(prefix=".aw-probe-", dir=folder))
+    except OSError as error:
+        raise AwError(
+            f"cannot write in {folder}: {error.strerror or error}; choose another -o, or change the "
+            "permissions"
+        ) from error
+    return Path(os.path.abspath(target))
+
+
+def list_names(folder: Path) -> list[str]:
+    """Files and links below a folder, sorted, as paths relative to it with slashes."""
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in found)
+
+
+def refuse_foreign_files(folder: Path, ours: Collection[str]) -> None:
+    """Raise AwError where the folder holds a file that is not in `ours` and would be lost."""
+    for name in list_names(folder):
+        if name not in ours:
+            raise AwError(
+                f"{folder} also holds {name}, which this command did not write and would remove: "
+                "move it to another folder, or choose another -o"
+            )
+
+
+def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> None:
+    """Raise AwError where one of these files, which a command is to write, is in the folder already.
+
+    `flag` is the option that replaces it.
+    """
+    for name in names:
+        if os.path.lexists(folder / name):
+            how = f"; replace it with {flag}, or choose another -o" if flag else "; choose another -o"
+            raise AwError(f"{folder / name} exists, and this command would replace it{how}")
+
+
+def is_record(path: Path, key: str) -> bool:
+    """Whether a file is a JSON object with this key: the mark of what a command wrote before."""
+    try:
+        return key in json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write UTF-8 text atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path | str, data: Any) -> None:
+    """Write JSON atomically: two-space indent, key order as given, NaN refused."""
+    write_text(path, json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n")

@@ -1,0 +1,160 @@
+"""Binary glTF 2.0 with KHR_gaussian_splatting: float32 attributes, nothing quantised.
+
+Names and values as the extension's specification has them: opacities after the sigmoid, scales after exp,
+quaternions x, y, z, w. A node turns the splat PLY's axes (y down) by 180 degrees about z, so that y is up.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.splat_arrays import SH_C0, Arrays, finite, logit, read_bytes, rounded, sigmoid
+
+EXTENSION = "KHR_gaussian_splatting"
+_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # x, y, z, w
+_MOST_BYTES = 1 << 33
+
+
+def _harmonics(rest: int) -> list[str]:
+    degree = round((rest + 1) ** 0.5) - 1
+    return [f"SH_DEGREE_{d}_COEF_{c}" for d in range(1, degree + 1) for c in range(2 * d + 1)]
+
+
+def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
+    """Write a .glb atomically. Returns how many Gaussians were written.
+
+    Args:
+        path: the file, NAME.glb.
+        gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
+        place: of their scene; its offset becomes the node's translation.
+    """
+    kept = finite(gaussians)
+    n, rest = kept["sh_rest"].shape[:2]
+    if not n:
+        raise AwError(f"cannot write {path}: no Gaussian is finite, and glTF has no empty meshes")
+    alpha = sigmoid(kept["opacity_logits"])
+    colour = np.column_stack([kept["sh0"] * SH_C0 + 0.5, alpha])
+    columns = {
+        "POSITION": kept["means"],
+        "COLOR_0": rounded(colour * 255, 255).astype(np.uint8),  # for viewers without the extension
+        f"{EXTENSION}:ROTATION": kept["quats"][:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": np.exp(kept["log_scales"].astype(np.float64)),
+        f"{EXTENSION}:OPACITY": alpha,
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": kept["sh0"],
+    }
+    columns |= {f"{EXTENSION}:{name}": kept["sh_rest"][:, k] for k, name in enumerate(_harmonics(rest))}
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    attributes: dict[str, int] = {}
+    parts: list[bytes] = []
+    offset = 0
+    for name, values in columns.items():
+        data = values if values.dtype == np.uint8 else values.astype("<f4")
+        accessor: dict[str, Any] = {
+            "bufferView": len(views),
+            "componentType": _BYTE if data.dtype == np.uint8 else _FLOAT,
+            "count": n,
+            "type": _TYPES[data.shape[1] if data.ndim > 1 else 1],
+        }
+        if data.dtype == np.uint8:
+            accessor["normalized"] = True
+        if name == "POSITION":
+            accessor |= {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
+        attributes[name] = len(accessors)
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": data.nbytes, "target": _ARRAY_BUFFER})
+        accessors.append(accessor)
+        parts.append(np.ascontiguousarray(data).tobytes())
+        offset += data.nbytes  # of whole words: every row has 4 bytes or a multiple
+    body = b"".join(parts)
+    extension = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "sortingMethod": "cameraDistance",
+        "projection": "perspective",
+    }
+    x, y, z = place.centre
+    node = {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
+    head = {
+        "asset": {"version": "2.0", "generator": "ambiguous_wild"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "buffers": [{"byteLength": len(body)}],
+        "bufferViews": views,
+        "accessors": accessors,
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
+                ]
+            }
+        ],
+    }
+    text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + len(body)
+    if total >= 1 << 32:
+        raise AwError(f"cannot write {path}: {total:,} bytes, and a .glb has at most 4 GiB; export as spz")
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        f.write(struct.pack("<4sII", b"glTF", 2, total))
+        f.write(struct.pack("<II", len(text), _JSON) + text)
+        f.write(struct.pack("<II", len(body), _BIN) + body)
+    return n
+
+
+def read_gltf(path: Path | str) -> dict[str, np.ndarray]:
+    """Raw parameters of a .glb that `write_gltf` wrote, float32.
+
+    Raises:
+        AwError: no such file, or another layout.
+    """
+    data = read_bytes(path, _MOST_BYTES)
+    try:
+        magic, version, _ = struct.unpack_from("<4sII", data)
+        length, kind = struct.unpack_from("<II", data, 12)
+        head = json.loads(data[20 : 20 + length])
+        if (magic, version, kind) != (b"glTF", 2, _JSON):
+            raise AwError(f"{path} is no binary glTF 2.0")
+        attributes = head["meshes"][0]["primitives"][0]["attributes"]
+        body = 20 + length + 8
+
+        def column(name: str) -> np.ndarray:
+            accessor = head["accessors"][attributes[name]]
+            width = next(k for k, v in _TYPES.items() if v == accessor["type"])
+            start = body + int(head["bufferViews"][accessor["bufferView"]]["byteOffset"])
+            count = int(accessor["count"])
+            found = np.frombuffer(data, "<f4", count * width, start).reshape(count, width)
+            return found[:, 0] if width == 1 else found
+
+        rest = sum(name.startswith(f"{EXTENSION}:SH_DEGREE_") for name in attributes) - 1
+        means = column("POSITION")
+        higher = [column(f"{EXTENSION}:{name}") for name in _harmonics(rest)]
+        return {
+            "means": means,
+            "quats": column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
+            "log_scales": np.log(column(f"{EXTENSION}:SCALE")),
+            "opacity_logits": logit(column(f"{EXTENSION}:OPACITY")),
+            "sh0": column(f"{EXTENSION}:SH_DEGREE_0_COEF_0"),
+            "sh_rest": np.stack(higher, axis=1) if higher else np.zeros((len(means), 0, 3), np.float32),
+        }
+    except (
+        struct.error,
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        StopIteration,
+        RecursionError,
+    ) as error:
+        raise AwError(f"{path} is no glTF as 'aw export' writes it: {error}") from None

@@ -1,1 +1,0 @@
-"""Other files for the same Gaussians: compressed PLY, SPZ, SOG, binary glTF; one module each."""

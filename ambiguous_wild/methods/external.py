@@ -1,0 +1,431 @@
+"""`external:my.yaml`: a program with commands to train and render, described in a YAML or TOML file.
+
+The plain adapter: a train command, a render command, and the paths of the pictures.
+
+Placeholders in commands and paths: ``{scene}``, ``{index:05d}``; names only, no expressions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+import json
+import os
+import re
+import shlex
+import shutil
+import string
+import subprocess
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from ambiguous_wild.core import AwError, View
+from ambiguous_wild.core.config import config_hash, from_plain, to_plain
+from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.core.names import check_name
+from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.files import write_json
+from ambiguous_wild.methods.entry import MethodEntry, NoOptions
+from ambiguous_wild.methods.external_process import (
+    DONE,
+    Photos,
+    Produced,
+    Task,
+    end_left_over,
+    no_parts,
+    run_logged,
+    split_lists,
+    stage,
+)
+
+_FORMATTER = string.Formatter()
+
+
+def placeholders(template: str, where: str) -> set[str]:
+    """Names in braces.
+
+    Raises:
+        AwError: a brace without its partner, or more than a name in braces.
+    """
+    try:
+        parts = list(_FORMATTER.parse(template))
+    except ValueError as error:
+        raise AwError(f"{where}: {template!r}: {error}; write {{{{ for a brace that is meant") from None
+    names = {name for _, name, _, _ in parts if name is not None}
+    for name in names:
+        if not name.isidentifier():
+            raise AwError(f"{where}: {{{name}}} in {template!r} is no placeholder: write a name")
+    return names
+
+
+def check(template: str, known: Iterable[str], where: str) -> set[str]:
+    """The placeholders of a template.
+
+    Raises:
+        AwError: one is not known; names the nearest.
+    """
+    names, choices = placeholders(template, where), set(known)
+    for name in sorted(names - choices):
+        raise unknown(f"placeholder in {where}", name, choices, "{{ is a brace that is meant")
+    return names
+
+
+def fill(template: str, values: Mapping[str, Any]) -> str:
+    """The template with values in place; a value stays within the one argument it stands in."""
+    try:
+        return _FORMATTER.vformat(template, (), values)
+    except (ValueError, TypeError, KeyError) as error:
+        raise AwError(f"{template!r} cannot be filled in: {error}") from None
+
+
+def fill_pattern(template: str, values: Mapping[str, Any]) -> str:
+    """The same for a glob pattern: wildcards of the template work, those in values are plain text."""
+    escaped = {k: glob.escape(v) if isinstance(v, str) else v for k, v in values.items()}
+    return fill(template, escaped)
+
+
+BEGUN = (
+    "begun.json"  # in the program's folder: the command that was started, to know whether it may be resumed
+)
+
+
+@dataclass(frozen=True)
+class CommandProgram:
+    """See `Description` for the fields; commands are split and paths resolved."""
+
+    name: str
+    train: tuple[str, ...]
+    render: tuple[str, ...]
+    resume: tuple[str, ...]
+    renders: str
+    masks: str
+    ply: str
+    cwd: Path
+    prefix: tuple[str, ...]
+    environment: tuple[tuple[str, str], ...]
+    scene_files: tuple[tuple[str, str], ...]
+    timeout_s: float | None
+    photos: Photos = "all"  # what the program sees, see staging.py
+    drawn_by_us: bool = False  # it leaves splats, which our renderer draws
+
+    def missing(self, options: Any) -> str:
+        """The first word of a command, or of the prefix, that is no program here; empty if all are."""
+        values = dataclasses.asdict(options)
+        commands = [self.prefix] if self.prefix else [self.train, self.render, self.resume]
+        words = [command[0] for command in commands if command]
+        path = dict(self.environment).get("PATH")
+        for word in dict.fromkeys(words):
+            if placeholders(f"{word}{path or ''}", self.name) - values.keys():
+                continue  # known when it runs
+            program = fill(word, values)
+            where = self.cwd / program if os.path.dirname(program) else program
+            if shutil.which(where, path=path and fill(path, values)) is None:
+                return program
+        return ""
+
+    def run(self, task: Task) -> Produced:
+        """Train unless that is done, render unless that is done, collect.
+
+        Raises:
+            AwError: a command fails or writes no complete output.
+        """
+        self._check_length(task)
+        end_left_over(task.logs)
+        lists = split_lists(task.scene)
+        files = {name: fill(text, lists) for name, text in self.scene_files}
+        staged = stage(task.scene, task.folder / ".scene", files, photos=self.photos)
+        try:
+            values = self._values(task, staged)
+            state = task.work / DONE
+            done: dict[str, float] = _read(state)
+            output = Path(values["output"])
+            if "train_s" not in done:
+                again = self._goes_on(task, output)
+                if not again:
+                    shutil.rmtree(output, ignore_errors=True)
+                output.mkdir(parents=True, exist_ok=True)
+                command = self.resume if again else self.train
+                write_json(task.work / BEGUN, list(self.train))
+                done["train_s"] = self._command("train", command, values, task)
+                write_json(state, done)
+            if self.render and "render_s" not in done:
+                done["render_s"] = self._command("render", self.render, values, task)
+                write_json(state, done)
+            return self._collect(task, values, done)
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+
+    def _goes_on(self, task: Task, output: Path) -> bool:
+        """Whether there is output of the same command that `resume` may continue."""
+        try:
+            begun = json.loads((task.work / BEGUN).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return False
+        same = begun == list(self.train)
+        return bool(self.resume) and same and output.is_dir() and any(output.iterdir())
+
+    def _check_length(self, task: Task) -> None:
+        if task.budget_s is not None and "budget_s" not in self._used():
+            raise AwError(
+                f"{self.name} has no {{budget_s}} in its commands, so it cannot keep a --budget: "
+                "give --iterations instead"
+            )
+
+    def _used(self) -> set[str]:
+        texts = (*self.train, *self.render, *(value for _, value in self.environment))
+        return set().union(*(placeholders(text, self.name) for text in texts))
+
+    def _values(self, task: Task, staged: Path) -> dict[str, Any]:
+        factor = int(task.scene.info.get("loaded_factor") or 1)
+        return dataclasses.asdict(task.options) | {
+            "scene": str(staged.absolute()),
+            "source": str(task.scene.root.resolve()),
+            "images": "images" if factor == 1 or self.photos != "all" else f"images_{factor}",
+            "output": str((task.work / "output").absolute()),
+            "seed": task.seed,
+            "iterations": task.iterations,
+            "budget_s": task.budget_s,
+            "factor": 1 if self.photos == "train" else factor,
+            "device": task.device,
+        }
+
+    def _command(self, step: str, command: Sequence[str], values: dict[str, Any], task: Task) -> float:
+        return run_logged(
+            f"{step} of {self.name}",
+            [*self.prefix, *(fill(argument, values) for argument in command)],
+            log=task.logs / f"{step}.log",
+            cwd=self.cwd,
+            environment={name: fill(text, values) for name, text in self.environment},
+            timeout_s=self.timeout_s,
+        )
+
+    def _collect(self, task: Task, values: dict[str, Any], done: dict[str, float]) -> Produced:
+        tests, trains = task.scene.test, task.scene.train
+        drawn = [] if self.drawn_by_us else list(enumerate(tests))
+        renders = {view.name: self._find(self.renders, values, view, i) for i, view in drawn}
+        missing = [name for name, found in renders.items() if found is None]
+        if missing:
+            raise AwError(
+                f"{self.name} left no render of {len(missing)} of {len(tests)} test photos "
+                f"({shortlist(missing)}): {self._pattern(self.renders, values, tests[0], 0)} is not there"
+            )
+        masks = {}
+        if self.masks:
+            masks = {view.name: self._find(self.masks, values, view, i) for i, view in enumerate(trains)}
+        ply = self._one(fill_pattern(self.ply, values)) if self.ply else None
+        if self.ply and ply is None:
+            raise AwError(f"{self.name} left no splats: {fill_pattern(self.ply, values)} is not there")
+        cost: dict[str, float] = dict(done)
+        if task.budget_s is None and "iterations" in self._used():
+            cost |= {"iterations": task.iterations}
+            cost |= {"ms_per_iteration": 1e3 * done["train_s"] / task.iterations}
+        return Produced(
+            renders={name: path for name, path in renders.items() if path is not None},
+            masks={name: path for name, path in masks.items() if path is not None},
+            ply=ply,
+            drawn_by_us=self.drawn_by_us,
+            cost=cost,
+            facts=self._facts(),
+        )
+
+    def _facts(self) -> dict[str, Any]:
+        """The program's revision, and the settings of the run that it was not given."""
+        revision = _revision(self.cwd)
+        deaf = sorted({"seed", "iterations"} - self._used())
+        return {"revision": revision, "not_told": deaf}
+
+    def _pattern(self, template: str, values: dict[str, Any], view: View, index: int) -> str:
+        stem = str(PurePosixPath(view.name).with_suffix(""))
+        pattern = fill_pattern(template, values | {"stem": stem, "name": view.name, "index": index})
+        return str(self.cwd / pattern)  # an absolute pattern stays as it is
+
+    def _find(self, template: str, values: dict[str, Any], view: View, index: int) -> Path | None:
+        return self._one(self._pattern(template, values, view, index))
+
+    def _one(self, pattern: str) -> Path | None:
+        found = sorted(glob.glob(str(self.cwd / pattern)))
+        if len(found) > 1:
+            raise AwError(
+                f"{self.name}: {len(found)} files fit {pattern} ({shortlist(found, 2)}): one must; "
+                "make the pattern narrower"
+            )
+        return Path(found[0]) if found else None
+
+
+def _read(state: Path) -> dict[str, float]:
+    try:
+        data = json.loads(state.read_text(encoding="utf-8"))
+        return {key: float(data[key]) for key in ("train_s", "render_s") if key in data}
+    except (OSError, ValueError, TypeError, RecursionError):
+        return {}
+
+
+def _revision(folder: Path) -> str | None:
+    """The commit of the program's repository; None if it is in none."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", "factor", "device")
+VIEW = ("stem", "name", "index")
+_NO_MATTER = ("summary", "paper", "needs", "timeout_h")
+_LATER = {"photos": "all", "drawn_by": "program"}
+LISTS = ("train_names", "test_names", "train_stems", "test_stems")
+
+
+@dataclass(frozen=True)
+class Description:
+    """The keys of the file. Commands are lists, or text split as a shell splits it; no shell runs them."""
+
+    name: str = ""  # how tables call it
+    summary: str = ""
+    paper: str = ""
+    needs: str = ""
+    train: str | tuple[str, ...] = ()
+    render: str | tuple[str, ...] = ()  # left out if training renders
+    resume: str | tuple[str, ...] = ()  # instead of train, if a stopped run left files in {output}
+    renders: str = ""  # path of a test photo's render; may contain wildcards
+    masks: str = ""  # path of a train photo's keep map, white = kept
+    ply: str = ""  # splats, for counting and size
+    cwd: str = ""  # relative to the file; empty = the file's folder
+    prefix: str | tuple[str, ...] = ()  # before every command, e.g. conda run --no-capture-output -n theirs
+    environment: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)  # placeholders of your own; --set NAME.KEY=VALUE
+    scene_files: dict[str, Any] = field(default_factory=dict)  # text files that the program wants in {scene}
+    photos: Photos = "all"  # what {scene} holds, see staging.py: "all", "train" alone, or as "nerf-w"
+    drawn_by: Literal["program", "us"] = "program"  # "us": our renderer draws the test views from `ply`
+    timeout_h: float = 0.0  # of each command; 0 = none
+
+
+PACKAGED = Path(__file__).parent / "descriptions"
+
+
+def packaged(name: str) -> Path:
+    """The file of a description that comes with the package: external:opensplat.
+
+    Raises:
+        AwError: there is none of that name.
+    """
+    known = sorted(file.stem for file in PACKAGED.glob("*.yaml"))
+    if name not in known:
+        raise unknown("description", name, known, "or write external:PATH.yaml")
+    return PACKAGED / f"{name}.yaml"
+
+
+def load_description(path: Path) -> MethodEntry:
+    """The method that a description makes.
+
+    Raises:
+        AwError: no such file, no YAML or TOML, an unknown key or placeholder, or a missing key.
+    """
+    if len(path.parts) == 1 and not path.suffix and not path.exists():
+        path = packaged(path.name)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise AwError(f"no description {path}: {error.strerror}; write external:PATH.yaml") from None
+    description = from_plain(Description, _parse(path, content), str(path))
+    options = _options_class(description.options, path)
+    program = CommandProgram(
+        name=check_name(f"name in {path}", description.name),
+        train=_command(description.train),
+        render=_command(description.render),
+        resume=_command(description.resume),
+        renders=description.renders,
+        masks=description.masks,
+        ply=description.ply,
+        cwd=_folder(description.cwd, path),
+        prefix=_command(description.prefix),
+        environment=tuple((str(k), str(v)) for k, v in description.environment.items()),
+        scene_files=tuple((str(k), str(v)) for k, v in description.scene_files.items()),
+        timeout_s=description.timeout_h * 3600.0 or None,
+        photos=description.photos,
+        drawn_by_us=description.drawn_by == "us",
+    )
+    _check(program, set(description.options), path)
+    return MethodEntry(
+        name=program.name,
+        summary=description.summary or f"external program of {path.name}",
+        recipe=no_parts,
+        config=options,
+        paper=description.paper,
+        needs=description.needs or "its own environment",
+        # keys without influence on the result may change without a new training
+        source_hash=config_hash(_decisive(description)),
+        program=program,
+    )
+
+
+def _folder(text: str, path: Path) -> Path:
+    """`cwd`, in which $NAME is a variable of the environment."""
+    for name in re.findall(r"\$(\w+)", text):
+        if not os.environ.get(name):
+            raise AwError(f"{path.stem} needs {name}: export {name}=FOLDER, the folder of its repository")
+    return (path.resolve().parent / Path(os.path.expandvars(text)).expanduser()).resolve()
+
+
+def _decisive(description: Description) -> dict[str, Any]:
+    """What decides the result. Later keys count where they differ from their default: runs from before them
+    keep their identity."""
+    plain = {k: v for k, v in to_plain(description).items() if k not in _NO_MATTER}
+    return {k: v for k, v in plain.items() if k not in _LATER or v != _LATER[k]}
+
+
+def _parse(path: Path, content: bytes) -> Mapping[str, Any]:
+    try:
+        text = content.decode()
+        data = tomllib.loads(text) if path.suffix == ".toml" else plain_yaml.parse(text)
+    except (AwError, ValueError, RecursionError) as error:
+        raise AwError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(data, dict):
+        raise AwError(f"{path} holds no keys: see docs/external-methods.md for name, train and renders")
+    return data
+
+
+def _command(text: str | tuple[str, ...]) -> tuple[str, ...]:
+    try:
+        return tuple(shlex.split(text)) if isinstance(text, str) else text
+    except ValueError as error:
+        raise AwError(f"command {text!r}: {error}") from None
+
+
+def _options_class(options: Mapping[str, Any], path: Path) -> type:
+    """A frozen dataclass with the file's values as defaults: `--set` checks types by it."""
+    if not options:
+        return NoOptions
+    for key, value in options.items():
+        if not str(key).isidentifier() or key in (*RUN, *VIEW, *LISTS):
+            raise AwError(f"{path}: option {key!r} must be a name, and none of {', '.join(RUN)}")
+        if not isinstance(value, (str, int, float, bool)):
+            raise AwError(f"{path}: option {key!r} needs a text, a number or a truth value as its default")
+    fields = [(key, type(value), field(default=value)) for key, value in options.items()]
+    return dataclasses.make_dataclass("ProgramOptions", fields, frozen=True)
+
+
+def _check(program: CommandProgram, options: set[str], path: Path) -> None:
+    needed = ("train", "ply" if program.drawn_by_us else "renders")
+    missing = [key for key in needed if not getattr(program, key)]
+    if missing:
+        raise AwError(f"{path} does not say {' and '.join(missing)}; see docs/external-methods.md")
+    run = {*RUN, *options}
+    for key in ("train", "render", "resume"):
+        for argument in getattr(program, key):
+            check(argument, run, f"{path}, {key}")
+    for name, value in program.environment:
+        check(value, run, f"{path}, environment {name}")
+    for name, value in program.scene_files:
+        check(value, LISTS, f"{path}, scene_files {name}")
+    for key, known in (("renders", run | {*VIEW}), ("masks", run | {*VIEW}), ("ply", run)):
+        check(getattr(program, key), known, f"{path}, {key}")
+    if program.renders and not {*VIEW} & placeholders(program.renders, "renders"):
+        raise AwError(f"{path}: renders must hold {{stem}}, {{name}} or {{index}}: one file a test photo")
+    if not program.cwd.is_dir():
+        raise AwError(f"{path}: cwd {program.cwd} is no folder")

@@ -1,1 +1,0 @@
-"""External programs as methods: they train and render, our harness measures their pictures."""

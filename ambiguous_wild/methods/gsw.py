@@ -1,0 +1,304 @@
+"""GS-W (Gaussian in the Wild): colours by a net from what a Gaussian is and what it samples in its photo.
+
+Source: EastbeanZhang/Gaussian-Wild. Ours: a small U-Net without ImageNet's weights, on the photo at
+`side` px (published: ResNet-18 at full size); no LPIPS term (it needs VGG's weights); 0.5 is added to
+colours, for the renderer clamps at 0; positions in units of the scene, without a gradient of the net (the
+release's is unverified); boxes start at the photo's size (published: 512 px); the net's output is added to
+the colour in the first three intrinsic features (`residual`: 24.3 for 22.9 dB after 700 iterations of a
+time-of-day, for the net need not learn every colour). A test photo shows the net its left half only (the
+release: all of it); a camera without a photo gets the mean of the train photos' maps. Gaussians outside of
+what may be read get the mean of what they sample at their pixels in the train photos whose pictures they lie
+in (at most 64 photos), as in training: zeros instead cost 3.8 dB on a courtyard.
+
+GS-W's U-Net, small and without pretrained weights: maps of a photo, and which of its pixels are static.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.masking_common import d_keep, hashed_uniform
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.placing import (
+    Unit,
+    conv_leaves,
+    directions,
+    frequencies,
+    mean_of_seen,
+    projected,
+    with_penalty,
+)
+from ambiguous_wild.splat.field import GaussianAttribute
+from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.step import Shot, Step, TrainData
+
+CHANNELS, FREE = 16, 2  # of a map; maps sampled at learnt places
+DYNAMIC = (FREE + 1) * CHANNELS
+
+
+def unet_leaves(width: int, rng: np.random.Generator, rate: float) -> dict[str, Leaf]:
+    """Encoder of three levels, decoder of two, and the mask's head on the last level of the encoder."""
+    w = width
+    widths = {
+        "down": (3, w, 2 * w, 4 * w),
+        "up": (6 * w, 2 * w),
+        "top": (3 * w, DYNAMIC),
+        "mask": (4 * w, w, 1),
+    }
+    return {k: v for n, c in widths.items() for k, v in conv_leaves(n, c, rng, rate, final=0.1).items()}
+
+
+def coded(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> list[Tensor]:
+    """The photo at `side` and the three levels of the encoder, [1, C, h, w] each."""
+    share = min(side / max(photo.shape[:2]), 1.0)
+    size = [max(8 * round(side * share / 8), 8) for side in photo.shape[:2]]
+    found = [F.interpolate(photo.permute(2, 0, 1)[None], size=size, mode="area") - 0.5]
+    for i in range(3):
+        found.append(_normal(_conv(found[-1], leaf, "down", i, stride=2)))
+    return found
+
+
+def maps_of(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
+    """[3, 16, h, w]: two that are sampled at learnt places, one at the Gaussian's pixel."""
+    _, fine, middle, coarse = coded(photo, leaf, side)
+    x = torch.cat([F.interpolate(coarse, size=middle.shape[2:]), middle], dim=1)
+    x = _normal(_conv(x, leaf, "up"))
+    x = torch.cat([F.interpolate(x, size=fine.shape[2:]), fine], dim=1)
+    return _conv(x, leaf, "top").reshape(FREE + 1, CHANNELS, *fine.shape[2:])
+
+
+def visibility(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
+    """M [H, W] in (0, 1), 1 = static, from the encoder's last level."""
+    x = F.interpolate(_normal(_conv(coded(photo, leaf, side)[3], leaf, "mask")), scale_factor=2.0)
+    x = torch.sigmoid(_conv(x, leaf, "mask", 1))
+    return F.interpolate(x, size=photo.shape[:2])[0, 0]
+
+
+def _conv(x: Tensor, leaf: Mapping[str, Tensor], name: str, i: int = 0, stride: int = 1) -> Tensor:
+    return F.conv2d(x, leaf[f"{name}_weight{i}"], leaf[f"{name}_bias{i}"], stride=stride, padding=1)
+
+
+def _normal(x: Tensor) -> Tensor:
+    return F.relu(F.group_norm(x, 1))
+
+
+def sample(maps: Tensor, at: Tensor) -> Tensor:
+    """[M, C] of a map [C, h, w] at (x, y) [M, 2] in [-1, 1]^2, bilinear, the border's value outside."""
+    found = F.grid_sample(maps[None], at[None, None], padding_mode="border", align_corners=False)
+    return found[0, :, 0].T
+
+
+INTRINSIC, OCTAVES = 48, 10  # features a Gaussian has; of the code of positions
+LENGTH = 70_000  # iterations of the release's commands
+MOST = 64  # train photos that stand for all where a camera has none
+
+
+@dataclass(frozen=True)
+class GswConfig:
+    """Options; times in nominal iterations (of 30 000)."""
+
+    density: DensityConfig = field(default_factory=lambda: DensityConfig(grow_grad=4e-4))
+    side: int = 128  # px, the longer side of the photo that the U-Net sees
+    width: int = 16  # channels of its first level
+    lr_unet: float = 2e-3  # to a tenth of it
+    lr_colour: float = 5e-4  # for 70 000 iterations; more in shorter runs
+    lr_places: float = 1.0  # of free coordinates, and in px of boxes; to a hundredth of it
+    residual: bool = True  # the net's output is added to the intrinsic colour; published: it is the colour
+    lr_intrinsic: float = 2.5e-3  # as 3DGS's colours; published 1.25e-4, for 70 000 iterations
+    dropout: float = 0.1  # of what is sampled
+    mask_start: float = 2500.0
+    mask_prior: float = 0.15  # times mean (1 - M)^2
+    outside: float = 1e-3  # times the mean distance of coordinates from [-1, 1]
+
+    def __post_init__(self) -> None:
+        check_limits(self, "gs-w", side=(16, 4096), width=(1, 512), dropout=(0, 0.9))
+
+
+def build(options: GswConfig) -> Parts:
+    """Colours, masks of the same U-Net, and growth from a higher gradient."""
+    effect = GswAppearance(options)
+    return Parts(
+        mask=Visibility(effect), density_config=options.density, weighting="images",
+        schedule=Schedule(lr_means_final=1.6e-7), effects=(effect,),
+    )  # fmt: skip
+
+
+class GswAppearance(Learnt):
+    """colour = net(position, intrinsic feature, samples of three maps, direction)."""
+
+    name, reads_photo = "gs-w", True
+
+    def __init__(self, config: GswConfig) -> None:
+        self.config = config
+
+    def setup(self, data: TrainData) -> None:
+        self.seed, self.points, self.all_photos = data.seed, data.sfm_points, data.photos
+        self.unit = Unit(data.scene.points.xyz, data.device)
+        self.cameras, count = data.cameras, len(data.photos)
+        self.chosen = sorted({k * count // min(count, MOST) for k in range(min(count, MOST))})
+        self._known: tuple[float, list[Tensor]] | None = None  # maps of those photos, at a nominal iteration
+        super().setup(data)
+
+    def acts(self, hook: str) -> bool:
+        return hook != "fit" and super().acts(hook)  # a test photo is read, nothing is fitted to it
+
+    def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
+        lr, position = self.config.lr_colour, 3 * (1 + 2 * OCTAVES)
+        nets = mlp_leaves("encoder", (position + DYNAMIC + INTRINSIC, 128, 96, 64, 48), rng, lr)
+        nets |= mlp_leaves("decoder", (48 + INTRINSIC, 48, 48, 48), rng, lr)
+        nets |= mlp_leaves("head", (48 + 3, 48, 3), rng, lr)
+        nets = {name: replace(leaf, made_for=LENGTH) for name, leaf in nets.items()}
+        return unet_leaves(self.config.width, rng, self.config.lr_unet) | nets
+
+    def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
+        rng, means, rate = np.random.default_rng([self.seed, 0x65]), gaussians.means, self.config.lr_places
+        low, high = self.points.amin(dim=0), self.points.amax(dim=0)  # a skybox would shrink the scene
+        unit = (2.0 * (means - low) / (high - low).clamp(min=1e-9) - 1.0).clamp(-1.0, 1.0)
+        weights = rng.uniform(size=(FREE * 2, 3))
+        weights /= weights.sum(axis=1, keepdims=True)
+        mixing = torch.tensor(weights, dtype=torch.float32).to(means.device)
+        intrinsic = torch.cat([gaussians.sh0, torch.zeros_like(gaussians.sh0).repeat(1, 15)], dim=1)
+        box = rate / max(self.all_photos[0].shape[:2])
+        return {
+            "gsw_intrinsic": GaussianAttribute(intrinsic.contiguous(), self.config.lr_intrinsic),
+            "gsw_places": GaussianAttribute((unit @ mixing.T).contiguous(), rate, rate / 100),
+            "gsw_box": GaussianAttribute(torch.ones(len(means), 2, device=means.device), box, box / 100),
+        }
+
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+        photo, means, intrinsic = self._seen(shot), visible.means.detach(), visible.extra["gsw_intrinsic"]
+        maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
+        places, box = visible.extra["gsw_places"], visible.extra["gsw_box"]
+        free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
+        width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of what is read
+        own, inside = at_pixels(maps[FREE], means, shot.camera, width, box)
+        if shot.fitting or photo is None:
+            usual = self._usual(shot, leaf, means, box)
+            own = usual if photo is None else torch.where(inside[:, None], own, usual)
+        else:
+            own = own * inside[:, None]
+        dynamic = torch.cat([*free, own], dim=1)
+        if shot.view is not None and self.config.dropout:
+            key = (self.seed, shot.iteration)
+            kept = hashed_uniform(dynamic.numel(), key, dynamic.device) >= self.config.dropout
+            dynamic = dynamic * kept.reshape(dynamic.shape) / (1.0 - self.config.dropout)
+        code = frequencies(self.unit(means), OCTAVES)
+        hidden = mlp(torch.cat([code, dynamic, intrinsic], dim=1), leaf, "encoder")
+        hidden = mlp(torch.cat([hidden, intrinsic], dim=1), leaf, "decoder")
+        colours = 0.5 + mlp(torch.cat([hidden, directions(means, shot.camera)], dim=1), leaf, "head")
+        if self.config.residual:
+            colours = colours + SH_C0 * intrinsic[:, :3]
+        beyond = mean_of_seen(F.relu(places.abs() - 1.0), means, shot.camera)
+        return with_penalty(colours, self.config.outside * beyond)
+
+    def _seen(self, shot: Shot) -> Tensor | None:
+        """What the U-Net sees: the photo, and of a test photo the left half."""
+        if shot.photo is None or shot.neutral:
+            return None
+        return shot.photo[:, : shot.photo.shape[1] // 2] if shot.fitting else shot.photo
+
+    @torch.no_grad()
+    def _maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> list[Tensor]:
+        """Maps of train photos, at most `MOST` of them, evenly chosen; made once an iteration."""
+        if self._known is None or self._known[0] != shot.nominal:
+            self._known = (
+                shot.nominal,
+                [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen],
+            )
+        return self._known[1]
+
+    @torch.no_grad()
+    def _mean_maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> Tensor:
+        """Their mean, at the first one's size."""
+        maps = self._maps(shot, leaf)
+        size = maps[0].shape[2:]
+        return torch.stack([F.interpolate(m, size=size, mode="bilinear") for m in maps]).mean(dim=0)
+
+    @torch.no_grad()
+    def _usual(self, shot: Shot, leaf: Mapping[str, Tensor], means: Tensor, box: Tensor) -> Tensor:
+        """[M, 16] that Gaussians sample at their pixels, in the mean of the train photos that show them."""
+        total, count = means.new_zeros(len(means), CHANNELS), means.new_zeros(len(means), 1)
+        for k, maps in zip(self.chosen, self._maps(shot, leaf)):
+            own, inside = at_pixels(maps[FREE], means, self.cameras[k], self.cameras[k].width, box)
+            total, count = total + own * inside[:, None], count + inside[:, None].float()
+        return total / count.clamp(min=1.0)
+
+    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+        self._known = None
+        super().step(own, shot, called_off)
+
+    def load_state_dict(self, state: State) -> None:
+        self._known = None
+        super().load_state_dict(state)
+
+    def learnable(self, shot: Shot) -> dict[str, Tensor]:
+        """Copies of all leaves, for a graph of one's own."""
+        return {name: value.requires_grad_() for name, value in self._leaf(shot).items()}
+
+
+def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tensor) -> tuple[Tensor, Tensor]:
+    """What Gaussians sample of a map [16, h, w] at their pixels in a camera.
+
+    Args:
+        maps: of the photo that the camera took, or of its left part.
+        means: [M, 3] world.
+        width: px, of what the maps are of.
+        box: [M, 2] part of width and height that a Gaussian takes for the whole.
+
+    Returns:
+        [M, 16] samples, and [M] bool where the pixel is inside.
+    """
+    pixels, z = projected(means, camera)
+    at = torch.stack([pixels[:, 0] / width, pixels[:, 1] / camera.height], dim=1) / box
+    inside = (z > 0) & (at > 0).all(dim=1) & (at < 1).all(dim=1)
+    return sample(maps, 2.0 * at - 1.0), inside
+
+
+class Visibility(MaskPolicy):
+    """M learns from the residual that it leaves in the loss, against the prior that nothing is masked."""
+
+    learns_by_gradients = True
+
+    def __init__(self, effect: GswAppearance) -> None:
+        self.effect, self.config = effect, effect.config
+
+    def required_effect(self) -> GswAppearance:
+        return self.effect
+
+    def setup(self, data: TrainData) -> None:
+        self.effect.require_setup()
+
+    def keep(self, step: Step) -> Tensor | None:
+        return self.predict(step) if step.nominal > self.config.mask_start else None
+
+    @torch.no_grad()
+    def predict(self, step: Step) -> Tensor:
+        return visibility(step.photo, self.effect._leaf(step), self.config.side)
+
+    def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
+        if keep is None or step.nominal <= self.config.mask_start:
+            return None
+        with torch.enable_grad():
+            leaf = self.effect.learnable(step)
+            mask = visibility(step.photo, leaf, self.config.side)
+            found = torch.autograd.grad(
+                mask, list(leaf.values()), self.d_mask(step, mask.detach()), allow_unused=True
+            )
+        own = {name: d for name, d in zip(leaf, found) if d is not None}
+        return Cotangents(own={self.effect.name: own})
+
+    def d_mask(self, step: Step, mask: Tensor) -> Tensor:
+        """dL/dM [H, W] of 0.8 |M R - M I| + 0.2 D-SSIM(M R, M I) + prior mean (1 - M)^2."""
+        through = d_keep(step.rendered.image.detach(), step.photo, mask)
+        return through - 2.0 * self.config.mask_prior / mask.numel() * (1.0 - mask)

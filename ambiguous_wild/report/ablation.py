@@ -1,0 +1,338 @@
+"""From an ablation study's runs to ablation.json, .csv, .md and .png.
+
+A mean is over images, then over all runs (scene, seed) of the variant; one missing value makes it missing.
+The spread is the sample deviation over those runs. Differences to the default are taken run by run, on the
+same scene with the same seed, so that the spread of a difference is not the spread between scenes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.ablation import (
+    DIFFERENCES,
+    METRICS,
+    REPORT,
+    GroupFacts,
+    Outcome,
+    Planned,
+    Study,
+    StudyReport,
+    Summary,
+    VariantRow,
+    read_outcomes,
+)
+from ambiguous_wild.harness.measures import Measure, measure
+from ambiguous_wild.io.files import atomic_path, write_json, write_text
+from ambiguous_wild.methods.ablation import DEFAULT
+from ambiguous_wild.methods.describe import BACK_ENDS
+from ambiguous_wild.metrics import stats
+from ambiguous_wild.report.plain_formats import to_csv, to_markdown
+from ambiguous_wild.report.table import BLANK, Cell, Column, Row, Table, ranks
+
+KEYS = tuple(m.key for m in METRICS)
+
+
+def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
+    """The study as plain data: one entry a row, with its values, differences and runs.
+
+    Args:
+        study: planned, run or in part run.
+        output: the folder of its runs.
+        made_by: the command that makes it again.
+    """
+    default = read_outcomes(study.default, output)
+    rows = [_row(row, read_outcomes(row.cells, output), default) for row in study.rows]
+    return {
+        "schema": 1,
+        "made_by": made_by,
+        "note": study.note,
+        **study.facts(),
+        "groups": [{"name": g.name, "title": g.title, "source": g.source} for g in study.groups],
+        "rows": rows,
+    }
+
+
+def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> VariantRow:
+    failed = [o for o in outcomes if o.result is None]
+    status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
+    reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
+    values = {key: _summary([o.value(key) for o in outcomes]) for key in KEYS}
+    differences = {}
+    for key in (m.key for m in DIFFERENCES):
+        pairs = [(o.value(key), d.value(key)) for o, d in zip(outcomes, default, strict=False)]
+        differences[key] = _summary([None if a is None or b is None else a - b for a, b in pairs])
+    return {
+        "group": row.group,
+        "variant": row.variant.name,
+        "settings": [*row.variant.settings, *_networks(row)],
+        "text": row.variant.text,
+        "status": status,
+        "reason": reason,
+        "same_as": row.same_as,
+        "values": values,
+        "differences": differences,
+        "runs": [
+            {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
+            | {"untimed": o.untimed}
+            | {key: o.value(key) for key in KEYS}
+            for o in outcomes
+        ],
+    }
+
+
+def _networks(row: Planned) -> list[str]:
+    """Features and instances of a variant that is another method."""
+    if not row.variant.method or not row.cells:
+        return []
+    options = to_plain(row.cells[0].options)
+    return [f"{key}={options[key]}" for key in BACK_ENDS if key in options]
+
+
+def _summary(values: list[float | None]) -> Summary:
+    numbers = [math.nan if v is None else float(v) for v in values]
+    mean, spread = stats.mean(numbers), stats.spread(numbers)
+    return {"mean": _number(mean), "spread": _number(spread)}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def write_report(data: StudyReport, folder: Path) -> list[Path]:
+    """ablation.json, .csv, .md and, where there is something to draw, .png; returns what was written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"ablation.{kind}" for kind in ("json", "csv", "md")]
+    write_json(paths[0], data)
+    write_text(paths[1], csv_of(data))
+    png = folder / "ablation.png"
+    if draw(data, png):
+        paths.append(png)
+    write_text(paths[2], markdown_of(data, picture=png.name if png in paths else ""))
+    return paths
+
+
+def csv_of(data: StudyReport) -> str:
+    """One line a row of the study; empty cells where a value is missing."""
+    lines = []
+    for row in data["rows"]:
+        line: dict[str, Any] = {
+            "group": row["group"],
+            "variant": row["variant"],
+            "status": row["status"],
+            "reason": row["reason"],
+            "same_as": row["same_as"],
+        }
+        line |= {"settings": " ".join(row["settings"]), "runs": len(row["runs"])}
+        for key, entry in row["values"].items():
+            line |= {key: entry["mean"], f"{key}_spread": entry["spread"]}
+        for key, entry in row["differences"].items():
+            line |= {f"difference_{key}": entry["mean"], f"difference_{key}_spread": entry["spread"]}
+        lines.append(line)
+    return to_csv(list(lines[0]), (line.values() for line in lines))
+
+
+def markdown_of(data: StudyReport, picture: str = "") -> str:
+    """One table a group: differences to the default, quality and cost of each variant, and what it is."""
+    lines = [f"# Ablations of {data['method']}", "", _subtitle(data), ""]
+    lines += [f"![quality against cost]({picture})", ""] if picture else []
+    shown = [m for m in METRICS if any(row["values"][m.key]["mean"] is not None for row in data["rows"])]
+    return "\n".join(lines) + "\n" + to_markdown(_tables(data, shown, differences=True))
+
+
+def _subtitle(data: StudyReport) -> str:
+    train = data["train"]
+    budget = train["budget_s"]
+    length = f"{train['iterations']} iterations" if budget is None else f"{budget:g} s of training"
+    base = f"; in every row of the method: {' '.join(data['settings'])}" if data["settings"] else ""
+    return (
+        f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}; {length}{base}. "
+        "Differences are to the default, on the same scene with the same seed; ± is the sample deviation "
+        "over runs."
+    )
+
+
+def _what(row: VariantRow) -> Cell:
+    parts = [row["text"], f"`{' '.join(row['settings'])}`" if row["settings"] else ""]
+    parts.append(f"same runs as {row['same_as']}" if row["same_as"] else "")
+    text = "; ".join(part for part in parts if part)
+    return Cell(printed=text, markdown=text) if text else BLANK
+
+
+def draw(data: StudyReport, path: Path) -> bool:
+    """Draw PSNR against ms per iteration, a panel a group; False where no group has two points."""
+    groups = [(g, _points(data, g["name"])) for g in data["groups"]]
+    groups = [(g, points) for g, points in groups if len(points) > 1]  # one point compares nothing
+    if not groups:
+        return False
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(groups))
+    rows = -(-len(groups) // columns)
+    figure = Figure(figsize=(5.2 * columns, 3.9 * rows), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for panel, (group, points) in zip(axes.flat, groups, strict=False):
+        _panel(panel, group, points)
+    for panel in list(axes.flat)[len(groups) :]:
+        panel.set_axis_off()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata={"Software": None})
+    return True
+
+
+def _points(data: StudyReport, group: str) -> list[tuple[str, float, float, float]]:
+    """(variant, ms an iteration, PSNR, its spread), variants of the same runs under one name."""
+    merged: dict[tuple[float, float], tuple[list[str], float]] = {}
+    for row in data["rows"]:
+        ms, psnr = row["values"]["ms_per_iteration"]["mean"], row["values"]["psnr"]["mean"]
+        if row["group"] == group and ms is not None and psnr is not None:
+            names = merged.setdefault((ms, psnr), ([], row["values"]["psnr"]["spread"] or 0.0))[0]
+            names.append(row["variant"])
+    return [(" = ".join(names), ms, psnr, spread) for (ms, psnr), (names, spread) in merged.items()]
+
+
+def _panel(axes: Any, group: GroupFacts, points: list[tuple[str, float, float, float]]) -> None:
+    for index, (name, ms, psnr, spread) in enumerate(points):
+        is_default = name.split(" = ")[0] == "default"
+        colour = "k" if is_default else f"C{index % 10}"
+        axes.errorbar(ms, psnr, yerr=spread or None, fmt="*" if is_default else "o", color=colour,
+                      ms=13 if is_default else 7, elinewidth=1, capsize=2)  # fmt: skip
+    _labels(axes, points)
+    axes.set_title(f"{group['name']}: {group['title']}", fontsize=8)
+    axes.set_xlabel("ms per iteration", fontsize=8)
+    axes.set_ylabel("PSNR (dB)", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.grid(alpha=0.25)
+
+
+def _labels(axes: Any, points: list[tuple[str, float, float, float]]) -> None:
+    """Name every point, each at least a line from the next and all of them inside the frame."""
+    axes.margins(0.12)
+    low, high = axes.get_ylim()
+    middle, line = sum(axes.get_xlim()) / 2, 0.05 * (high - low)
+    width = axes.get_xlim()[1] - axes.get_xlim()[0]
+    order = sorted(range(len(points)), key=lambda index: points[index][2])
+    heights, last = {}, -math.inf
+    for index in order:
+        last = heights[index] = max(points[index][2], last + line)
+    above = high + 0.4 * line
+    for index in reversed(order):  # labels that left the frame move down again
+        above = heights[index] = min(heights[index], above - line)
+    for index, (name, ms, psnr, _) in enumerate(points):
+        left = ms <= middle
+        axes.annotate(
+            name,
+            (ms, psnr),
+            xytext=(ms + (0.03 if left else -0.03) * width, heights[index]),
+            fontsize=7,
+            color="k" if name.split(" = ")[0] == "default" else f"C{index % 10}",
+            ha="left" if left else "right",
+            va="center",
+            arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "0.6"},
+        )
+
+
+SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "model_mb")
+
+
+def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
+    """The tables of a study: a table a group, a row a variant.
+
+    Args:
+        folder: the output of `aw ablate`.
+        metrics: columns; empty = those of `SHOWN` that any row has.
+
+    Raises:
+        AwError: no study there, a damaged one, or a metric that it does not have.
+    """
+    path = folder / REPORT
+    try:
+        data: StudyReport = json.loads(path.read_text(encoding="utf-8"))
+        known = list(dict.fromkeys(key for row in data["rows"] for key in row["values"]))
+        for name in metrics:
+            if name not in known:
+                raise AwError(f"{path} has no {name!r}: it has {', '.join(known)}")
+        has = {key for row in data["rows"] for key in known if not math.isnan(_mean(row, "values", key))}
+        ours = {m.key: m for m in METRICS}
+        keys = metrics or [key for key in SHOWN if key in has]
+        return _tables(data, [ours.get(key, measure(key)) for key in keys])
+    except FileNotFoundError:
+        raise AwError(f"no {REPORT} in {folder}: 'aw ablate -o {folder}' writes it") from None
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise AwError(f"{path} is damaged ({error!r}): run 'aw ablate' again") from None
+
+
+def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool = False) -> list[Table]:
+    """A table a group; with `differences` those to the default stand first, and what a variant is last."""
+    tables = []
+    for group in data["groups"]:
+        members = [row for row in data["rows"] if row["group"] == group["name"]]
+        untimed = {
+            r["variant"]: why for r in members for run in r.get("runs", ()) if (why := run.get("untimed"))
+        }
+        by_column = [
+            ranks(
+                [
+                    math.nan if c.timed and row["variant"] in untimed else _mean(row, "values", c.key)
+                    for row in members
+                ],
+                c,
+            )
+            for c in columns
+        ]
+        lines = []
+        for k, row in enumerate(members):
+            cells = [_cell(row, c, rank[k]) for c, rank in zip(columns, by_column)]
+            if differences:
+                cells = [*(_difference(row, c) for c in DIFFERENCES), *cells, _what(row)]
+            lines.append(Row(str(row["variant"]), tuple(cells), note=str(row["text"])))
+        notes = [f"{r['variant']} {r['status']}: {r['reason']}" for r in members if r["status"] != "ok"]
+        for reason in dict.fromkeys(untimed.values()):
+            names = shortlist(name for name, why in untimed.items() if why == reason)
+            notes.append(f"times not ranked: {names} ({reason})")
+        heads = [Column("", c) for c in columns]
+        if differences:
+            first = (Column("", replace(c, label=f"d {c.label}", better=None)) for c in DIFFERENCES)
+            heads = [*first, *heads, Column("", Measure("what", "what", None, 0), words=True)]
+        source = f" (paper: {group['source']})" if group["source"] else ""
+        title = f"{data['method']}, {group['name']}: {group['title']}{source}"
+        over = "seeds" if len(data["scenes"]) == 1 else "scenes and seeds"
+        tables.append(Table(title, tuple(heads), tuple(lines), tuple(notes), over))
+    common = [f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}"]
+    common += [f"{data['method']}: {data['note']}"] if data.get("note") else []
+    common += [f"command of the runs: {data['made_by']}"] if data["made_by"] else []
+    return [*tables[:-1], tables[-1].with_notes(*common)]
+
+
+def _cell(row: VariantRow, column: Measure, rank: int | None) -> Cell:
+    if row["status"] == "failed":
+        return Cell(state="failed")
+    value = _mean(row, "values", column.key)
+    if math.isnan(value):
+        return Cell(state="missing")
+    spread = row["values"][column.key]["spread"]
+    return Cell(value, math.nan if spread is None else float(spread), rank=rank)
+
+
+def _difference(row: VariantRow, column: Measure) -> Cell:
+    value, spread = _mean(row, "differences", column.key), row["differences"][column.key]["spread"]
+    if row["variant"] == DEFAULT or math.isnan(value):
+        return BLANK
+    text = f"{value:+.{column.digits}f}"
+    return Cell(printed=text if spread is None else f"{text} ± {spread:.{column.digits}f}")
+
+
+def _mean(row: VariantRow, kind: Literal["values", "differences"], key: str) -> float:
+    """NaN where it is missing."""
+    value = row[kind][key]["mean"] if key in row[kind] else None
+    return math.nan if value is None else float(value)

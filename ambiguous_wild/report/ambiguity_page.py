@@ -1,0 +1,305 @@
+"""The report's folder: one page that needs no other file, the picture, CSV and JSON."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.io.files import atomic_dir, atomic_path, refuse_file, write_json, write_text
+from ambiguous_wild.io.page_parts import data_uri, jpeg_bytes, narrowed
+from ambiguous_wild.io.palette import ADDED, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
+from ambiguous_wild.metrics import ambiguity as am
+from ambiguous_wild.metrics import semantic as sem
+from ambiguous_wild.report.ambiguity_measure import BINS, Measured, SceneFeatures, cosine_map, load_photo
+from ambiguous_wild.report.ambiguity_sources import Background, Masks
+from ambiguous_wild.report.ambiguity_summary import NO_DISTRACTORS, cosine_column, describe, row
+from ambiguous_wild.report.plain_formats import to_csv
+from ambiguous_wild.report.table import text_table
+from ambiguous_wild.report.typeset import html_table
+
+PHOTOS = 4
+SIDE = 480  # px a picture in the figure at most
+
+
+def chosen(measured: list[Measured], most: int = PHOTOS) -> list[int]:
+    """Indices spread over the range of occlusion rather than the first few: what is easy and what is hard."""
+    order = sorted(range(len(measured)), key=lambda i: measured[i].counts.occlusion)
+    return [order[round(k)] for k in np.linspace(0, len(order) - 1, min(most, len(order)))]
+
+
+def overlay(photo: np.ndarray, distractor: np.ndarray) -> np.ndarray:
+    """The photo [H, W, 3] in [0, 1] with its distractors tinted, uint8."""
+    return tint((255 * photo + 0.5).astype(np.uint8), distractor, MASKED)
+
+
+def residual_picture(
+    photo: np.ndarray, behind: np.ndarray | None, known: np.ndarray | None, distractor: np.ndarray
+) -> np.ndarray:
+    """Residual of the distractors in the palette from 0 to 1 on the faded photo; dark grey = unknown."""
+    shown = faded((255 * photo + 0.5).astype(np.uint8))
+    use = np.zeros_like(distractor) if behind is None else distractor & (True if known is None else known)
+    residual = np.full(distractor.shape, np.nan)
+    if behind is not None:
+        residual[use] = am.colour_residual(photo, behind)[use]
+    shown[distractor] = ramp(residual, 0.0, 1.0)[distractor]
+    return shown
+
+
+def cosine_picture(
+    look: SceneFeatures, index: int, photo: np.ndarray, distractor: np.ndarray
+) -> np.ndarray | None:
+    """Cosine of every cell to the photo's largest distractor in the palette, the distractors outlined."""
+    import cv2
+
+    cosines = cosine_map(look, index, photo)
+    if cosines is None:
+        return None
+    size = (photo.shape[1], photo.shape[0])
+    shown = cv2.resize(ramp(1.0 - cosines, 0.0, 1.0), size, interpolation=cv2.INTER_NEAREST)
+    edges, _ = cv2.findContours(distractor.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(shown, edges, -1, (20, 20, 20), max(1, photo.shape[1] // 240)))
+
+
+def write_figure(
+    scene: Scene,
+    masks: Masks,
+    background: Background,
+    measured: list[Measured],
+    look: SceneFeatures,
+    path: Path,
+) -> None:
+    """Write the picture as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    picks = chosen(measured)
+    columns = max(len(picks), 3)
+    figure = Figure(figsize=(3.6 * columns, 9.2), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(4, 12)
+    for column, index in enumerate(picks):
+        view = scene.train[index]
+        photo, distractor = load_photo(view), masks.load(view)
+        behind, known = background.load(index, view)
+        pictures = [
+            overlay(photo, distractor),
+            residual_picture(photo, behind, known, distractor) if behind is not None else None,
+            cosine_picture(look, index, photo, distractor),
+        ]
+        name = view.name if len(view.name) <= 28 else f"…{view.name[-27:]}"
+        captions = [
+            f"{name}: {100 * distractor.mean():.0f} % covered",
+            "residual to the background",
+            "cosine to the largest distractor",
+        ]
+        span = slice(12 * column // len(picks), 12 * (column + 1) // len(picks))
+        for line, (picture, caption) in enumerate(zip(pictures, captions)):
+            _panel(figure.add_subplot(grid[line, span]), picture, caption)
+    _histograms(figure, grid, measured, look)
+    _legend(figure)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata={"Software": None})
+
+
+def _panel(axes: Any, picture: np.ndarray | None, caption: str) -> None:
+    import cv2
+
+    axes.set_xticks([])
+    axes.set_yticks([])
+    # A scene's photo may be called $x$: not to be read as a formula.
+    axes.set_title(caption, fontsize=9, parse_math=False)
+    if picture is None:
+        why = "background unknown" if "residual" in caption else "no distractor to compare"
+        axes.text(0.5, 0.5, why, ha="center", va="center", transform=axes.transAxes, fontsize=9)
+        return
+    scale = SIDE / max(picture.shape[:2])
+    if scale < 1:
+        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    axes.imshow(picture)
+
+
+def _legend(figure: Any) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap
+
+    colours = ListedColormap(ramp(np.linspace(0, 1, 64), 0.0, 1.0) / 255.0)
+    bar = figure.colorbar(
+        ScalarMappable(cmap=colours),
+        ax=figure.axes[: -3 or None],
+        location="right",
+        shrink=0.4,
+        aspect=30,
+        pad=0.01,
+    )
+    bar.set_ticks(
+        [0, 1], labels=["alike: residual 0,\ncosine 1", "different: residual 1,\ncosine 0"], fontsize=8
+    )
+
+
+def _histograms(figure: Any, grid: Any, measured: list[Measured], seen: SceneFeatures) -> None:
+    colour, cover, look = (figure.add_subplot(grid[3, s]) for s in (slice(0, 4), slice(4, 8), slice(8, 12)))
+    counts = np.sum([m.histogram for m in measured], axis=0)
+    colour.stairs(counts / max(counts.sum(), 1), BINS, fill=True, color=plot_colour(ADDED))
+    colour.axvline(am.COLOUR_THRESHOLD, color="k", ls="--", lw=1)
+    colour.set_xlabel(f"colour difference (close: below {am.COLOUR_THRESHOLD})", fontsize=9)
+    colour.set_ylabel("share of distractor px", fontsize=9)
+    cover.hist([100 * m.counts.occlusion for m in measured], bins=12, color=plot_colour(LOCAL))
+    cover.set_xlabel("% of a photo covered", fontsize=9)
+    cosines = [c for m in measured if not math.isnan(c := sem.photo_cosine(m.matches))]
+    look.hist(cosines, bins=24, range=(-0.2, 1.0), color=plot_colour(NEUTRAL))
+    limit = seen.usual if seen.whitened else sem.AMBIGUOUS_ABOVE
+    if not math.isnan(limit):
+        look.axvline(limit, color="k", ls="--", lw=1)
+    what = "95 % of static regions reach" if seen.whitened else "limit"
+    look.set_xlabel(f"cosine of the most similar distractor ({what} {limit:.2f})", fontsize=9)
+    for axes in (cover, look):
+        axes.set_ylabel("photos", fontsize=9)
+    for axes in (colour, cover, look):
+        axes.tick_params(labelsize=8)
+
+
+FILES = ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv")
+SHOWN = 8  # photos with maps on the page
+WIDTH = 420  # px of a picture on the page
+
+
+def check_folder(folder: Path) -> None:
+    """Raise AwError where the path is a file, or a folder with files that are no report."""
+    refuse_file(folder)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    strange = sorted(p.name for p in folder.iterdir() if p.name not in FILES)
+    if strange or not (folder / FILES[0]).is_file():
+        raise AwError(
+            f"{folder} holds something else than a report ({strange[0] if strange else 'half of one'}); "
+            "choose another -o"
+        )
+
+
+def write_report(
+    scene: Scene,
+    masks: Masks,
+    background: Background,
+    measured: list[Measured],
+    look: SceneFeatures,
+    summary: dict[str, Any],
+    out: Path,
+) -> None:
+    """Write the report into `out`, whole or not at all; an earlier report is replaced."""
+    metric = cosine_column(summary["features"])
+    rows = [row(m, metric) for m in measured]
+    with atomic_dir(out) as folder:
+        write_text(folder / "photos.csv", to_csv(list(rows[0]), (r.values() for r in rows)))
+        write_json(folder / "ambiguity.json", {**summary, "per_photo": rows})
+        write_figure(scene, masks, background, measured, look, folder / "ambiguity.png")
+        pictures = list(_pictures(scene, masks, background, measured, look))
+        write_text(
+            folder / "index.html", page(summary, rows, (folder / "ambiguity.png").read_bytes(), pictures)
+        )
+
+
+def _pictures(
+    scene: Scene, masks: Masks, background: Background, measured: list[Measured], look: SceneFeatures
+) -> Iterator[tuple[str, list[tuple[str, bytes]]]]:
+    """Name and JPEGs (photo, overlay, residual, cosine) of the photos on the page, by name."""
+    for index in sorted(chosen(measured, SHOWN)):
+        view = scene.train[index]
+        photo, distractor = load_photo(view), masks.load(view)
+        behind, known = background.load(index, view)
+        plain = (255 * photo + 0.5).astype(np.uint8)
+        images = [("photo", plain), ("distractors", overlay(photo, distractor))]
+        if behind is not None:
+            residual = residual_picture(photo, behind, known, distractor)
+            images.append(("difference in colour to the background", residual))
+        cosine = cosine_picture(look, index, photo, distractor)
+        if cosine is not None:
+            images.append(("similarity to the largest distractor", cosine))
+        yield view.name, [(caption, jpeg_bytes(narrowed(image, WIDTH), 85)) for caption, image in images]
+
+
+_STYLE = """
+:root{--back:#fff;--text:#222;--line:#ddd}
+@media(prefers-color-scheme:dark){:root{--back:#14181b;--text:#e6e9eb;--line:#343c42}}
+body{font:16px/1.45 system-ui,sans-serif;max-width:90em;margin:1.5em auto;padding:0 1em}
+body{background:var(--back);color:var(--text)}figure{margin:0}figcaption{font-size:13px;opacity:.8}
+img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
+td,th{padding:3px 9px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
+th:first-child{text-align:left;font-weight:normal}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
+.row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
+.row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
+.bar{height:.9em;max-width:24rem;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
+.ends{display:flex;justify-content:space-between;max-width:24rem;font-size:13px}
+"""
+_CLASSES = {
+    "both": "ambiguous in colour and semantically",
+    "colour": "ambiguous in colour",
+    "semantic": "semantically ambiguous",
+    "neither": "neither ambiguous in colour nor semantically",
+    NO_DISTRACTORS: "no distractors",
+}
+_HEADS = {
+    "photo": "photo",
+    "occlusion": "covered",
+    am.COLOUR_METRIC: "colour: close share",
+    "mean_residual": "mean residual",
+    "distractor_px": "distractor px",
+    "unknown_px": "unknown px",
+    "regions": "distractors",
+    "told_by": "each told by",
+}
+
+
+def page(
+    summary: dict[str, Any],
+    rows: list[dict[str, Any]],
+    picture: bytes,
+    photos: list[tuple[str, list[tuple[str, bytes]]]],
+) -> str:
+    """The page; every text of the scene is escaped, every picture is in it."""
+    title = html.escape(f"Ambiguity of {summary['scene']}")
+    verdict = _CLASSES.get(summary["class"], f"class: {summary['class']}")
+    lines = "".join(f"<li>{html.escape(line)}</li>" for line in describe(summary))
+    sources = (
+        f"{summary['photos']} train photos; masks: {summary['masks']}; background: {summary['background']}; "
+        f"features: {summary['features']}; 95 % intervals by bootstrap over photos, seed {summary['seed']}"
+    )
+    shown = "".join(
+        f"<h3>{html.escape(name)}</h3><div class=row>{''.join(_shown(name, *i) for i in images)}</div>"
+        for name, images in photos
+    )
+    head = [_HEADS.get(key, "semantic: cosine") for key in rows[0]]
+    table = html_table(text_table("", head, ([_cell(value) for value in r.values()] for r in rows)))
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>"
+        f"<p class=class>{html.escape(verdict)}</p><ul>{lines}</ul><p>{html.escape(sources)}</p>"
+        "<h2>Photos</h2><p>From the left: the photo; its distractors in red; how much they differ from the "
+        "background; how similar everything is to the largest distractor. Colours of the last two:</p>"
+        "<div class=bar></div><div class=ends><span>similar</span>"
+        f"<span>different</span></div>{shown}"
+        f"<h2>Distributions</h2>{_image(picture, 'png', 'masks, maps and distributions')}"
+        f"<h2>Every photo</h2><div class=wide>{table}</div></body></html>\n"
+    )
+
+
+def _shown(name: str, caption: str, data: bytes) -> str:
+    picture = _image(data, "jpeg", f"{caption}, {name}")
+    return f"<figure>{picture}<figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def _image(data: bytes, kind: str, name: str) -> str:
+    return f'<img alt="{html.escape(name)}" src="{data_uri(kind, data)}">'
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -1,0 +1,312 @@
+"""Where the report's masks and backgrounds come from: the truth, the user, or a trained run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.images import load_image_float, read_mask
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.gaussians import Gaussians
+
+# of a background that a run renders
+OPAQUE = 0.9  # accumulated alpha from which something stands there
+SEEN_BY = 2  # other photos that must see the surface unmasked
+DEPTH_SLACK = 0.05  # relative difference of depth up to which two photos see the same surface
+
+
+@dataclass(frozen=True)
+class Masks:
+    """Masks of the train photos, by the photo's name."""
+
+    source: str  # truth, scene, run or folder: as recorded
+    paths: dict[str, Path]
+    keep: bool  # white = static; else white = distractor
+
+    def load(self, view: View) -> np.ndarray:  # [H, W] bool
+        """True on distractors, at the photo's size.
+
+        Raises:
+            AwError: unreadable, no mask, or of another shape than the photo.
+        """
+        white = load_mask(self.paths[view.name], view)
+        return ~white if self.keep else white
+
+
+def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool = False) -> Masks:
+    """Distractor masks of the train photos.
+
+    Args:
+        scene: whose photos.
+        choice: "truth", "scene" (masks/train), "run" or a folder; None takes the first of truth, run and
+            scene that is there.
+        run: folder of a run with masks/.
+        keep: the choice is a folder where white means keep; else it means distractor.
+
+    Raises:
+        AwError: there is none, or photos lack theirs.
+    """
+    truth = scene.root / "truth" / "distractor"
+    if choice is None:
+        if truth.is_dir():
+            choice = "truth"
+        elif run is not None and (run / "masks").is_dir() and any((run / "masks").rglob("*.png")):
+            choice = "run"
+        elif any(v.keep_path for v in scene.train):
+            choice = "scene"
+        else:
+            raise AwError(
+                f"{scene.name} has no distractor masks: neither truth/distractor nor masks/train; give "
+                "--distractor-masks or --keep-masks DIR (PNG of the photo's stem) or --run RUN of a method "
+                "that masks"
+            )
+    if choice == "truth" and not keep:
+        return Masks("truth", _all(scene, truth, "add them (all black where there is no distractor)"), False)
+    if choice == "scene" and not keep:
+        folder = scene.root / "masks" / "train"
+        return Masks("scene", _all(scene, folder, "add them (all white where there is no distractor)"), True)
+    if choice == "run" and not keep:
+        if run is None:
+            raise AwError("--distractor-masks run needs --run RUN, a folder of 'aw bench'")
+        return Masks("run", _all(scene, run / "masks", "this method draws no masks; take another run"), True)
+    wanted = f"add them (all {'white' if keep else 'black'} where there is no distractor)"
+    return Masks("folder", _all(scene, Path(choice), wanted), keep)
+
+
+def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise AwError(
+            f"there is no mask folder {folder} for {scene.name}: give --distractor-masks truth|scene|run|DIR"
+        )
+    found = {v.name: folder / f"{stem(v)}.png" for v in scene.train}
+    missing = [name for name, path in found.items() if not path.is_file()]
+    if missing:
+        raise AwError(
+            f"{len(missing)} of {len(found)} train photos have no mask in {folder}: {shortlist(missing)}; "
+            + advice
+        )
+    return found
+
+
+def load_mask(path: Path, view: View) -> np.ndarray:
+    """White of a mask, see `read_mask`, at the photo's size, [H, W] bool; another size is resampled.
+
+    Raises:
+        AwError: unreadable, or of another shape than the photo.
+    """
+    import cv2
+
+    mask = read_mask(path)
+    width, height = view.camera.width, view.camera.height
+    if mask.shape != (height, width):
+        if abs(mask.shape[1] * height - mask.shape[0] * width) > 0.02 * mask.shape[1] * height:
+            raise AwError(
+                f"mask {path} is {mask.shape[1]}x{mask.shape[0]}, its photo {width}x{height}: another shape; "
+                "export it from the photo of the scene"
+            )
+        mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
+    return mask >= 128
+
+
+class Background(Protocol):
+    """What is behind the distractors."""
+
+    source: str
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Of train photo `index`: [H, W, 3] float32 in [0, 1] or None, and where it is known, [H, W] bool
+        (None: everywhere)."""
+        ...
+
+
+class CleanBackground:
+    """Clean versions of the photos; a photo without one is of unknown background."""
+
+    source = "clean"
+
+    def __init__(self, scene: Scene) -> None:
+        self.folder = scene.root / "truth" / "clean"
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """See `Background`.
+
+        Raises:
+            AwError: it is of another size than the photo.
+        """
+        path = self.folder / f"{stem(view)}.png"
+        if not path.is_file():
+            return None, None
+        image = load_image_float(path)
+        if image.shape[:2] != (view.camera.height, view.camera.width):
+            raise AwError(
+                f"{path} is {image.shape[1]}x{image.shape[0]}, its photo {view.camera.width}x"
+                f"{view.camera.height}; load the factor it was built for, or build it again"
+            )
+        return image, None
+
+
+class RunBackground:
+    """Renders of a run's Gaussians at the train cameras.
+
+    A render says something about every pixel; it *knows* only what other photos saw. A pixel counts as known
+    where the render is opaque and its surface is seen by two other photos outside their masks.
+    """
+
+    source = "run"
+
+    def __init__(self, scene: Scene, run: Path, masks: Masks) -> None:
+        """
+        Raises:
+            AwError: no finished run, or one of another scene or size.
+        """
+        check_run(scene, run)
+        self.views, self.masks = list(scene.train), masks
+        self._gaussians = _load(run)
+        self._depth: dict[int, tuple[Camera, np.ndarray, np.ndarray]] = {}  # of the other photos, coarse
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """See `Background`."""
+        if not self._depth:
+            self._depth = {k: self._coarse(v) for k, v in enumerate(self.views)}
+        image, alpha, depth = self._render(view.camera)
+        known = alpha >= OPAQUE
+        rows, cols = np.nonzero(known & self.masks.load(view))
+        points = unproject(view.camera, rows, cols, depth[rows, cols])
+        seen = np.zeros(len(rows), int)
+        for other, coarse in self._depth.items():
+            if other != index:
+                seen += sees(*coarse, points)
+        known[rows[seen < SEEN_BY], cols[seen < SEEN_BY]] = False
+        return image, known
+
+    def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        from ambiguous_wild.splat.render import render
+
+        drawn = render(self._gaussians, camera, sh_degree=self._gaussians.sh_degree)
+        alpha = drawn.alpha.numpy()
+        depth = drawn.depth.numpy() / np.maximum(alpha, 1e-6)
+        return drawn.image.numpy().clip(0.0, 1.0), alpha, depth
+
+    def _coarse(self, view: View) -> tuple[Camera, np.ndarray, np.ndarray]:
+        """A camera of about a quarter of the size, its depth, and where it sees the static scene."""
+        import cv2
+
+        width, height = max(view.camera.width // 4, 16), max(view.camera.height // 4, 16)
+        camera = view.camera.resized(width, height)
+        _, alpha, depth = self._render(camera)
+        # Any masked pixel masks the coarse one: it must not vouch for what it half sees.
+        masked = self.masks.load(view).astype(np.uint8)
+        static = cv2.resize(masked * 255, (width, height), interpolation=cv2.INTER_AREA) == 0
+        return camera, depth, static & (alpha >= OPAQUE)
+
+
+class NoBackground:
+    """Nothing is known behind distractors: colour has no score."""
+
+    source = "none"
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """See `Background`."""
+        return None, None
+
+
+def find_background(scene: Scene, choice: str | None, run: Path | None, masks: Masks) -> Background:
+    """What to compare distractors with: clean versions where there are any, else the render of a run.
+
+    Raises:
+        AwError: there is neither, or the one asked for is not there.
+    """
+    clean = scene.root / "truth" / "clean"
+    there = any((clean / f"{stem(v)}.png").is_file() for v in scene.train)
+    if choice is None:
+        choice = "clean" if there else "run" if run is not None else ""
+    if choice == "clean" and there:
+        return CleanBackground(scene)
+    if choice == "run" and run is not None:
+        return RunBackground(scene, run, masks)
+    if choice == "none":
+        return NoBackground()
+    if choice == "run":
+        raise AwError("--background run needs --run RUN, a folder of 'aw bench'")
+    raise AwError(
+        f"{scene.name} has no clean versions in {clean}: nothing is known behind its distractors; give "
+        "--run RUN of a trained run, or --background none to leave colour out"
+    )
+
+
+def stem(view: View) -> str:
+    """The photo's name without its suffix, as its mask is called."""
+    return str(PurePosixPath(view.name).with_suffix(""))
+
+
+def check_run(scene: Scene, run: Path) -> None:
+    """Make sure that the run is finished and of this scene.
+
+    Raises:
+        AwError: what is wrong, and what to do.
+    """
+    from ambiguous_wild.harness.cell import scene_identity
+
+    path = run / "config.yaml"
+    if not path.is_file() or not (run / "point_cloud.ply").is_file():
+        raise AwError(
+            f"{run} is no finished run (config.yaml and point_cloud.ply); give a folder of 'aw bench', "
+            "RUNS/SCENE/METHOD/seed0"
+        )
+    try:
+        config = plain_yaml.read_mapping(path)
+        known, name = config["scene"]["sha256"], config["scene"]["name"]
+    except (AwError, KeyError, TypeError) as error:
+        raise AwError(f"{path} is damaged ({' '.join(str(error).split())}); train the run again") from None
+    if known != scene_identity(scene):
+        raise AwError(
+            f"{run} was trained on scene {name!r} with other photos, split or size than {scene.root}; "
+            "train on this one: 'aw bench --scene'"
+        )
+
+
+def unproject(
+    camera: Camera,
+    rows: np.ndarray,  # [P]
+    cols: np.ndarray,  # [P]
+    depth: np.ndarray,  # [P] z
+) -> np.ndarray:  # [P, 3] world
+    """World points of pixel centres at a depth."""
+    x = (cols + 0.5 - camera.cx) / camera.fx * depth
+    y = (rows + 0.5 - camera.cy) / camera.fy * depth
+    rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+    return (np.stack([x, y, depth], axis=1) - translation) @ rotation
+
+
+def sees(
+    camera: Camera,
+    depth: np.ndarray,  # [h, w] z
+    static: np.ndarray,  # [h, w] bool: opaque and outside the mask
+    points: np.ndarray,  # [P, 3] world
+) -> np.ndarray:  # [P] bool
+    """Whether the camera sees each point: inside the picture, at its surface, outside the mask."""
+    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    z = np.maximum(local[:, 2], 1e-9)
+    cols = np.floor(np.clip(camera.fx * local[:, 0] / z + camera.cx, -1, camera.width)).astype(int)
+    rows = np.floor(np.clip(camera.fy * local[:, 1] / z + camera.cy, -1, camera.height)).astype(int)
+    inside = (local[:, 2] > 1e-6) & (cols >= 0) & (cols < camera.width) & (rows >= 0) & (rows < camera.height)
+    r, c = rows.clip(0, camera.height - 1), cols.clip(0, camera.width - 1)
+    return inside & static[r, c] & (np.abs(depth[r, c] - z) <= DEPTH_SLACK * z)
+
+
+def _load(run: Path) -> Gaussians:
+    import torch
+
+    from ambiguous_wild.io.ply import read_splat_ply
+    from ambiguous_wild.splat.gaussians import Gaussians
+
+    arrays = read_splat_ply(run / "point_cloud.ply")
+    found: dict[str, Any] = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+    return Gaussians(**found)

@@ -1,0 +1,314 @@
+"""From measured photos to the scene's scores, its class, and the sentences that say so."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any, TypedDict
+
+from ambiguous_wild.core import Scene
+from ambiguous_wild.metrics import ambiguity as am
+from ambiguous_wild.metrics import semantic as sem
+from ambiguous_wild.metrics.stats import Interval
+from ambiguous_wild.report.ambiguity_measure import (
+    KINDS,
+    Measured,
+    SceneFeatures,
+    feature_family,
+    weight_free,
+)
+
+LOOKS = (
+    "weight-free features see looks, not meaning: a distractor in the texture of something static counts as "
+    "like it, and a statue painted red as unlike a statue of stone; --objects names the static objects to "
+    "compare with, --features dinov2-small sees kinds of things"
+)
+NAMED = "weight-free features see looks, not meaning; compared with the objects named"
+NO_DISTRACTORS = "no distractors"  # the class of a scene whose masks are empty
+REAL = "raw cosine, as the paper's"
+
+
+class Scored(TypedDict):
+    """A score with its 95 % interval over photos; None = undefined."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+class OcclusionScore(Scored):
+    """Share of a train photo that distractors cover."""
+
+    min: float
+    max: float
+
+
+class ColourScore(Scored):
+    """Share of the distractor pixels whose colour is close to their background."""
+
+    threshold: float
+    ambiguous_above: float
+    ambiguous: bool | None  # None = no verdict
+    mean_residual: float | None
+    distractor_px: int
+    unknown_px: int  # with an unknown background
+
+
+class Told(TypedDict):
+    """Distractors by the evidence that tells them; None = no distractor could be asked."""
+
+    distractors: int
+    colour: int | None
+    structure: int | None
+    features: int | None
+    motion: int | None
+    nothing: int  # told by none of them
+
+
+class SemanticScore(Scored):
+    """Similarity of distractors to the static scene."""
+
+    ambiguous_above: float
+    ambiguous: bool | None  # None = no verdict
+    compared_with: str
+    cosine_most_similar: float | None
+    cosine_mean: float | None
+    usual_match: float | None
+    same_surface: float | None
+    unrelated: float | None
+    calibrated: float | None
+    photos: int
+    note: str
+
+
+def semantic_metric(features: str) -> str:
+    """The score's name with its variant: ``semantic_cosine_dinov2_small``, ``semantic_lookalike_labhog``."""
+    kind = "lookalike" if weight_free(features) else "cosine"
+    return f"semantic_{kind}_{_family(features)}"
+
+
+def cosine_column(features: str) -> str:
+    """The photos' column: the cosine of a photo's most similar distractor."""
+    return f"semantic_cosine_{_family(features)}"
+
+
+def _family(features: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", feature_family(features).lower())
+
+
+def summarise(
+    scene: Scene,
+    measured: list[Measured],
+    look: SceneFeatures,
+    *,
+    features: str = "labhog",
+    masks: str = "truth",
+    background: str = "clean",
+    seed: int = 0,
+) -> dict[str, Any]:
+    """The scene's scores with 95 % intervals over photos; what is undefined is None."""
+    colour, semantic = _colour(measured, seed), _semantic(measured, look, features, seed)
+    counts = [m.counts for m in measured]
+    covered = am.ratio_interval([c.distractor for c in counts], [c.pixels for c in counts], seed=seed)
+    shares = [c.occlusion for c in counts]
+    return {
+        "scene": scene.name,
+        "photos": len(measured),
+        "masks": masks,
+        "background": background,
+        "features": features,
+        "seed": seed,
+        "class": classify(colour["ambiguous"], semantic["ambiguous"]) if covered.mean else NO_DISTRACTORS,
+        "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
+        am.COLOUR_METRIC: colour,
+        semantic_metric(features): semantic,
+        "told": _told(measured),
+    }
+
+
+def classify(colour: bool | None, semantic: bool | None) -> str:
+    """colour, semantic, both or neither; where a verdict is missing, what is known, and "unknown"."""
+    if colour is None or semantic is None:
+        known = "colour" if colour else "semantic" if semantic else ""
+        return f"{known}, rest unknown" if known else "unknown"
+    return {(1, 1): "both", (1, 0): "colour", (0, 1): "semantic", (0, 0): "neither"}[
+        (int(colour), int(semantic))
+    ]
+
+
+def _colour(measured: list[Measured], seed: int) -> ColourScore:
+    counts = [m.counts for m in measured]
+    total = am.pooled(counts)
+    share = am.ratio_interval([c.close for c in counts], [c.known for c in counts], seed=seed)
+    return {
+        **_interval(share),
+        "threshold": am.COLOUR_THRESHOLD,
+        "ambiguous_above": am.COLOUR_AMBIGUOUS_ABOVE,
+        "ambiguous": am.verdict(share.mean, am.COLOUR_AMBIGUOUS_ABOVE),
+        "mean_residual": _number(total.mean_residual),
+        "distractor_px": total.distractor,
+        "unknown_px": total.unknown,
+    }
+
+
+def _semantic(measured: list[Measured], look: SceneFeatures, features: str, seed: int) -> SemanticScore:
+    photos = [m.matches for m in measured if m.matches]
+    # A mean is a ratio to the number of photos; without any it is missing, and not an error.
+    best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
+    score, limit = best, sem.AMBIGUOUS_ABOVE
+    if look.whitened:
+        alike = [sum(m.pixels for m in p if m.cosine >= look.usual) for p in photos]
+        known = [sum(m.pixels for m in p) for p in photos] if not math.isnan(look.usual) else []
+        score, limit = am.ratio_interval(alike[: len(known)], known, seed=seed), sem.LOOKALIKE_ABOVE
+    note = REAL if not look.whitened else NAMED if look.objects else LOOKS
+    return {
+        **_interval(score),
+        "ambiguous_above": limit,
+        "ambiguous": am.verdict(score.mean, limit),
+        "compared_with": "objects" if look.objects else "static segments",
+        "cosine_most_similar": _number(best.mean),
+        "cosine_mean": _number(sem.mean_cosine([m for p in photos for m in p])),
+        "usual_match": _number(look.usual),
+        "same_surface": _number(look.anchors.same),
+        "unrelated": _number(look.anchors.different),
+        "calibrated": _number(look.anchors.calibrated(best.mean)),
+        "photos": len(photos),
+        "note": note,
+    }
+
+
+def _told(measured: list[Measured]) -> Told:
+    every = [d for m in measured for d in m.distractors]
+
+    def count(kind: str) -> int | None:
+        answers = [answer for d in every if (answer := getattr(d, kind)) is not None]
+        return sum(answers) if answers else None
+
+    return {
+        "distractors": len(every),
+        "colour": count("colour"),
+        "structure": count("structure"),
+        "features": count("features"),
+        "motion": count("motion"),
+        "nothing": sum(not d.told_by for d in every),
+    }
+
+
+def _told_line(told: Told) -> str:
+    known = {kind: told[kind] for kind in KINDS if told[kind] is not None}  # type: ignore[literal-required]
+    parts = ", ".join(f"{kind} tells {count}" for kind, count in known.items())
+    text = f"distractors: {told['distractors']}; {parts or 'no evidence tells any'}; "
+    text += f"told by nothing: {told['nothing']}"
+    return text if told["motion"] is not None else f"{text} (the scene does not say what moves)"
+
+
+def row(m: Measured, metric: str) -> dict[str, Any]:
+    """One line of the table of photos."""
+    return {
+        "photo": m.name,
+        "occlusion": _number(m.counts.occlusion),
+        am.COLOUR_METRIC: _number(m.counts.close_share),
+        "mean_residual": _number(m.counts.mean_residual),
+        metric: _number(sem.photo_cosine(m.matches)),
+        "distractor_px": m.counts.distractor,
+        "unknown_px": m.counts.unknown,
+        "regions": len(m.matches),
+        "told_by": "; ".join(" ".join(d.told_by) or "nothing" for d in m.distractors),
+    }
+
+
+def describe(summary: dict[str, Any]) -> list[str]:
+    """The scores as sentences, for the terminal and the page."""
+    colour: ColourScore = summary[am.COLOUR_METRIC]
+    covered: OcclusionScore = summary["occlusion"]
+    if summary["class"] == NO_DISTRACTORS:
+        return [
+            f"the masks of all {summary['photos']} photos are empty: no distractor, so nothing that could be "
+            "ambiguous"
+        ]
+    look: SemanticScore = summary[semantic_metric(summary["features"])]
+    lines = [
+        f"occlusion: {_percent(covered)} of a train photo, from {100 * covered['min']:.1f} to "
+        f"{100 * covered['max']:.1f} %",
+        _colour_line(colour),
+        _semantic_line(look, weight_free(summary["features"])),
+    ]
+    if look["same_surface"] is not None:
+        lines.append(
+            f"with {summary['features']}, a static region scores {look['same_surface']:.2f} against other "
+            f"photos of itself and {look['unrelated']:.2f} against unrelated ones; {look['note']}"
+        )
+    told: Told | None = summary.get("told")  # absent from older reports
+    if told and told["distractors"]:
+        lines.append(_told_line(told))
+    if colour["unknown_px"]:
+        share = 100 * colour["unknown_px"] / colour["distractor_px"]
+        lines.append(
+            f"the background of {share:.0f} % of the distractor pixels is unknown: left out of colour"
+        )
+    return lines
+
+
+def _colour_line(colour: ColourScore) -> str:
+    if colour["value"] is None:
+        return "colour: no verdict, for no distractor's background is known"
+    return (
+        f"colour: {_percent(colour)} of the distractor pixels are within {am.COLOUR_THRESHOLD} of their "
+        f"background: {_word(colour)} (limit {100 * am.COLOUR_AMBIGUOUS_ABOVE:.0f} %)"
+    )
+
+
+def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
+    if look["value"] is None:
+        return f"semantic: no verdict, for no distractor could be compared with the {look['compared_with']}"
+    if lookalike:
+        return (
+            f"semantic: {_percent(look)} of the distractor pixels lie in regions that resemble a "
+            f"{_one(look)} of another photo as closely as static regions resemble each other: {_word(look)} "
+            f"(limit {100 * sem.LOOKALIKE_ABOVE:.0f} %)"
+        )
+    return (
+        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
+        f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})"
+    )
+
+
+def _one(look: SemanticScore) -> str:
+    return "named object" if look["compared_with"] == "objects" else "static region"
+
+
+def _percent(score: Scored) -> str:
+    if score["value"] is None:
+        return "missing"
+    text = f"{100 * score['value']:.1f} %"
+    return (
+        text
+        if score["low"] is None or score["high"] is None
+        else f"{text} [{100 * score['low']:.1f}, {100 * score['high']:.1f}]"
+    )
+
+
+def _value(score: Scored) -> str:
+    if score["value"] is None:
+        return "missing"
+    text = f"{score['value']:.3f}"
+    return (
+        text
+        if score["low"] is None or score["high"] is None
+        else f"{text} [{score['low']:.3f}, {score['high']:.3f}]"
+    )
+
+
+def _word(score: ColourScore | SemanticScore) -> str:
+    word = {None: "no verdict", True: "AMBIGUOUS", False: "not ambiguous"}[score["ambiguous"]]
+    low, high = score["low"], score["high"]
+    close = low is not None and high is not None and low <= score["ambiguous_above"] <= high
+    return f"{word}, but the interval crosses the limit" if close else word
+
+
+def _interval(interval: Interval) -> Scored:
+    return {"value": _number(interval.mean), "low": _number(interval.low), "high": _number(interval.high)}
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else round(float(value), 6)

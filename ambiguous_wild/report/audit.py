@@ -1,0 +1,230 @@
+"""Contradictions, exchanged numbers, means, ranks, digits and units; and what `aw audit` prints."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+
+from ambiguous_wild.report import audit_numbers
+from ambiguous_wild.report.audit_numbers import (
+    ALL,
+    KINDS,
+    MEAN,
+    UNKNOWN,
+    Finding,
+    Number,
+    finding,
+    method_name,
+    place_name,
+)
+from ambiguous_wild.report.plain_formats import markdown_text, plain, to_csv
+
+LOWER = ("lpips", "flip", "memory", "gpu_hours", "train_s", "ms", "model_mb", "peak", "gaussians")
+HIGHER = ("psnr", "ssim", "fps", "mask_", "iou")
+UNITLESS = ("memory", "time", "size")  # metrics that mean nothing without a unit and what was counted
+
+
+def contradictions(numbers: list[Number]) -> list[Finding]:
+    """The same method, setting, scene and metric with numbers that rounding does not explain."""
+    clashes: dict[tuple[str, ...], list[tuple[Number, Number]]] = defaultdict(list)
+    groups: dict[tuple[str, ...], list[Number]] = defaultdict(list)
+    for n in numbers:
+        if n.known:
+            groups[(*n.identity, n.metric)].append(n)
+    for group in groups.values():
+        for a, b in combinations(group, 2):
+            same_variant = a.variant == b.variant or UNKNOWN in (a.variant, b.variant)
+            if same_variant and abs(a.value - b.value) > a.half + b.half + 1e-12:
+                clashes[(*a.identity, a.table, b.table)].append((a, b))
+    exchanged = _exchanged([p for pairs in clashes.values() for p in pairs])
+    found = [f for f, _ in exchanged]
+    explained = {id(n) for _, pairs in exchanged for p in pairs for n in p}
+    for pairs in clashes.values():
+        left = [(a, b) for a, b in pairs if id(a) not in explained]
+        if left:
+            a, b = left[0]
+            words = ", ".join(f"{x.metric} {x.text} against {y.text}" for x, y in left)
+            text = f"{method_name(a)} on {place_name(a)}: {words} ({a.table}, {b.table})"
+            found.append(finding("contradiction", text, [n for p in left for n in p]))
+    return found
+
+
+def _exchanged(
+    clashes: list[tuple[Number, Number]],
+) -> list[tuple[Finding, list[tuple[Number, Number]]]]:
+    """Two methods whose numbers are exchanged between two tables."""
+    found = []
+    for (a, a2), (b, b2) in combinations(clashes, 2):
+        alike = (a.place, a.metric, a.table, a2.table) == (b.place, b.metric, b.table, b2.table)
+        if alike and a.method != b.method and a.value == b2.value and b.value == a2.value:
+            text = (
+                f"{a.method} and {b.method} on {place_name(a)}: {a.metric} {a.text} and {b.text} in "
+                f"{a.table} are exchanged in {a2.table}"
+            )
+            found.append((finding("swapped", text, (a, b, a2, b2)), [(a, a2), (b, b2)]))
+    return found
+
+
+def means(numbers: list[Number]) -> list[Finding]:
+    """Means over scenes, and over datasets, that rounding does not explain."""
+    wrong: dict[tuple[str, ...], list[tuple[Number, float, list[Number]]]] = defaultdict(list)
+    for n in numbers:
+        if n.scene != MEAN or n.setting:
+            continue
+        parts = _of_datasets(n, numbers) if n.dataset == ALL else _of_scenes(n, numbers)
+        if len(parts) < 2:
+            continue
+        value = float(np.mean([p.value for p in parts]))
+        if abs(value - n.value) > n.half + max(p.half for p in parts) + 1e-9:
+            wrong[n.table, n.method, n.dataset].append((n, value, parts))
+    return [_mean(cases) for cases in wrong.values()]
+
+
+def _mean(cases: list[tuple[Number, float, list[Number]]]) -> Finding:
+    first, _, parts = cases[0]
+    what = "datasets" if first.dataset == ALL else f"scenes of {first.dataset}"
+    words = ", ".join(
+        f"{n.metric} {n.text} where they give {value:.{n.digits + 1}f}" for n, value, _ in cases
+    )
+    text = f"{first.method}, mean over the {len(parts)} {what}: {words} ({first.table})"
+    return finding("mean", text, [m for n, _, parts in cases for m in (n, *parts)])
+
+
+def _of_datasets(mean: Number, numbers: list[Number]) -> list[Number]:
+    """The means of the same line of the same table."""
+    return [
+        n
+        for n in numbers
+        if (n.table, n.method, n.setting, n.metric, n.scene)
+        == (mean.table, mean.method, mean.setting, mean.metric, MEAN)
+        and n.dataset != ALL
+    ]
+
+
+def _of_scenes(mean: Number, numbers: list[Number]) -> list[Number]:
+    """The method's numbers on every scene of the dataset; none where one is missing."""
+    of_dataset = [
+        n
+        for n in numbers
+        if n.dataset == mean.dataset and n.metric == mean.metric and not n.setting and _one_scene(n)
+    ]
+    inside = [n for n in of_dataset if n.table == mean.table]
+    of_dataset = inside or of_dataset
+    size = Counter(n.table for n in of_dataset)
+    best: dict[str, Number] = {}
+    for n in of_dataset:
+        # An ablation repeats one scene of the main table: the larger table is where means come from.
+        if n.method == mean.method and (n.scene not in best or size[n.table] > size[best[n.scene].table]):
+            best[n.scene] = n
+    scenes = {n.scene for n in of_dataset}
+    return [best[s] for s in sorted(scenes)] if scenes == best.keys() else []
+
+
+def _one_scene(n: Number) -> bool:
+    return n.scene not in (MEAN, UNKNOWN, ALL) and "+" not in n.scene
+
+
+def ranks(numbers: list[Number]) -> list[Finding]:
+    """Marks for first, second and third that the numbers of the column do not give."""
+    columns: dict[tuple[str, ...], list[Number]] = defaultdict(list)
+    for n in numbers:
+        if not n.setting:
+            columns[(n.table, *n.place, n.metric)].append(n)
+    found = []
+    for column in columns.values():
+        better = _sign(column[0].metric)
+        if better is None or not any(n.mark for n in column):
+            continue
+        wrong = [n for n in column if n.mark and n.mark not in _places(n, column, better)]
+        if wrong:
+            order = sorted(column, key=lambda n: -better * n.value)
+            right = ", ".join(f"{i} {n.method} {n.text}" for i, n in enumerate(order[:3], start=1))
+            said = ", ".join(f"{n.method} {n.text} as {n.mark}" for n in wrong)
+            text = f"{column[0].metric} on {place_name(column[0])}: marks {said}, but it is {right}"
+            found.append(finding("rank", text, wrong))
+    return found
+
+
+def _places(n: Number, column: list[Number], better: int) -> range:
+    """The ranks it may be marked as; equal numbers may share one or take several."""
+    ahead = {m.value for m in column if better * (m.value - n.value) > 0}
+    before = sum(better * (m.value - n.value) > 0 for m in column)
+    return range(1 + len(ahead), 1 + before + sum(m.value == n.value for m in column))
+
+
+def _sign(metric: str) -> int | None:
+    if metric.startswith(HIGHER):
+        return 1
+    return -1 if metric.startswith(LOWER) else None
+
+
+def digits(numbers: list[Number]) -> list[Finding]:
+    """Quality metrics printed with other digits than nearly all of their column."""
+    columns: dict[tuple[str, str], list[Number]] = defaultdict(list)
+    for n in numbers:
+        if n.metric.startswith(("psnr", "ssim", "lpips")):
+            columns[n.table, n.metric].append(n)
+    return [f for column in columns.values() for f in _odd_digits(column)]
+
+
+def _odd_digits(column: list[Number]) -> Iterator[Finding]:
+    usual, count = Counter(n.digits for n in column).most_common(1)[0]
+    odd = [n for n in column if n.digits != usual]
+    if odd and count >= 0.8 * len(column):
+        words = ", ".join(f"{n.method} on {place_name(n)} {n.text}" for n in odd)
+        text = f"{column[0].metric} has {usual} digits in {column[0].table}, but {words}"
+        yield finding("digits", text, odd)
+
+
+def units(numbers: list[Number]) -> list[Finding]:
+    """Quantities without a unit, one finding a metric."""
+    found = []
+    for metric in sorted({n.metric for n in numbers if n.metric in UNITLESS}):
+        bare = [n for n in numbers if n.metric == metric and n.variant == UNKNOWN]
+        if bare:
+            tables = ", ".join(dict.fromkeys(n.table for n in bare))
+            text = f"{len(bare)} values of {metric} carry no unit, nor what was counted ({tables})"
+            found.append(finding("unit", text, bare))
+    return found
+
+
+CHECKS = (
+    audit_numbers.repeated, contradictions, audit_numbers.exchanged, means,
+    audit_numbers.out_of_place, audit_numbers.unlike, ranks, digits, units,
+)  # fmt: skip
+
+
+def audit(numbers: list[Number]) -> list[Finding]:
+    """Everything that cannot be right, by kind; the same numbers give the same findings."""
+    found = [f for check in CHECKS for f in check(numbers)]
+    order = list(KINDS)
+    return sorted(found, key=lambda f: order.index(f.kind))
+
+
+def text_of(findings: list[Finding]) -> str:
+    """Grouped by kind, for a terminal."""
+    lines = []
+    for kind, meaning in KINDS.items():
+        of_kind = [f for f in findings if f.kind == kind]
+        if of_kind:
+            lines += [f"{kind}: {meaning} ({len(of_kind)})", *(f"  {plain(f.text)}" for f in of_kind), ""]
+    return "\n".join(lines)
+
+
+def markdown_of(findings: list[Finding]) -> str:
+    """A list by kind."""
+    lines = []
+    for kind, meaning in KINDS.items():
+        of_kind = [f for f in findings if f.kind == kind]
+        if of_kind:
+            lines += [f"**{kind}** ({meaning}):", "", *(f"- {markdown_text(f.text)}" for f in of_kind), ""]
+    return "\n".join(lines)
+
+
+def csv_of(findings: list[Finding]) -> str:
+    """One finding a row."""
+    rows = ((f.kind, f.text, "; ".join(f.tables), "; ".join(f.where)) for f in findings)
+    return to_csv(("kind", "finding", "tables", "where"), rows)

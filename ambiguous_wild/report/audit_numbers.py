@@ -1,0 +1,467 @@
+"""Unlikely numbers: repeated more often than by chance, impossible, exchanged, unlike their table.
+
+How often two numbers agree to the digit by chance depends on how densely they lie, which is measured: pairs
+that are nearly equal (within `NEAR` units of the last digit) say how many exactly equal ones to expect.
+
+Tables of reported numbers: one number a line, in CSV.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.report.plain_formats import read_csv
+
+REQUIRED = ("method", "scene", "metric", "value")
+OPTIONAL = ("table", "setting", "dataset", "variant", "mark", "printed")
+UNKNOWN = "unknown"
+MEAN, ALL = "mean", "all"  # of scenes, and of datasets
+LARGEST = 50_000_000  # bytes
+REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables, see docs/audit.md
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number as printed."""
+
+    table: str  # which table it stands in
+    method: str
+    setting: str  # how it differs from the method as published; empty: as published
+    dataset: str
+    scene: str  # MEAN for a mean over the dataset's scenes, UNKNOWN where the table does not say
+    metric: str
+    variant: str  # of the metric, or its unit; UNKNOWN where the table does not say
+    value: float
+    digits: int  # behind the point
+    mark: int | None  # rank the table marks it as: 1, 2, 3
+    where: str  # file and line
+
+    @property
+    def identity(self) -> tuple[str, str, str, str]:
+        return (self.method, self.setting, self.dataset, self.scene)
+
+    @property
+    def place(self) -> tuple[str, str]:
+        return (self.dataset, self.scene)
+
+    @property
+    def half(self) -> float:
+        """Half a unit of the last printed digit."""
+        return 0.5 * 10.0**-self.digits
+
+    @property
+    def text(self) -> str:
+        return f"{self.value:.{self.digits}f}"
+
+    @property
+    def known(self) -> bool:
+        """Whether it is said what it was measured on."""
+        return UNKNOWN not in self.place
+
+
+def read_tables(paths: Sequence[Path]) -> list[Number]:
+    """Read CSV files; a folder stands for the *.csv in it. Cells without a value are left out.
+
+    Raises:
+        AwError: no file, or one that is unreadable, lacks a column or holds what is no number.
+    """
+    files: list[Path] = []
+    for path in paths:
+        inside = sorted(path.glob("*.csv")) if path.is_dir() else [path]
+        if not inside:
+            raise AwError(f"no *.csv in {path}: give tables as docs/audit.md describes them")
+        files += inside
+    found = [n for path in dict.fromkeys(files) for n in _read(path)]
+    if not found:
+        raise AwError(f"no number in {shortlist(map(str, files))}: nothing to audit")
+    return found
+
+
+def _read(path: Path) -> list[Number]:
+    advice = f"a table of results has {', '.join(REQUIRED)} and may have {', '.join(OPTIONAL)}"
+    rows = read_csv(path, REQUIRED, LARGEST, advice)[1]
+    return [n for line, row in rows if (n := _number(path, line, row)) is not None]
+
+
+def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
+    where = f"{path.name}:{line}"
+    cell = {k: row.get(k, "").strip() for k in (*REQUIRED, *OPTIONAL)}
+    if not cell["value"]:
+        return None
+    for column in ("method", "scene", "metric"):
+        if not cell[column]:
+            raise AwError(f"{path} line {line} has no {column}")
+    if not re.fullmatch(r"-?\d+(\.\d+)?([eE][+-]?\d+)?", cell["value"]) or math.isinf(float(cell["value"])):
+        raise AwError(
+            f"{path} line {line}: {cell['value'][:40]!a} is no number; leave the cell empty for none"
+        )
+    if cell["mark"] not in ("", "1", "2", "3"):
+        raise AwError(f"{path} line {line}: mark {cell['mark'][:40]!a} is none of 1, 2, 3")
+    return Number(
+        cell["table"] or path.stem,
+        cell["method"],
+        cell["setting"],
+        cell["dataset"] or UNKNOWN if "dataset" in row else path.stem,
+        cell["scene"],
+        cell["metric"],
+        cell["variant"] or UNKNOWN,
+        float(cell["value"]),
+        _digits(cell["value"]),
+        int(cell["mark"]) if cell["mark"] else None,
+        where,
+    )
+
+
+def _digits(text: str) -> int:
+    if "e" in text.lower():
+        return 6
+    return len(text.partition(".")[2])
+
+
+# kind -> what it means, in the order they are listed
+KINDS = {
+    "repeated": "numbers equal to the digit where they must not be",
+    "contradiction": "the same thing with another number elsewhere",
+    "swapped": "numbers or columns that look exchanged",
+    "mean": "a mean that does not follow from what it is the mean of",
+    "out of place": "a number its metric, or its neighbours, do not allow",
+    "rank": "a marked rank that the numbers do not give",
+    "digits": "another number of digits than the rest of its column",
+    "unit": "it is not said what was counted",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    kind: str  # of `KINDS`
+    text: str  # one line
+    tables: tuple[str, ...]
+    where: tuple[str, ...]  # file:line of every number involved
+
+
+def finding(kind: str, text: str, numbers: Iterable[Number]) -> Finding:
+    """A finding about these numbers."""
+    involved = list(numbers)
+    return Finding(
+        kind,
+        text,
+        tuple(dict.fromkeys(n.table for n in involved)),
+        tuple(dict.fromkeys(n.where for n in involved)),
+    )
+
+
+def place_name(number: Number) -> str:
+    """Where it was measured, for people."""
+    if number.scene == "mean":
+        return f"the mean of {number.dataset}"
+    if number.scene == "all":
+        return f"all of {number.dataset}"
+    return number.scene if number.scene != "unknown" else "a scene not named"
+
+
+def method_name(number: Number) -> str:
+    return f"{number.method} ({number.setting})" if number.setting else number.method
+
+
+NEAR, CLOSE = 25, 5  # units of the last digit; the narrower where numbers lie in heaps
+ODDS = 0.005  # of an accident, over everything looked at; above it nothing is said
+Key = tuple[str, ...]
+Line = dict[Key, Number]
+
+
+def repeated(numbers: list[Number]) -> list[Finding]:
+    """Scenes and methods whose lines repeat, then single entries (all metrics of a method on a scene)."""
+    plain = [n for n in numbers if n.known and n.scene != MEAN and "+" not in n.scene]
+    by_scene = _lines(plain, lambda n: n.place, lambda n: (n.method, n.setting, n.metric))
+    by_method = _lines(plain, lambda n: (n.method, n.setting), lambda n: (*n.place, n.metric))
+    found, covered = [], set[frozenset[str]]()
+    for lines, kind in ((by_scene, "scenes"), (by_method, "methods")):
+        for pairs in _repeating(lines):
+            involved = [n for pair in pairs for n in pair]
+            covered |= {frozenset((a.where, b.where)) for a, b in pairs}
+            found.append(finding("repeated", _words(kind, pairs), involved))
+    # A mean stands in several tables: what repeats it is said once.
+    said: dict[str, Finding] = {}
+    for f in _entries(numbers, covered):
+        said.setdefault(f.text, f)
+    return found + list(said.values())
+
+
+def _lines(
+    numbers: list[Number], line: Callable[[Number], Key], cell: Callable[[Number], Key]
+) -> dict[Key, Line]:
+    lines: dict[Key, Line] = defaultdict(dict)
+    for n in numbers:
+        lines[line(n)].setdefault(cell(n), n)
+    return lines
+
+
+def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[Number, Number]]]:
+    """Pairs of lines that share too many numbers in the same cells; metric by metric."""
+    from scipy.stats import poisson
+
+    trials = []
+    for (_, a), (_, b) in combinations(sorted(lines.items()), 2):
+        shared: dict[str, list[tuple[Number, Number]]] = defaultdict(list)
+        for cell in a.keys() & b.keys():
+            shared[cell[-1]].append((a[cell], b[cell]))
+        trials.append([sorted(pairs, key=lambda p: p[0].where) for _, pairs in sorted(shared.items())])
+    tested = sum(map(len, trials))
+    for metrics in trials:
+        equal = []
+        for pairs in metrics:
+            same = [(a, b) for a, b in pairs if a.value == b.value]
+            # Several methods at the same value (0.99 for all) are one coincidence, not several.
+            distinct = len({a.value for a, _ in same})
+            if distinct < 3:
+                continue
+            near, close = (
+                sum(a.value != b.value and _near(a, b, w) for a, b in pairs) for w in (NEAR, CLOSE)
+            )
+            expected = max((near + 1) / (2 * NEAR), close / (2 * CLOSE))
+            if poisson.sf(distinct - 1, expected) * tested < ODDS:
+                equal += same
+        if equal:
+            yield equal
+
+
+def _words(kind: str, pairs: list[tuple[Number, Number]]) -> str:
+    a, b = pairs[0]
+    metrics = ", ".join(dict.fromkeys(p[0].metric for p in pairs))
+    if kind == "scenes":
+        methods = ", ".join(dict.fromkeys(method_name(p[0]) for p in pairs))
+        places = f"{place_name(a)} ({a.dataset}) and {place_name(b)} ({b.dataset})"
+        return f"{places}: the same {metrics} for {methods}"
+    scenes = ", ".join(dict.fromkeys(place_name(p[0]) for p in pairs))
+    return f"{method_name(a)} and {method_name(b)}: the same {metrics} on {scenes}"
+
+
+def _entries(numbers: list[Number], covered: set[frozenset[str]]) -> Iterator[Finding]:
+    entries: dict[Key, dict[str, Number]] = defaultdict(dict)
+    for n in numbers:
+        entries[(n.table, *n.identity)].setdefault(n.metric, n)
+    wide = [e for e in entries.values() if len(e) >= 2]
+    # By how they are related: chance is rarer where fewer pairs are looked at.
+    families: dict[str, list[tuple[dict[str, Number], dict[str, Number]]]] = defaultdict(list)
+    for i, j in _near_pairs(wide):
+        a, b = wide[i], wide[j]
+        first, second = next(iter(a.values())), next(iter(b.values()))
+        if not _may_be_one(first, second):
+            related = first.method == second.method or (first.known and first.place == second.place)
+            families["related" if related else "unrelated"].append((a, b))
+    for pairs in families.values():
+        equal = [(a, b) for a, b in pairs if _all(a, b, lambda x, y: x.value == y.value)]
+        near = len(pairs) - len(equal)
+        close = sum(_all(a, b, lambda x, y: _near(x, y, CLOSE)) for a, b in pairs) - len(equal)
+        for a, b in equal:
+            shared = sorted(a.keys() & b.keys())
+            odds = max((near + 3) / (2 * NEAR + 1) ** len(shared), close / (2 * CLOSE + 1) ** len(shared))
+            known = all(frozenset((a[m].where, b[m].where)) in covered for m in shared)
+            if odds < ODDS and not known:
+                yield _entry(a, b, shared)
+
+
+def _near_pairs(entries: list[dict[str, Number]]) -> list[tuple[int, int]]:
+    """Pairs that share three metrics or more and are near in all they share."""
+    metrics = sorted({m for e in entries for m in e})
+    value, unit = (np.full((len(entries), len(metrics)), np.nan) for _ in range(2))
+    for i, e in enumerate(entries):
+        for m, n in e.items():
+            value[i, metrics.index(m)], unit[i, metrics.index(m)] = n.value, 2 * n.half
+    pairs = []
+    for i in range(len(entries) - 1):
+        apart = np.abs(value[i + 1 :] - value[i])
+        shared = ~np.isnan(apart)
+        far = shared & (apart > NEAR * np.fmin(unit[i + 1 :], unit[i]) + 1e-12)
+        hits = np.flatnonzero((shared.sum(axis=1) >= 3) & ~far.any(axis=1))
+        pairs += [(i, i + 1 + int(j)) for j in hits]
+    return pairs
+
+
+def _entry(a: dict[str, Number], b: dict[str, Number], shared: list[str]) -> Finding:
+    first, second = a[shared[0]], b[shared[0]]
+    values = " / ".join(a[m].text for m in a if m in shared)
+    left = f"{method_name(first)} on {place_name(first)}"
+    right = f"{method_name(second)} on {place_name(second)}"
+    return finding("repeated", f"{left} and {right}: the same {values}", [*_of(a, shared), *_of(b, shared)])
+
+
+def _of(entry: dict[str, Number], metrics: Iterable[str]) -> list[Number]:
+    return [entry[m] for m in metrics]
+
+
+def _may_be_one(a: Number, b: Number) -> bool:
+    """The same thing, as far as the tables say: then equality is as it should be."""
+    if (a.method, a.setting) != (b.method, b.setting):
+        return False
+    return all(x == y or UNKNOWN in (x, y) for x, y in zip(a.place, b.place))
+
+
+def _all(a: dict[str, Number], b: dict[str, Number], holds: Callable[[Number, Number], bool]) -> bool:
+    return all(holds(a[m], b[m]) for m in a.keys() & b.keys())
+
+
+def _near(a: Number, b: Number, units: int) -> bool:
+    return abs(a.value - b.value) <= units * 10.0 ** -max(a.digits, b.digits) + 1e-12
+
+
+# metric family -> what a value can be; LPIPS has no upper limit, but none above 1.5 was ever printed rightly
+LIMITS = {"psnr": (2.0, 100.0), "ssim": (-1.0, 1.0), "lpips": (0.0, 1.5)}
+MARGIN = 0.5  # of the others' range: how far from them is still among them
+OTHERS = 4  # methods a scene needs besides, before one is called unlike them
+CLEARLY = 3.0  # times nearer to the others when exchanged
+FAR = 8.0  # robust deviations of a residual; in normal noise once in 10^15
+USUAL = 4.0  # what the other two metrics may be off
+FINEST = 0.0125  # of a spread: nothing below FAR times it is called a misprint
+SMALLEST = 4  # methods and scenes a table needs to say what fits
+Entry = dict[str, Number]  # family -> number
+Scenes = dict[tuple[str, str, str], dict[str, Entry]]  # (table, dataset, scene) -> method -> entry
+
+
+def out_of_place(numbers: list[Number]) -> list[Finding]:
+    """Values outside what the metric allows."""
+    found = []
+    for n in numbers:
+        low, high = LIMITS.get(_family(n), (-np.inf, np.inf))
+        if not low <= n.value <= high:
+            text = f"{n.method} on {place_name(n)}: {n.metric} {n.text} cannot be ({low:g} to {high:g})"
+            found.append(finding("out of place", text, [n]))
+    return found
+
+
+def exchanged(numbers: list[Number]) -> list[Finding]:
+    """SSIM and LPIPS exchanged: for one method, or for a whole scene of a table."""
+    scenes = _scenes(numbers)
+    columns = list(_columns(scenes))
+    done = {n for f in columns for n in f.where}
+    return columns + [f for place in scenes for f in _cells(scenes, place) if f.where[0] not in done]
+
+
+def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[Finding]:
+    entries = scenes[place]
+    for method, entry in entries.items():
+        if _unusual(scenes, place, method) is False:
+            continue  # as the method is elsewhere: weak, not exchanged
+        others = [e for m, e in entries.items() if m != method]
+        if len(others) < OTHERS:
+            continue
+        psnr, ssim, lpips = (np.array([e[f].value for e in others]) for f in ("psnr", "ssim", "lpips"))
+        s, d = entry["ssim"].value, entry["lpips"].value
+        usual = float(np.median(ssim)), float(np.median(lpips))
+        printed = abs(s - usual[0]) + abs(d - usual[1])
+        turned = abs(d - usual[0]) + abs(s - usual[1])
+        among = _among(s, ssim) or _among(d, lpips)
+        # A method that failed here has a bad PSNR too: then both may be outside rightly.
+        worst = psnr.min() - MARGIN * (psnr.max() - psnr.min())
+        if not among and CLEARLY * turned < printed and entry["psnr"].value >= worst:
+            text = (
+                f"{method} on {place_name(entry['ssim'])}: SSIM {entry['ssim'].text} and LPIPS "
+                f"{entry['lpips'].text} look exchanged (others: SSIM {ssim.min():g} to {ssim.max():g}, LPIPS "
+                f"{lpips.min():g} to {lpips.max():g})"
+            )
+            yield finding("swapped", text, (entry["ssim"], entry["lpips"]))
+
+
+def _unusual(scenes: Scenes, place: tuple[str, str, str], method: str) -> bool | None:
+    """Whether SSIM and LPIPS, exchanged, are nearer to the method's elsewhere; None: it is nowhere else."""
+    rest = [e[method] for p, e in scenes.items() if p != place and method in e]
+    if not rest:
+        return None
+    ssim, lpips = (float(np.median([e[f].value for e in rest])) for f in ("ssim", "lpips"))
+    s, d = (scenes[place][method][f].value for f in ("ssim", "lpips"))
+    return abs(s - ssim) + abs(d - lpips) > abs(d - ssim) + abs(s - lpips)
+
+
+def _columns(scenes: Scenes) -> Iterator[Finding]:
+    from scipy.stats import spearmanr
+
+    for place, entries in scenes.items():
+        if len(entries) < OTHERS:
+            continue
+        votes = [v for m in entries if (v := _unusual(scenes, place, m)) is not None]
+        if len(votes) < OTHERS or not all(votes):
+            continue
+        psnr, ssim, lpips = ([e[f].value for e in entries.values()] for f in ("psnr", "ssim", "lpips"))
+        if len(set(psnr)) > 1 and spearmanr(psnr, ssim)[0] < spearmanr(psnr, lpips)[0]:
+            involved = [e[f] for e in entries.values() for f in ("ssim", "lpips")]
+            text = f"SSIM and LPIPS of {place_name(involved[0])} in {place[0]} look exchanged for all methods"
+            yield finding("swapped", text, involved)
+
+
+def unlike(numbers: list[Number]) -> list[Finding]:
+    """SSIM or LPIPS far from what method and scene together let expect, where PSNR and the other are not.
+
+    A method that failed on a scene is bad in all three: that is a result, not a misprint.
+    """
+    known = {n for f in exchanged(numbers) for n in f.where}
+    grids: dict[str, dict[tuple[str, str], Entry]] = defaultdict(dict)
+    for (_, dataset, scene), entries in _scenes(numbers).items():
+        for method, entry in entries.items():
+            grids[dataset].setdefault((method, scene), entry)
+    found = []
+    for grid in grids.values():
+        rests = {family: _residuals(grid, family) for family in LIMITS}
+        for key, entry in grid.items():
+            far = {family: abs(rest[key][0]) for family, rest in rests.items() if key in rest}
+            for family in ("ssim", "lpips"):
+                others = [v for f, v in far.items() if f != family]
+                n = entry[family]
+                if far and far[family] > FAR and max(others) < USUAL and n.where not in known:
+                    fits = rests[family][key][1]
+                    text = f"{n.method} on {place_name(n)}: {family.upper()} {n.text}, {fits:.2f} would fit"
+                    found.append(finding("out of place", text, [n]))
+    return found
+
+
+def _residuals(grid: dict[tuple[str, str], Entry], family: str) -> dict[tuple[str, str], tuple[float, float]]:
+    """(residual in robust deviations, expected value) by method and scene; empty for a small table."""
+    methods, scenes = (sorted({key[i] for key in grid}) for i in (0, 1))
+    table = np.full((len(methods), len(scenes)), np.nan)
+    for (method, scene), entry in grid.items():
+        table[methods.index(method), scenes.index(scene)] = entry[family].value
+    if min(table.shape) < SMALLEST or np.isnan(table).mean() > 0.5:
+        return {}
+    fit = np.zeros_like(table)
+    for _ in range(10):  # Tukey's median polish
+        fit += np.nanmedian(table - fit, axis=1, keepdims=True)
+        fit += np.nanmedian(table - fit, axis=0, keepdims=True)
+    rest = table - fit
+    # The mean, not the median: many residuals of a polished table are zero by construction. The largest is
+    # left out, or it would hide itself.
+    spread = 1.2533 * np.mean(np.sort(np.abs(rest[~np.isnan(rest)]))[:-1])
+    # What the fit takes up: a row and a column of freedom; and three digits are never known better than this.
+    typical = max(spread * np.sqrt(table.size / ((len(methods) - 1) * (len(scenes) - 1))), FINEST)
+    return {
+        (m, s): (float(rest[i, j] / typical), float(fit[i, j]))
+        for i, m in enumerate(methods)
+        for j, s in enumerate(scenes)
+        if not np.isnan(rest[i, j])
+    }
+
+
+def _scenes(numbers: list[Number]) -> Scenes:
+    """PSNR, SSIM and LPIPS of every method on every scene, where all three are."""
+    found: dict[tuple[str, str, str], dict[str, Entry]] = defaultdict(lambda: defaultdict(dict))
+    for n in numbers:
+        if n.known and not n.setting and _family(n) in LIMITS:
+            found[n.table, n.dataset, n.scene][n.method].setdefault(_family(n), n)
+    return {k: {m: e for m, e in v.items() if len(e) == len(LIMITS)} for k, v in found.items()}
+
+
+def _family(n: Number) -> str:
+    return n.metric.partition("_")[0]
+
+
+def _among(value: float, others: np.ndarray) -> bool:
+    low, high = others.min(), others.max()
+    return bool(low - MARGIN * (high - low) <= value <= high + MARGIN * (high - low))

@@ -1,0 +1,342 @@
+"""CSV that spreadsheets take for text, and that reads back as what was written."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.harness.measures import MEASURES
+from ambiguous_wild.io.files import write_text
+from ambiguous_wild.report import plain_formats
+from ambiguous_wild.report.plain_formats import shortest
+
+FORMULA = ("=", "+", "-", "@")
+LARGEST = 200_000_000  # bytes
+LONGEST = 200  # characters of a name
+HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # Unicode categories of invisible characters
+CsvValue = str | int | float | None
+
+
+def guard(text: str) -> str:
+    """The text with an apostrophe in front where a spreadsheet would calculate it.
+
+    A text that begins with an apostrophe gets one too, so that `unguard` knows ours from its own.
+    """
+    begins = text.lstrip()[:1]
+    return "'" + text if begins in FORMULA or text[:1] in ("'", "\t", "\r", "\n") else text
+
+
+def unguard(cell: str) -> str:
+    """What `guard` was given."""
+    return cell[1:] if cell.startswith("'") else cell
+
+
+def number(value: float | None) -> str:
+    """Shortest digits that read back as the same number; empty where it is missing."""
+    if value is None or math.isnan(value):
+        return ""
+    return str(value) if isinstance(value, int) else shortest(value)
+
+
+def board_csv(head: Sequence[str], rows: Iterable[Sequence[CsvValue]]) -> str:
+    """Text is guarded, numbers stay numbers, None is an empty cell."""
+    return plain_formats.to_csv(head, rows, text=guard, number=shortest)
+
+
+def read_csv(path: Path, required: Sequence[str]) -> tuple[list[str], list[dict[str, str]]]:
+    """(columns, rows) of a file that `board_csv` wrote; cells as they stand, see `unguard` and `to_number`.
+
+    Raises:
+        AwError: unreadable, malformed, or without a column that must be there.
+    """
+    advice = "it is no file of a leaderboard, or was changed by hand: restore it from your version control"
+    head, rows = plain_formats.read_csv(path, required, LARGEST, advice)
+    return head, [cells for _, cells in rows]
+
+
+def to_count(text: str, where: str) -> int:
+    """The whole number from 0 on of a cell.
+
+    Raises:
+        AwError: it holds none, or one of more than 18 digits.
+    """
+    if not (text.isascii() and text.isdigit()) or len(text) > 18:
+        raise AwError(f"{where} {text[:40]!a} is no count; restore the file")
+    return int(text)
+
+
+def to_number(cell: str, where: str) -> float:
+    """The number in a cell; NaN for an empty one.
+
+    Raises:
+        AwError: it is no number.
+    """
+    if not cell:
+        return math.nan
+    if not re.fullmatch(r"-?(inf|\d+(\.\d+)?([eE][+-]?\d+)?)", cell):
+        raise AwError(f"{where}: {cell[:40]!a} is no number; restore the file")
+    return float(cell)
+
+
+def check_text(kind: str, text: str) -> str:
+    """The text, where it is fit to stand in a table: others' names may hold anything that can be printed.
+
+    Raises:
+        AwError: empty, too long, or with control characters or text-direction marks.
+    """
+    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    if not text.strip() or len(text) > LONGEST or hidden is not None:
+        shown = text if len(text) <= 40 else text[:37] + "..."
+        why = "is empty" if not text.strip() else f"holds {hidden!a}" if hidden else "is too long"
+        raise AwError(f"the {kind} {shown!a} {why}; give it 1 to {LONGEST} characters that can be printed")
+    return text
+
+
+def slug(text: str) -> str:
+    """A file name for any text: lower case, digits and '-', and never a path."""
+    ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    return re.sub(r"[^a-z0-9]+", "-", ascii_text).strip("-")[:48].strip("-")
+
+
+def unique_slug(*texts: str) -> str:
+    """A file name of its own for every tuple of texts."""
+    digest = hashlib.sha256("\0".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return "-".join(filter(None, (slug(texts[0]), digest)))
+
+
+FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
+LAST = (
+    "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
+    "result_hash", "checked", "reproduce", "row_hash",
+)  # fmt: skip
+NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns of others than plain text
+COST = "cost_"  # begins the column of a cost; every other column of numbers is a quality
+ALONE = "alone"  # the cost that says whether the run had the machine alone: 1 or 0
+TIDY = (
+    "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
+    "version", "source", "config_hash", "scene_hash", "checked",
+)  # fmt: skip
+# What was computed again from renders and photos: every metric of pictures, PSNR alone, or nothing.
+Checked = Literal["photos", "psnr", "files"]
+CHECKED: tuple[Checked, ...] = ("files", "psnr", "photos")  # the stronger last
+Key = tuple[str, str, str, str, str, int]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A run on the board; its values are means over the test images."""
+
+    dataset: str
+    scene: str
+    method: str
+    setting: str  # what sets it apart, for people: "2000 iterations, effects exposure"
+    options: str  # first 8 hex digits of the hash of the method's options; empty where it has none
+    seed: int
+    images: int  # test images behind the values
+    quality: Mapping[str, float]  # metric variant -> value
+    cost: Mapping[str, float]  # as in the result file, numbers only
+    missing: tuple[str, ...]  # metrics that were asked for and are not there
+    device: str
+    hardware: str  # what times depend on
+    version: str  # of this package
+    source: str  # sha256 of the method's own file; empty for the methods of this package
+    code_hash: str  # sha256 over this package's files; empty in results of before it was kept
+    config_hash: str
+    scene_hash: str
+    result_hash: str  # sha256 of metrics.json
+    checked: Checked
+    reproduce: str  # the command
+
+    @property
+    def key(self) -> Key:
+        """The cell it fills."""
+        return (self.dataset, self.scene, self.method, self.setting, self.options, self.seed)
+
+    @property
+    def name(self) -> str:
+        return f"{self.method} on {self.scene} with seed {self.seed} ({self.setting})"
+
+    @property
+    def row_hash(self) -> str:
+        """sha256 over the cells of its row: what a hand or a spreadsheet changes there shows."""
+        plain = {k: getattr(self, k) for k in (*FIRST, *LAST) if k != "row_hash"}
+        values = {k: {m: number(v) for m, v in getattr(self, k).items()} for k in ("quality", "cost")}
+        return config_hash(plain | values)
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Metrics in the order tables have them, then by name."""
+    known = list(MEASURES)
+    return sorted(names, key=lambda n: (known.index(n) if n in known else len(known), n))
+
+
+def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[CsvValue]]]:
+    """Head and rows, one row a run."""
+    quality = in_order({k for e in entries for k in e.quality})
+    cost = in_order({k for e in entries for k in e.cost})
+    head = [*FIRST, *quality, *(COST + k for k in cost), *LAST]
+    rows: list[list[CsvValue]] = []
+    for e in sorted(entries, key=lambda e: e.key):
+        row: list[CsvValue] = [*e.key, e.images]
+        row += [e.quality.get(k) for k in quality]
+        row += [e.cost.get(k) for k in cost]
+        row += [" ".join(e.missing), e.device, e.hardware, e.version, e.source, e.code_hash]
+        rows.append([*row, e.config_hash, e.scene_hash, e.result_hash, e.checked, e.reproduce, e.row_hash])
+    return head, rows
+
+
+def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
+    """The entry of a row.
+
+    Raises:
+        AwError: a cell that cannot be.
+    """
+    text = {k: unguard(row[k]) for k in (*FIRST, *LAST)}
+    numbers = {
+        k: value
+        for k in head
+        if k not in FIRST and k not in LAST and not math.isnan(value := to_number(row[k], f"{where}, {k}"))
+    }
+    counts = {column: to_count(text[column], f"{where}: {column}") for column in ("seed", "images")}
+    checked = next((c for c in CHECKED if c == text["checked"]), None)
+    if checked is None:
+        raise AwError(
+            f"{where}: checked is {text['checked'][:40]!a}, none of {', '.join(CHECKED)}; restore it"
+        )
+    names = {k: text[k] for k in (*FIRST, *LAST) if k not in NO_TEXT}
+    return Entry(
+        **names,
+        seed=counts["seed"],
+        images=counts["images"],
+        quality={k: v for k, v in numbers.items() if not k.startswith(COST)},
+        cost={k.removeprefix(COST): v for k, v in numbers.items() if k.startswith(COST)},
+        missing=tuple(text["missing"].split()),
+        checked=checked,
+    )
+
+
+def tidy(entries: Iterable[Entry]) -> Iterator[list[CsvValue]]:
+    """Rows under `TIDY`, one a run and metric; what is missing has a row without a value."""
+    for e in sorted(entries, key=lambda e: e.key):
+        last = [e.device, e.version, e.source, e.config_hash, e.scene_hash, e.checked]
+        qualities = {**dict.fromkeys(e.missing, math.nan), **e.quality}
+        for kind, values in (("quality", qualities), ("cost", e.cost)):
+            for metric in in_order(values):
+                yield [*e.key, kind, metric, values[metric], *last]
+
+
+ALL = "all"
+
+
+def measured(board: Path) -> Path:
+    """The folder of the measured numbers."""
+    return board / "measured"
+
+
+def dataset_file(board: Path, dataset: str) -> Path:
+    """Where the runs of a dataset stand.
+
+    Raises:
+        AwError: no file can be named after it.
+    """
+    name = slug(dataset)
+    if not name or name == ALL:
+        raise AwError(f"dataset {dataset!a} cannot name a file: use letters or digits, and not 'all'")
+    return measured(board) / f"{name}.csv"
+
+
+def dataset_files(board: Path) -> list[Path]:
+    """The CSVs of a board, one a dataset."""
+    return sorted(p for p in measured(board).glob("*.csv") if p.stem != ALL and not p.name.startswith("."))
+
+
+def read_board(board: Path) -> list[Entry]:
+    """Every run on the board, in order; none where there is no board yet.
+
+    Whoever publishes or writes a board reads it so: what a hand changed must not become what was measured.
+
+    Raises:
+        AwError: a file that is damaged or was changed by hand, or a run that is there twice.
+    """
+    entries, wrong = examine(board)
+    if wrong:
+        raise AwError(wrong[0])
+    return entries
+
+
+def examine(board: Path) -> tuple[list[Entry], list[str]]:
+    """(runs as the files have them, a line for each row and file that was changed by hand).
+
+    Raises:
+        AwError: a file that is damaged, or a run that is there twice.
+    """
+    entries: list[Entry] = []
+    wrong: list[str] = []
+    for path in dataset_files(board):
+        head, rows = read_csv(path, (*FIRST, *LAST))
+        found = [from_wide(head, row, f"{path} row {at}") for at, row in enumerate(rows, 2)]
+        for e in found:
+            if dataset_file(board, e.dataset) != path:
+                raise AwError(f"{path} holds a run of dataset {e.dataset!a}: restore the file")
+        wrong += [
+            f"{path} row {at} ({e.name}) was changed by hand, its cells do not hash to its row_hash: restore "
+            "the file from your version control, or remove it and all.csv and add its runs again"
+            for at, (row, e) in enumerate(zip(rows, found), 2)
+            if row["row_hash"] != e.row_hash
+        ]
+        entries += found
+    seen: set[object] = set()
+    for e in entries:
+        if e.key in seen:
+            raise AwError(f"{e.name} is twice in {dataset_file(board, e.dataset)}: restore the file")
+        seen.add(e.key)
+    entries.sort(key=lambda e: e.key)
+    # Where a row was changed, all.csv must differ: that is not a second problem.
+    return entries, wrong or _other_files(board, entries)
+
+
+def _other_files(board: Path, entries: Sequence[Entry]) -> list[str]:
+    """A line for each file that the runs do not give; one that is not there can be made from them."""
+    return [
+        f"{path} is not what the runs of {path.parent} give: rows were changed, added or taken out by hand, "
+        "or a write was cut off; restore the files from your version control. Where "
+        f"{ALL}.csv alone is wrong, remove it: 'aw leaderboard add' of any run writes it again"
+        for path, text in files_of(board, entries).items()
+        if path.is_file() and path.read_bytes() != text.encode()
+    ]
+
+
+def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:
+    """Path and content of every CSV of a board with these runs.
+
+    Raises:
+        AwError: two datasets whose names differ only in case or blanks.
+    """
+    by_file: dict[Path, list[Entry]] = {}
+    for e in entries:
+        by_file.setdefault(dataset_file(board, e.dataset), []).append(e)
+    for path, rows in by_file.items():
+        names = sorted({e.dataset for e in rows})
+        if len(names) > 1:
+            raise AwError(f"datasets {names[0]!a} and {names[1]!a} would share {path.name}: spell them alike")
+    files = {path: board_csv(*wide(rows)) for path, rows in sorted(by_file.items())}
+    return files | {measured(board) / f"{ALL}.csv": board_csv(TIDY, tidy(entries))}
+
+
+def write_board(board: Path, entries: Sequence[Entry]) -> None:
+    """Write what changed; all.csv last, because it can be made again from the others."""
+    files = files_of(board, entries)
+    for path in dataset_files(board):
+        if path not in files:
+            path.unlink()  # of a dataset whose last run was taken down
+    for path, text in files.items():
+        if not path.is_file() or path.read_bytes() != text.encode():
+            write_text(path, text)

@@ -1,0 +1,483 @@
+"""The page: one index.html with CSVs and pictures beside it, made from the board's CSVs alone.
+
+What the page's scripts read: runs, pictures, methods, reported numbers with what the audit found.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+from urllib.parse import quote
+
+from ambiguous_wild import __version__
+from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.measures import measure
+from ambiguous_wild.harness.models import TrainedModel, find_models, open_scene
+from ambiguous_wild.harness.result_file import RESULT
+from ambiguous_wild.io.files import (
+    atomic_dir,
+    check_output,
+    folder_lock,
+    list_names,
+    sha256_file,
+    sweep_siblings,
+    write_json,
+)
+from ambiguous_wild.io.files import refuse_foreign_files as refuse_strangers
+from ambiguous_wild.io.page_parts import fill_page
+from ambiguous_wild.methods.registry import knows_truth
+from ambiguous_wild.report import board_pictures
+from ambiguous_wild.report.audit import audit
+from ambiguous_wild.report.audit_numbers import REPORTED, Finding, Number, read_tables
+from ambiguous_wild.report.board import (
+    ALONE,
+    CsvValue,
+    Entry,
+    board_csv,
+    files_of,
+    in_order,
+    read_board,
+    slug,
+    to_number,
+)
+from ambiguous_wild.viewing.page_file import page_text
+
+COSTS = ("reference_s", "train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
+TIMES = ("reference_s", "train_s", "fps")  # compare only between runs that had the machine alone
+MASKS = ("mask_iou", "mask_precision", "mask_recall")
+PRINTED_LABELS = {"lpips": "LPIPS", "memory": "memory", "gpu_hours": "GPU h", "fps": "FPS"}
+LABELS = {
+    "train_s": "training s", "reference_s": "reference s", "model_mb": "model MB",
+    "peak_rss_mb": "peak memory MB",
+}  # fmt: skip
+COLUMNS = (
+    "dataset", "scene", "method", "setting", "options", "seed", "images", "missing", "device", "hardware",
+    "version", "source", "code_hash", "config_hash", "scene_hash", "result_hash", "checked", "reproduce",
+)  # fmt: skip
+# Code of the authors; papers are linked by the arXiv number that the method's entry names.
+CODE = {
+    "3dgs": "https://github.com/graphdeco-inria/gaussian-splatting",
+    "absgs": "https://github.com/TY424/AbsGS",
+    "desplat": "https://github.com/AaltoML/desplat",
+    "dronesplat": "https://github.com/BITyia/DroneSplat",
+    "mcmc": "https://github.com/ubc-vision/3dgs-mcmc",
+    "pup-3dgs": "https://github.com/j-alex-hanson/gaussian-splatting-pup",
+    "robustsplat": "https://github.com/fcyycf/RobustSplat",
+    "wildgaussians": "https://github.com/jkulhanek/wild-gaussians",
+}
+PAPERS = {
+    "3dgs": "https://arxiv.org/abs/2308.04079",
+    "absgs": "https://arxiv.org/abs/2404.10484",
+    "mcmc": "https://arxiv.org/abs/2404.09591",
+    "pup-3dgs": "https://arxiv.org/abs/2406.10219",
+}
+
+
+def facts(
+    entries: Sequence[Entry],
+    index: Iterable[Mapping[str, str]],
+    reported: Reported,
+    files: list[str],
+    models: Mapping[str, str] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """The page's data, ready for JSON.
+
+    Args:
+        entries: runs of the board.
+        index: rows of `pictures.read_index`.
+        reported: numbers that papers print; may be empty.
+        files: names of the CSVs beside the page.
+        models: page that shows a run's model, by hash of its result.
+    """
+    order = in_order({k for e in entries for k in e.quality})
+    missing = {k for e in entries for k in e.missing}
+    measures = {
+        k: {"label": LABELS.get(k, m.label), "better": m.better, "digits": m.digits}
+        for k in (*order, *sorted(missing), *COSTS, "lpips_alex")
+        for m in (measure(k),)
+    }
+    for n in reported.numbers:
+        m = measure(n.metric)
+        label = PRINTED_LABELS.get(n.metric, m.label)
+        measures.setdefault(n.metric, {"label": label, "better": m.better, "digits": 3})
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "version": __version__,
+        "order": order,
+        "partial": [*(k for k in (*order, *sorted(missing)) if measure(k).partial), *MASKS],
+        "times": list(TIMES),
+        "references": sorted({e.method for e in entries if knows_truth(e.method)}),
+        "methods": {name: _method(name) for name in sorted({e.method for e in entries})},
+        "measures": measures,
+        "runs": [_run(e) for e in entries],
+        "models": dict(models),
+        "images": [
+            {k: v for k, v in row.items() if k not in ("sha256", "psnr")}
+            | {"psnr": _number(to_number(row["psnr"], "psnr"))}
+            for row in index
+        ],
+        **reported.plain(),
+        "files": files,
+    }
+
+
+def _run(e: Entry) -> dict[str, Any]:
+    quality = dict(e.quality)
+    if "mask_recall" not in quality:  # no distractor to find: an IoU of 0 says nothing
+        quality = {k: v for k, v in quality.items() if k not in MASKS}
+    alone = e.cost.get(ALONE)
+    return {k: getattr(e, k) for k in COLUMNS} | {
+        "quality": _numbers(quality),
+        "cost": _numbers({k: v for k, v in e.cost.items() if k in COSTS}),
+        "alone": None if alone is None else bool(alone),  # None: the load was not recorded
+    }
+
+
+def _method(name: str) -> dict[str, str]:
+    """What a method is, with links; a name that this package does not know has none."""
+    from ambiguous_wild.methods.registry import BUILTIN
+
+    known = {entry.name: entry for entry in BUILTIN}
+    entry = known.get(re.split("[@]", name)[0])
+    if entry is None:
+        return {"summary": "", "paper": "", "paper_url": "", "code_url": ""}
+    number = re.search(r"arXiv (\d{4}\.\d{4,5})", entry.paper)
+    url = f"https://arxiv.org/abs/{number[1]}" if number else PAPERS.get(entry.name, "")
+    return {
+        "summary": entry.summary, "paper": entry.paper, "paper_url": url,
+        "code_url": CODE.get(entry.name, ""),
+    }  # fmt: skip
+
+
+def _numbers(values: Mapping[str, float]) -> dict[str, Any]:
+    return {k: _number(v) for k, v in values.items()}
+
+
+def _number(value: float) -> float | str | None:
+    """As JSON has it: no NaN, no infinity."""
+    if math.isfinite(value):
+        return value
+    return None if math.isnan(value) else str(value)
+
+
+SOURCE = "reported"
+SOURCES = "sources.json"
+REPORTED_COLUMNS = (
+    "source",
+    "method",
+    "setting",
+    "dataset",
+    "scene",
+    "metric",
+    "variant",
+    "value",
+    "printed",
+    "table",
+)
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What papers print, where it stands, and what `aw audit` found in it."""
+
+    numbers: tuple[Number, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    sources: dict[str, dict[str, str]] = field(default_factory=dict)  # table -> title, venue, url, caption
+
+    def plain(self) -> dict[str, Any]:
+        """For the page: findings are looked up by the place of a number."""
+        return {
+            "reported": [
+                {column: _plain(n, column) for column in (*REPORTED_COLUMNS[1:], "where")}
+                for n in self.numbers
+            ],
+            "findings": [{"kind": f.kind, "text": f.text, "where": list(f.where)} for f in self.findings],
+            "sources": self.sources,
+        }
+
+
+def read_reported(folder: Path) -> Reported:
+    """Every number of FOLDER/*.csv that says method and scene, in order; none without the folder.
+
+    Raises:
+        AwError: a file that is unreadable or malformed.
+    """
+    if not folder.is_dir() or not any(folder.glob("*.csv")):
+        return Reported()
+    numbers = read_tables([folder])
+    # of no method: what the text says of the photos
+    found = [n for n in numbers if n.known and n.method != "dataset"]
+    found.sort(key=lambda n: (n.dataset, n.method, n.setting, n.scene, n.table, n.metric, n.variant))
+    return Reported(tuple(found), tuple(audit(numbers)), read_sources(folder / SOURCES))
+
+
+def read_sources(path: Path) -> dict[str, dict[str, str]]:
+    """Table -> title of its paper, link and caption, from the sources.json beside reported tables.
+
+    Raises:
+        AwError: it is there and not of that form.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        papers, tables = found["papers"], found["tables"]
+        return {
+            str(name): {
+                "caption": str(about.get("caption", "")),
+                "title": str(papers[about["paper"]].get("title", "")),
+                "venue": str(papers[about["paper"]].get("venue", "")),
+                "url": _link(papers[about["paper"]].get("url", "")),
+            }
+            for name, about in tables.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise AwError(
+            f'{path} is malformed: write {{"papers": {{ID: {{"title", "venue", "url"}}}}, '
+            '"tables": {TABLE: {"paper": ID, "caption"}}}'
+        ) from None
+
+
+def _link(url: object) -> str:
+    """An address that a page may link to; empty for anything else, such as javascript:."""
+    text = str(url or "")
+    return text if re.fullmatch(r"https?://[^\s\"'<>]+", text) else ""
+
+
+def reported_csv(numbers: Sequence[Number]) -> str:
+    """One number a row, each marked as reported; beside the value how it is printed."""
+    rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in numbers)
+    return board_csv(REPORTED_COLUMNS, rows)
+
+
+def _plain(number: Number, column: str) -> CsvValue:
+    value: CsvValue = getattr(number, "text" if column == "printed" else column)
+    return value
+
+
+GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
+OURS = {"index.html", "data", "images", "models"}
+MANIFEST = "data/files.json"  # every other file of the page
+SCRIPTS = (
+    "page_data.js", "page_table.js", "page_matrix.js", "page_runs.js", "page_plot.js", "page_compare.js",
+    "page_reported.js", "page_main.js",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Published:
+    """What the page shows."""
+
+    runs: int
+    datasets: int
+    images: int
+    reported: int
+    reported_from: str | None = None  # the folder that was looked into; None: not asked for
+    model_pages: int = 0
+
+
+def publish(
+    board: Path,
+    out: Path,
+    *,
+    reported: bool = False,
+    reported_from: Path | None = None,
+    title: str = "Leaderboard",
+    models: Sequence[Path] = (),
+    say: Callable[[str], None] = lambda text: None,
+) -> Published:
+    """Write the page; an earlier page in `out` is replaced once the new one is whole.
+
+    Args:
+        board: folder of the leaderboard.
+        out: for index.html, data/*.csv and images/.
+        reported: show what papers print, too: BOARD/reported/*.csv, else the tables of this package.
+        reported_from: show what papers print, too, from this folder.
+        title: of the page.
+        models: run folders, or folders of them; their models go into pages of `aw view`, OUT/models/*.html.
+        say: told which entries have no model there.
+
+    Raises:
+        AwError: the board is damaged, or `out` holds something else.
+    """
+    if not board.is_dir():
+        raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
+    if reported_from is not None and not reported_from.is_dir():
+        raise AwError(
+            f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/audit.md"
+        )
+    source = reported_from
+    if reported and source is None:
+        source = board / SOURCE if (board / SOURCE).is_dir() else REPORTED
+    check_output(out)
+    out = Path(os.path.realpath(out))
+    with folder_lock(out, "aw leaderboard publish"):
+        _restore(out)
+        _check_folder(out)
+        sweep_siblings(out)
+        entries, index = read_board(board), board_pictures.read_index(board)
+        printed = read_reported(source) if source is not None else Reported()
+        with atomic_dir(out) as folder:
+            names = _write_data(board, folder / "data", entries, printed.numbers)
+            for row in index:
+                _copy_picture(
+                    board_pictures.folder_of(board) / row["file"],
+                    folder / "images" / row["file"],
+                    row["sha256"],
+                )
+            pages = write_model_pages(entries, models, folder, say) if models else ModelPages({}, 0)
+            text = page(title, facts(entries, index, printed, names, pages.links))
+            (folder / "index.html").write_text(text, encoding="utf-8")
+            write_json(folder / MANIFEST, list_names(folder))
+    return Published(
+        runs=len(entries),
+        datasets=len({e.dataset for e in entries}),
+        images=len(index),
+        reported=len(printed.numbers),
+        reported_from=None if source is None else str(source),
+        model_pages=pages.pages,
+    )
+
+
+def _restore(out: Path) -> None:
+    """Put the old page back where a killed call had moved it away and not yet the new one in."""
+    if out.exists():
+        return
+    for left in sorted(out.parent.glob(f".{out.name}.old-*")):
+        if (left / out.name / "index.html").is_file():
+            os.replace(left / out.name, out)
+            return
+
+
+def _check_folder(out: Path) -> None:
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise AwError(f"{out} is a file; choose another -o")
+    names = {p.name for p in out.iterdir()}
+    page_there = out / "index.html"
+    made = (
+        page_there.is_file() and GENERATOR in page_there.read_text(encoding="utf-8", errors="replace")[:2000]
+    )
+    if names and (not made or names - OURS):
+        odd = sorted(names - OURS)[0] if names - OURS else "another page"
+        raise AwError(f"{out} holds something else than a published board ({odd}); choose another -o")
+    known = _published(out)
+    if known is not None:
+        refuse_strangers(out, known)
+
+
+def _published(out: Path) -> set[str] | None:
+    """What the last publish wrote there; None for a page of before it kept a list."""
+    try:
+        found = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return {MANIFEST, *map(str, found)} if isinstance(found, list) else None
+
+
+def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Number]) -> list[str]:
+    folder.mkdir()
+    files = {path.name: text for path, text in files_of(board, entries).items()}
+    if printed:
+        files["reported.csv"] = reported_csv(printed)
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return list(files)
+
+
+def _copy_picture(source: Path, target: Path, digest: str) -> None:
+    if not source.is_file() or sha256_file(source) != digest:
+        raise AwError(
+            f"picture {source} is missing or changed: restore it, or add its runs again with "
+            "'aw leaderboard add'"
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+
+
+def page(title: str, known: Mapping[str, Any]) -> str:
+    """The page; data and title can be anything and stay text."""
+    # A picture beside a file:// page is not 'self' in every browser.
+    here = Path(__file__).resolve().parent / "page"
+    return fill_page(here, known, SCRIPTS, title=title, images="'self' file: data:", sort_keys=True)
+
+
+MODELS = "models"
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ModelPages:
+    """What was written."""
+
+    links: dict[str, str]  # by the result hash of a run: where its entry is shown, relative to index.html
+    pages: int
+
+
+def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path, say: Say) -> ModelPages:
+    """Write OUT/models/*.html from run folders whose results are on the board.
+
+    Of an entry (a method with its setting) the lowest seed that is at hand is shown.
+
+    Args:
+        entries: of the board.
+        runs: run folders, or folders of them.
+        out: folder of the published page.
+        say: told which entries have no model at hand.
+
+    Raises:
+        AwError: no run with a model below `runs`, or a scene that is not where its run says.
+    """
+    found, notes = find_models(runs)
+    for note in notes:
+        say(note)
+    by_hash = {sha256_file(f.run / RESULT): f for f in found}
+    scenes: dict[tuple[str, str], dict[str, list[Entry]]] = {}
+    for entry in sorted(entries, key=lambda e: e.key):
+        label = f"{entry.method} ({entry.setting})" + (f" {entry.options}" if entry.options else "")
+        scenes.setdefault((entry.dataset, entry.scene), {}).setdefault(label, []).append(entry)
+    links: dict[str, str] = {}
+    names: set[str] = set()
+    for (dataset, scene), groups in scenes.items():
+        shown: list[tuple[str, TrainedModel]] = []
+        for label, of_group in groups.items():
+            at_hand = [e for e in of_group if e.result_hash in by_hash]
+            if not at_hand:
+                say(f"no model of {label} on {scene}: its run is not below the folders given")
+                continue
+            chosen = at_hand[0]
+            shown.append((label, by_hash[chosen.result_hash]))
+        if not shown:
+            continue
+        if len({f.scene_hash for _, f in shown}) > 1:
+            raise AwError(f"runs on scene {scene!r} of {dataset!r} saw different photos: publish them apart")
+        name = _page_name(dataset, scene, names)
+        models = [replace(f.model, label=label) for label, f in shown]
+        text, _, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
+        (out / MODELS).mkdir(exist_ok=True)
+        (out / MODELS / name).write_text(text, encoding="utf-8")
+        for label, _ in shown:
+            for entry in groups[label]:
+                links[entry.result_hash] = f"{MODELS}/{name}#left={quote(label, safe='')}"
+    return ModelPages(links, len(names))
+
+
+def _page_name(dataset: str, scene: str, taken: set[str]) -> str:
+    """A file name nobody has yet; names of scenes can be anything."""
+    stem = f"{slug(dataset)}-{slug(scene)}".strip("-") or "scene"
+    name, number = f"{stem}.html", 1
+    while name in taken:
+        number += 1
+        name = f"{stem}-{number}.html"
+    taken.add(name)
+    return name

@@ -1,0 +1,313 @@
+"""The settings of a run in words, and the commands that make it and its scene again in an empty folder."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.builder.settings import BuildSettings
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.config import config_hash, flatten, to_plain
+from ambiguous_wild.harness.cell import scene_identity
+from ambiguous_wild.harness.result_file import RunResult
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.report.board import HIDDEN, Entry
+from ambiguous_wild.simulate.presets import PRESETS, resized
+from ambiguous_wild.simulate.spec_file import plain_spec
+
+# options of `aw build-scene`
+FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing", "sfm")
+
+
+def setting(config: Mapping[str, Any]) -> str:
+    """Length, effects, protocol, limits: "2000 iterations, effects exposure".
+
+    Only what the run itself says, for it is part of a cell: a method's defaults, which later versions change,
+    have no say in it. Options have a hash of their own.
+    """
+    train = config["train"]
+    words = [_length(train)]
+    if config.get("effects"):
+        words.append("effects " + "+".join(map(str, config["effects"])))
+    if config.get("protocol", "full") != "full":
+        words.append(f"{config['protocol']} images")
+    if train.get("resolution", "auto") != "auto":
+        words.append(f"resolution {train['resolution']}")
+    if train.get("max_gaussians") is not None:
+        words.append(f"at most {train['max_gaussians']} Gaussians")
+    return ", ".join(words)
+
+
+def _length(train: Mapping[str, Any]) -> str:
+    seconds = train.get("budget_s")
+    if seconds is None:
+        return f"{train.get('iterations')} iterations"
+    return f"{seconds / 60:g} min" if seconds >= 60 else f"{seconds:g} s"
+
+
+def options_hash(config: Mapping[str, Any]) -> str:
+    """First 8 hex digits over the method's options; empty where it has none."""
+    return config_hash(config["options"])[:8] if config["options"] else ""
+
+
+def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
+    """The command that makes the run again, the scene by its name.
+
+    From the hashed configuration alone: what a result file calls a command is a stranger's text, and whoever
+    reads a board pastes this one into a shell.
+
+    Args:
+        config: of the run.
+        before: commands that make its scene, see `preparation`.
+
+    Raises:
+        AwError: it would hold what is not seen: control characters, line breaks, text-direction marks.
+    """
+    train, method = config["train"], config["method"]
+    words = [
+        "aw",
+        "bench",
+        "--method",
+        method,
+        "--scene",
+        config["scene"].get("name"),
+        "--seed",
+        train["seed"],
+    ]
+    if config["source"]:
+        words += ["--plugin", "METHOD.py"]
+    if train.get("budget_s") is None:
+        words += ["--iterations", train.get("iterations")]
+    else:
+        words += ["--budget", f"{train['budget_s']:g}s"]
+    for flag, value, usual in (
+        ("--resolution", train.get("resolution"), "auto"),
+        ("--max-gaussians", train.get("max_gaussians"), None),
+        ("--protocol", config.get("protocol", "full"), "full"),
+        ("--factor", config["scene"].get("factor"), None),
+    ):
+        if value != usual:
+            words += [flag, value]
+    words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
+    for key, value in _changed(config).items():
+        words += ["--set", f"{key}={value}"]
+    words += ["--device", config.get("device", "cpu"), "-o", "runs"]
+    text = " && ".join([*before, shlex.join(str(w) for w in words)])
+    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    if hidden is not None:
+        raise AwError(f"config.yaml holds {hidden!a}, which no command can show: run it again without")
+    return text
+
+
+def _changed(config: Mapping[str, Any]) -> dict[str, str]:
+    """METHOD.KEY and value of options that are not the method's defaults on every machine.
+
+    Of a method in a file, all of them. Of a variant only those that depend on the machine: its name says the
+    others.
+    """
+    options, name = flatten(config["options"]), config["method"]
+    if "@" in name:
+        kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in _chosen(name)}
+        return {key: _word(value) for key, value in kept.items() if value is not None}
+    usual = {} if config["source"] else _defaults(name)
+    if usual is None:
+        return {}
+    return {f"{name}.{k}": _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
+
+
+def _chosen(method: str) -> list[tuple[str, str, str]]:
+    """Of a graft: place, member and name of each option whose default depends on the machine."""
+    from ambiguous_wild.methods.registry import get_method
+
+    try:
+        places = get_method(method).places
+        return sorted((p, member, k) for p, member in places for k in get_method(member).by_machine())
+    except (AwError, ImportError):
+        return []
+
+
+@cache
+def _defaults(method: str) -> dict[str, Any] | None:
+    """Defaults that are the same on every machine; None of an unknown method."""
+    from ambiguous_wild.methods.registry import get_method
+
+    try:
+        entry = get_method(method)
+        options = flatten(to_plain(entry.options()))
+    except (AwError, ImportError):
+        return None
+    return {k: v for k, v in options.items() if k not in entry.by_machine()}
+
+
+def _word(value: Any) -> str:
+    """As `--set` reads it."""
+    if isinstance(value, (list, tuple)):
+        return ",".join(map(_word, value))
+    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def hardware(path: Path, result: RunResult) -> str:
+    """What the times depend on: "Intel Xeon, 2 threads", or the GPU.
+
+    Raises:
+        AwError: env.json is damaged.
+    """
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        name = facts.get("gpu") or facts["cpu"]
+    except (OSError, ValueError, KeyError, AttributeError, RecursionError):
+        raise AwError(
+            f"{path} is damaged: restore it, or run again with 'aw bench --overwrite always'"
+        ) from None
+    threads = result["cost"].get("threads")
+    count = (
+        "" if facts.get("gpu") or threads is None else f", {threads:g} thread{'' if threads == 1 else 's'}"
+    )
+    return " ".join(str(name).split())[:100] + count
+
+
+def preparation(scene: Scene | None) -> list[str]:
+    """`aw simulate` and `aw build-scene` for a simulated scene; empty where photos cannot be made again.
+
+    Args:
+        scene: of a run; None: not at hand.
+    """
+    truth = _read(scene.root / "truth" / "capture.json") if scene is not None else {}
+    settings = scene.info.get("settings") if scene is not None else None
+    if scene is None or not truth or not isinstance(settings, dict):
+        return []
+    simulate = _simulate(truth, scene.name)
+    raw = f"raw/{scene.name}"
+    return [*simulate, shlex.join(_build(raw, scene.name, settings))] if simulate else []
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
+def _simulate(truth: Mapping[str, Any], name: str) -> list[str]:
+    """By its preset where that gives the same spec; else the spec itself, as a file."""
+    spec, seed = truth.get("spec"), truth.get("seed")
+    if not isinstance(spec, dict) or not isinstance(seed, int):
+        return []
+    end = [*(["--seed", str(seed)] if seed else []), "-o", f"raw/{name}"]
+    known = PRESETS.get(str(truth.get("preset")))
+    if known is not None:
+        views = spec.get("train_views") if spec.get("train_views") != known.train_views else None
+        width = spec.get("width") if spec.get("width") != known.width else None
+        try:
+            same = json.loads(json.dumps(plain_spec(resized(known, views, width)))) == spec
+        except (AwError, TypeError):
+            same = False
+        if same:
+            size = [*(["--views", str(views)] if views else []), *(["--width", str(width)] if width else [])]
+            return [shlex.join(["aw", "simulate", known.name, *size, *end])]
+    file = f"{name}.yaml"
+    text = json.dumps(spec, ensure_ascii=True)  # JSON is YAML
+    return [
+        f"printf %s {shlex.quote(text)} > {shlex.quote(file)}",
+        shlex.join(["aw", "simulate", f"./{file}", *end]),
+    ]
+
+
+def _build(raw: str, name: str, settings: Mapping[str, Any]) -> list[str]:
+    usual = {f.name: f.default for f in fields(BuildSettings)}
+    settings = {"sfm": "thorough", **settings}  # the only way there was before scenes recorded it
+    words = ["aw", "build-scene", raw, "-o", name]
+    if settings.get("factor") is not None:
+        words += ["--factor", str(settings["factor"])]
+    for key in FLAGS:
+        if key in settings and settings[key] != usual[key]:
+            words += [f"--{key.replace('_', '-')}", str(settings[key])]
+    return words + (["--strict"] if settings.get("strict") else [])
+
+
+SIMULATED = "simulated"
+
+
+class Scenes:
+    """Finds scenes, each opened once."""
+
+    def __init__(
+        self, folder: Path | None = None, dataset: str | None = None, board: Iterable[Entry] = ()
+    ) -> None:
+        """Args:
+        folder: of scenes, or one scene; instead of where the runs say they lie.
+        dataset: of every scene, whatever it says itself.
+        board: what is known of scenes that are not at hand.
+        """
+        self._folder, self._dataset = folder, dataset
+        self._known = {e.scene_hash: e.dataset for e in board}
+        self._opened: dict[tuple[Path, int | None], tuple[Scene, str]] = {}
+
+    def find(self, run: Path, config: Mapping[str, Any]) -> Scene | None:
+        """The scene of a run; None where it is not on this machine.
+
+        Raises:
+            AwError: what lies there is another scene, or damaged.
+        """
+        asked = config["scene"]
+        path = self._path(asked)
+        if path is None:
+            return None
+        factor = asked.get("factor")
+        key = (path, factor if isinstance(factor, int) else None)
+        if key not in self._opened:
+            scene = load_scene(path, factor=key[1], verify=True)
+            self._opened[key] = scene, scene_identity(scene)
+        scene, identity = self._opened[key]
+        if identity != asked.get("sha256"):
+            raise AwError(
+                f"{run} is of another scene than {path}: the run's has hash {str(asked.get('sha256'))[:12]}, "
+                f"this one {identity[:12]}; name the right one with --scene, or run again on this one"
+            )
+        return scene
+
+    def _path(self, asked: Mapping[str, Any]) -> Path | None:
+        name = str(asked.get("name"))
+        if self._folder is not None:
+            if (self._folder / "sparse").is_dir():
+                return self._folder
+            # The name is a stranger's: it must not lead elsewhere.
+            inside = Path(name).name == name and (self._folder / name).is_dir()
+            return self._folder / name if inside else None
+        path = asked.get("path")
+        return Path(path) if isinstance(path, str) and path and Path(path).is_dir() else None
+
+    def dataset(self, run: Path, scene: Scene | None, scene_hash: str) -> str:
+        """The dataset: as asked for, as scene.json says, "simulated", or as the board knows it.
+
+        Raises:
+            AwError: nothing says it.
+        """
+        if self._dataset is not None:
+            return self._dataset
+        if scene is not None:
+            said = scene.info.get("dataset")
+            if isinstance(said, str) and said.strip():
+                return said
+            if _simulated(scene.root):
+                return SIMULATED
+        if scene_hash in self._known:
+            return self._known[scene_hash]
+        why = "its scene is not on this machine" if scene is None else f"{scene.root} names none"
+        raise AwError(f"{run}: no dataset known, {why}; say it with --dataset NAME")
+
+
+def _simulated(root: Path) -> bool:
+    """Whether `aw simulate` made the photos."""
+    try:
+        facts = json.loads((root / "truth" / "capture.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(facts, dict) and isinstance(facts.get("preset"), str)

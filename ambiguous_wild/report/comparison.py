@@ -1,0 +1,365 @@
+"""From runs to a comparison: rows are methods, columns are measures, one table a scene.
+
+The mean is taken over images, then over seeds, then over scenes, in that order. No mean is shown where a
+value is missing. A scene that cannot have a value, such as a mask score without distractors, is left out of
+the mean, for every method. A failed run makes its cell "failed", so that no method gains by failing where
+it is hard, and a method with an unfinished run shows what it has but is not ranked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
+from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, read_runs
+from ambiguous_wild.methods.registry import knows_truth
+from ambiguous_wild.metrics import stats
+from ambiguous_wild.report.notes import incomparable, notes, untimed
+from ambiguous_wild.report.plain_formats import to_text
+from ambiguous_wild.report.table import Cell, Column, Row, State, Table, ranks
+from ambiguous_wild.report.typeset import to_html
+
+MASK_COLUMNS = ("mask_iou", "mask_precision")
+
+
+def comparison(
+    runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = (), drop_empty: bool | None = None
+) -> list[Table]:
+    """The comparison of every method: a table a scene, before them the mean where there are several.
+
+    Notes on what is missing, failed or not comparable stand below the last table.
+
+    Args:
+        runs: from `store.read_runs`.
+        metrics: columns by key, in this order; empty: PSNR, SSIM, LPIPS, whatever else was measured, mask
+            IoU and cost.
+        scenes: only these, in this order; empty: all, by name.
+        drop_empty: leave out columns without any value; a note says why they are empty. None: unless
+            `metrics` names them.
+
+    Raises:
+        AwError: a metric or scene that no run has, or no finished run.
+    """
+    frame = runs.runs
+    if not len(frame):
+        names = shortlist(f"{i.folder} ({i.reason})" for i in runs.incomplete)
+        raise AwError(f"no finished run: {names}")
+    known = sorted(frame["scene"].unique())
+    for name in scenes:
+        if name not in known:
+            raise unknown("scene", name, known)
+    chosen = tuple(dict.fromkeys(scenes)) or tuple(known)
+    runs = replace(
+        runs,
+        runs=frame[frame["scene"].isin(chosen)],
+        images=runs.images[runs.images["scene"].isin(chosen)],
+        missing=runs.missing[runs.missing["scene"].isin(chosen)],
+    )
+    methods = sorted(runs.runs["method"].unique())
+    index = _Index(runs)
+    columns = _columns(runs, metrics)
+    defined = {c.key: [s for s in chosen if index.can_have(s, c, methods)] for c in columns}
+    unranked = incomparable(runs.runs, columns)
+    rows = {scene: [_scene_row(index, m, scene, columns) for m in methods] for scene in chosen}
+    if len(chosen) > 1:
+        mean = [_mean_row(index, k, m, chosen, columns, rows, defined) for k, m in enumerate(methods)]
+        rows = {"": mean} | rows
+    title = f"mean over {len(chosen)} scenes"
+    tables = [
+        Table(
+            scene or title,
+            tuple(Column("", measure, scene) for measure in columns),
+            tuple(_ranked(of, columns, unranked)),
+            continued=True,
+        )
+        for scene, of in rows.items()
+    ]
+    tables = [_with_effects(table, runs.runs) for table in tables]
+    tables[-1] = replace(tables[-1], continued=False).with_notes(
+        *notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined)
+    )
+    return _without_empty(tables) if drop_empty or (drop_empty is None and not metrics) else tables
+
+
+class Tables(tuple[Table, ...]):
+    """Tables that `print` and a notebook show as they are read."""
+
+    def __repr__(self) -> str:
+        return f"Tables({', '.join(table.title for table in self)})"
+
+    def __str__(self) -> str:
+        return to_text(self)
+
+    def _repr_html_(self) -> str:
+        return to_html(self)
+
+
+def table(
+    runs: Runs | Path | str, *, metrics: str | Sequence[str] = (), scenes: str | Sequence[str] = ()
+) -> Tables:
+    """The `comparison` of runs, or of every run below a folder; one name needs no list."""
+    found = runs if isinstance(runs, Runs) else read_runs(runs)
+    columns, only = ([names] if isinstance(names, str) else names for names in (metrics, scenes))
+    return Tables(comparison(found, metrics=columns, scenes=only))
+
+
+EFFECTS = Measure("effects", "effects", None, 0, per_image=False)
+
+
+def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
+    """The table with a column of what each row was trained with, where the rows of a scene differ in that."""
+    done = frame[frame["status"] == "ok"]
+    if not any(of["effects"].nunique() > 1 for _, of in done.groupby("scene")):
+        return table
+    here = done[done["scene"] == table.columns[0].scene] if table.columns[0].scene else done
+    rows = []
+    for row in table.rows:
+        names = " or ".join(dict.fromkeys(here[here["method"] == row.name]["effects"]))
+        rows.append(replace(row, cells=(*row.cells, Cell(printed=names) if names else Cell(state="missing"))))
+    column = Column("", EFFECTS, table.columns[0].scene, words=True)
+    return replace(table, columns=(*table.columns, column), rows=tuple(rows))
+
+
+def _without_empty(tables: list[Table]) -> list[Table]:
+    """Without the columns that have no value anywhere; where none has any, everything stays."""
+    kept = [
+        i
+        for i in range(len(tables[0].columns))
+        if any(row.cells[i].state == "ok" for table in tables for row in table.rows)
+    ]
+    return [table.picked(kept) for table in tables] if kept else tables
+
+
+def _undefined(
+    columns: tuple[Measure, ...], scenes: tuple[str, ...], defined: Mapping[str, Sequence[str]]
+) -> list[str]:
+    """A line for the columns whose mean leaves the same scenes out."""
+    lines: dict[str, list[str]] = {}
+    for column in columns:
+        out = [s for s in scenes if s not in defined[column.key]]
+        if out and len(out) < len(scenes):
+            lines.setdefault(shortlist(out), []).append(column.label)
+    return [f"undefined on {out}, left out of the mean: {', '.join(c)}" for out, c in lines.items()]
+
+
+class _Index:
+    """Values by (method, scene): finding them in the frames for every cell would be quadratic."""
+
+    def __init__(self, runs: Runs) -> None:
+        self.runs = dict(iter(runs.runs.groupby(["method", "scene"])))
+        self.images = dict(iter(runs.images.groupby(["method", "scene", "metric"])))
+        self.unfinished = {(i.method, i.scene) for i in runs.incomplete}
+        self.untimed = set(untimed(runs.runs))
+
+    def seeds(self, method: str, scene: str, column: Measure) -> pd.Series:
+        """The run's value by seed, NaN where missing."""
+        rows = self.runs[method, scene].set_index("seed")
+        if not column.per_image:
+            values = rows[column.key] if column.key in rows else pd.Series(math.nan, index=rows.index)
+            values = values.astype(float)
+            if column.key in MASK_COLUMNS and "mask_recall" in rows:
+                # Without a distractor recall is undefined, and an IoU of 0 says nothing.
+                values = values.where(rows["mask_recall"].notna())
+            return values.sort_index()
+        images = self.images.get((method, scene, column.key))
+        found = {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
+        means = {seed: stats.mean(found.get(seed, np.empty(0))) for seed in sorted(rows.index)}
+        return pd.Series(means, dtype=float)
+
+    def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:
+        """Whether the measure is defined on the scene: some method has a value, or it always is."""
+        if not column.partial and column.key not in (*MASK_COLUMNS, "mask_recall"):
+            return True
+        return any(
+            (m, scene) in self.runs and bool(self.seeds(m, scene, column).notna().any()) for m in methods
+        )
+
+    def state(self, method: str, scene: str) -> State:
+        if (method, scene) not in self.runs:
+            return "absent"
+        return "failed" if (self.runs[method, scene]["status"] == "failed").any() else "ok"
+
+
+def _columns(runs: Runs, metrics: Sequence[str]) -> tuple[Measure, ...]:
+    images = runs.images.dropna(subset=["value"])
+    measured = list(dict.fromkeys([*MEASURES, *sorted(images["metric"].unique())]))
+    of_runs = set(runs.runs.columns) - {"scene", "method", *TEXT_OF_RUNS}
+    if metrics:
+        choices = set(MEASURES) | set(runs.images["metric"]) | of_runs
+        for name in metrics:
+            if name not in choices:
+                raise unknown("metric", name, choices, "'aw table RUNS' shows what was measured")
+        listed = [measure(name) for name in dict.fromkeys(metrics)]
+        return tuple(replace(m, per_image=False) if m.key in of_runs else m for m in listed)
+    present = set(images["metric"]) | set(ALWAYS)
+    quality = [measure(k) for k in measured if k in present and measure(k).per_image]
+    masks = [MEASURES["mask_iou"]] if runs.runs["mask_iou"].notna().any() else []
+    cost = [MEASURES[k] for k in COST if k in runs.runs and runs.runs[k].notna().any()]
+    return (*quality, *masks, *cost)
+
+
+def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, ...]) -> Row:
+    state = index.state(method, scene)
+    if state != "ok":
+        count = 0 if state == "absent" else int((index.runs[method, scene]["status"] == "ok").sum())
+        return Row(method, tuple(Cell(state=state) for _ in columns), runs=count)
+    cells = []
+    for column in columns:
+        values = index.seeds(method, scene, column).to_numpy()
+        value = stats.mean(values)
+        if math.isnan(value):
+            cells.append(Cell(state="missing"))
+            continue
+        low = high = math.nan
+        if column.timed and (method, scene) in index.untimed:
+            cells.append(Cell(value, math.nan, float(values.min()), float(values.max()), ranged=True))
+            continue
+        if column.per_image:
+            images = index.images[method, scene, column.key].pivot_table(
+                index="image", columns="seed", values="value", aggfunc="mean", dropna=False
+            )
+            means = images.to_numpy().mean(axis=1)
+            interval = stats.bootstrap_interval(
+                means[np.isfinite(means)] if np.isfinite(means).any() else means
+            )
+            low, high = interval.low, interval.high
+        cells.append(Cell(value, stats.spread(values), low, high))
+    ranked = (method, scene) not in index.unfinished and not knows_truth(method)
+    return Row(method, tuple(cells), runs=len(index.runs[method, scene]), ranked=ranked)
+
+
+def _mean_row(
+    index: _Index,
+    k: int,  # number of the method among the rows
+    method: str,
+    scenes: tuple[str, ...],
+    columns: tuple[Measure, ...],
+    by_scene: Mapping[str, Sequence[Row]],
+    defined: Mapping[str, Sequence[str]],  # column -> scenes that can have a value
+) -> Row:
+    rows = [by_scene[scene][k] for scene in scenes]
+    states = [index.state(method, scene) for scene in scenes]
+    cells = []
+    for i, column in enumerate(columns):
+        over = defined[column.key]
+        value = stats.mean([row.cells[i].value for row, s in zip(rows, scenes) if s in over])
+        if "failed" in states:
+            cells.append(Cell(state="failed"))
+        elif math.isnan(value):
+            cells.append(Cell(state="missing"))
+        elif any(row.cells[i].ranged for row in rows):
+            own = [(c.low, c.high) if c.ranged else (c.value, c.value) for c in (r.cells[i] for r in rows)]
+            low, high = (float(np.mean(ends)) for ends in zip(*own))
+            cells.append(Cell(value, math.nan, low, high, ranged=True))
+        else:
+            # Seed by seed, so that the spread is that of the number shown; needs the same seeds everywhere.
+            by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
+            cells.append(Cell(value, stats.spread(by_seed.mean(axis=1))))
+    return Row(
+        method, tuple(cells), runs=sum(row.runs for row in rows), ranked=all(row.ranked for row in rows)
+    )
+
+
+def _ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozenset[str]) -> list[Row]:
+    """The rows with the first, second and third of every column marked.
+
+    `unranked`: columns of times that were measured on machines that differ.
+    """
+    marked = [list(row.cells) for row in rows]
+    for i, column in enumerate(columns):
+        if column.key in unranked:
+            continue
+        cells = [row.cells[i] for row in rows]
+        values = [
+            c.value if row.ranked and c.state == "ok" and not c.ranged else math.nan
+            for row, c in zip(rows, cells)
+        ]
+        for k, rank in enumerate(ranks(values, column)):
+            marked[k][i] = replace(cells[k], rank=rank)
+    return [replace(row, cells=tuple(cells), note=_why_unranked(row)) for row, cells in zip(rows, marked)]
+
+
+def _why_unranked(row: Row) -> str:
+    if row.ranked:
+        return ""
+    return "knows the truth, not ranked" if knows_truth(row.name) else "unfinished, not ranked"
+
+
+COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash",
+           "effects", "length")  # fmt: skip
+_KEYS = ["scene", "method", "seed"]
+_OF_RUN = ["config_hash", "effects", "length"]
+_NO_NUMBER = {*_KEYS, "images", *TEXT_OF_RUNS}
+_TEXT = ("scene", "method", "image", "metric", "better", "reason", *_OF_RUN)
+
+
+def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> pd.DataFrame:
+    """All runs as one table.
+
+    Args:
+        runs: from `store.read_runs`.
+        metrics: only these; empty: all.
+        scenes: only these; empty: all.
+
+    Returns:
+        Columns `COLUMNS`. A number of a whole run (cost, masks) has an empty image. A missing value is NaN
+        and `reason` says why, where a run says it; a run that failed has one row, metric "failed". `better`
+        is "higher", "lower" or empty.
+
+    Raises:
+        AwError: a metric or scene that no run has.
+    """
+    frame = pd.concat([_images(runs), _missing(runs), _whole(runs), _failed(runs)], ignore_index=True)
+    frame = _only(_only(frame, "metric", metrics), "scene", scenes)
+    frame["better"] = frame["metric"].map(lambda key: measure(str(key)).better or "")
+    if len(runs.runs):  # no finished run: there are neither rows nor hashes
+        frame = frame.merge(runs.runs[[*_KEYS, *_OF_RUN]], on=_KEYS, how="left")
+    frame = frame.reindex(columns=list(COLUMNS)).fillna(dict.fromkeys(_TEXT, ""))
+    return frame.sort_values([*_KEYS, "image"], kind="stable", ignore_index=True)
+
+
+def _only(frame: pd.DataFrame, column: str, names: Sequence[str]) -> pd.DataFrame:
+    known = sorted(frame[column].unique())
+    for name in names:
+        if name not in known:
+            raise unknown(column, name, known)
+    return frame[frame[column].isin(list(names))].copy() if names else frame
+
+
+def _images(runs: Runs) -> pd.DataFrame:
+    frame = runs.images.merge(runs.missing, on=[*_KEYS, "metric"], how="left")
+    return frame.assign(reason=frame["reason"].where(frame["value"].isna(), ""))
+
+
+def _missing(runs: Runs) -> pd.DataFrame:
+    """Metrics that a run lacks as a whole and that have no row of any image."""
+    key = [*_KEYS, "metric"]
+    shown = set(runs.images[key].itertuples(index=False, name=None))
+    gone = [row not in shown for row in runs.missing[key].itertuples(index=False, name=None)]
+    return runs.missing[gone].assign(image="", value=math.nan)
+
+
+def _whole(runs: Runs) -> pd.DataFrame:
+    if not len(runs.runs):
+        return pd.DataFrame()
+    done = runs.runs[runs.runs["status"] == "ok"]
+    numbers = [name for name in done.columns if name not in _NO_NUMBER]
+    frame = done.melt(_KEYS, numbers, "metric", "value")
+    # A cost that does not apply (memory of a GPU) and mask scores without a truth are no gaps.
+    frame["value"] = pd.to_numeric(frame["value"], errors="coerce")
+    return frame[frame["value"].notna()].assign(image="", reason="")
+
+
+def _failed(runs: Runs) -> pd.DataFrame:
+    if not len(runs.runs):
+        return pd.DataFrame()
+    lost = runs.runs[runs.runs["status"] == "failed"]
+    return lost[_KEYS].assign(image="", metric="failed", value=math.nan, reason=lost["error"])

@@ -1,0 +1,354 @@
+"""The plots of the cost report: timelines, budgets, fronts and what each change brings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.palette import CATEGORIES, plot_colour
+from ambiguous_wild.methods.registry import knows_truth
+from ambiguous_wild.report.cost import PLOTS, CostReport, Unit, per_minute, time_unit
+from ambiguous_wild.report.cost_curves import KINDS as CHANGES
+from ambiguous_wild.report.cost_curves import Change, Curve, Point, Summary, longest, summary, timeline
+from ambiguous_wild.report.plain_formats import plain
+
+DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))  # when colours run out
+GREY = "0.45"
+PANEL = (4.6, 3.4)  # inches
+DPI = 130
+MOST_COLUMNS = 3
+
+
+def new_figure(
+    panels: int, *, panel: tuple[float, float] = PANEL, reading: str = ""
+) -> tuple[Any, list[Any]]:
+    """A figure of so many panels and their axes, without the screen; `reading` says below how to read it."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = 2 if panels == 4 else min(MOST_COLUMNS, panels)
+    rows = -(-panels // columns)
+    figure = Figure(figsize=(panel[0] * columns, panel[1] * rows), layout="constrained", dpi=DPI)
+    FigureCanvasAgg(figure)
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    if reading:
+        figure.supxlabel(reading, fontsize=8, color=GREY)
+    for spare in axes[panels:]:
+        spare.set_axis_off()
+    for used in axes[:panels]:
+        used.spines[["top", "right"]].set_visible(False)
+        used.tick_params(labelsize=8)
+        used.grid(axis="y", color="0.92", linewidth=0.8)
+        used.set_axisbelow(True)
+    return figure, axes[:panels]
+
+
+def save(figure: Any, stem: Path) -> list[Path]:
+    """Write STEM.svg and STEM.png; the same figure gives the same bytes."""
+    import matplotlib
+
+    paths = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
+    with matplotlib.rc_context({"svg.hashsalt": "aw"}):
+        for path, metadata in zip(paths, ({"Date": None, "Creator": None}, {"Software": None})):
+            with atomic_path(path) as temporary:
+                figure.savefig(temporary, metadata=metadata)
+    return paths
+
+
+def looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour and line of every name; the same names look the same in every plot."""
+    return {
+        name: {
+            "color": plot_colour(CATEGORIES[i % len(CATEGORIES)]),
+            "linestyle": DASHES[(i // len(CATEGORIES)) % len(DASHES)],
+        }
+        for i, name in enumerate(sorted(set(names)))
+    }
+
+
+def text(axes: Any, what: str, **kw: Any) -> None:
+    """A title or a label from others' names: neither formula nor control character."""
+    getattr(axes, f"set_{what}")(plain(kw.pop("label")), parse_math=False, **kw)
+
+
+def spread_out(heights: Sequence[float], gap: float) -> list[float]:
+    """Heights for labels at least `gap` apart, near where they belong; those that overlap share a middle."""
+    order = sorted(range(len(heights)), key=lambda i: heights[i])
+    pools: list[tuple[float, list[int]]] = []  # (middle, members)
+    for i in order:
+        pools.append((heights[i], [i]))
+        while len(pools) > 1 and _top(pools[-2], gap) > _bottom(pools[-1], gap):
+            (a, one), (b, two) = pools[-2:]
+            pools[-2:] = [((a * len(one) + b * len(two)) / (len(one) + len(two)), one + two)]
+    placed = [0.0] * len(heights)
+    for pool in pools:
+        for k, i in enumerate(pool[1]):
+            placed[i] = pool[0] + (k - (len(pool[1]) - 1) / 2) * gap
+    return placed
+
+
+def _top(pool: tuple[float, list[int]], gap: float) -> float:
+    return pool[0] + len(pool[1]) * gap / 2
+
+
+def _bottom(pool: tuple[float, list[int]], gap: float) -> float:
+    return pool[0] - len(pool[1]) * gap / 2
+
+
+def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> None:
+    """Names in the right margin, at the height where their lines end; (name, x, y, colour) each."""
+    if not ends:
+        return
+    low, high = axes.get_ylim()
+    line = 0.062 * (high - low)
+    heights = spread_out([y for _, _, y, _ in ends], line)
+    for (name, x, y, colour), height in zip(ends, heights):
+        axes.annotate(
+            plain(name), (x, y), xytext=(1.03, (height - low) / (high - low)), textcoords="axes fraction",
+            color=colour, fontsize=8, va="center", ha="left", parse_math=False, annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": colour, "alpha": 0.35, "linewidth": 0.7, "shrinkA": 1,
+                        "shrinkB": 3},
+        )  # fmt: skip
+
+
+def label_points(axes: Any, points: Sequence[tuple[str, float, float, Any]]) -> None:
+    """Names beside their points, towards the middle of the panel; (name, x, y, colour) each."""
+    low, high = axes.get_ylim()
+    to_axes = axes.transData + axes.transAxes.inverted()
+    heights = spread_out([y for _, _, y, _ in points], 0.062 * (high - low))
+    for (name, x, y, colour), height in zip(points, heights):
+        on_right = to_axes.transform((x, y))[0] > 0.5
+        axes.annotate(
+            plain(name), (x, height), xytext=(-8 if on_right else 8, 0), textcoords="offset points",
+            color=colour, fontsize=8, va="center", ha="right" if on_right else "left", parse_math=False,
+        )  # fmt: skip
+
+
+def ticks_of_time(axes: Any, times: Sequence[float]) -> None:
+    """A logarithmic axis with a tick at every one of the few times."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(FixedLocator(sorted(times)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def finite(*values: float) -> bool:
+    return all(math.isfinite(v) for v in values)
+
+
+AXES = (
+    ("minutes", "training time", True),
+    ("model_mb", "model size (MB)", True),
+    ("fps", "frames a second", False),
+)
+KINDS = {kind: k for k, kind in enumerate(CHANGES)}
+
+
+def draw_all(report: CostReport, folder: Path) -> list[Path]:
+    """Draw every plot that the runs have data for, as SVG and PNG; returns the paths."""
+    written = []
+    for name, draw in zip(PLOTS, (draw_timelines, draw_budgets, draw_front, draw_changes)):
+        figure = draw(report)
+        written += [] if figure is None else save(figure, folder / name)
+    return written
+
+
+def _panels(report: CostReport) -> list[tuple[str, tuple[str, ...]]]:
+    """(title, scenes) of each panel: the mean first where there are several."""
+    panels: list[tuple[str, tuple[str, ...]]] = [(scene, (scene,)) for scene in report.scenes]
+    return [(f"mean over {len(panels)} scenes", report.scenes), *panels] if len(panels) > 1 else panels
+
+
+def draw_timelines(report: CostReport) -> Any | None:
+    """Test PSNR over training time: seeds thin, their mean thick, their spread at the end."""
+    curves = [c for c in longest(report.curves) if any(len(run.points) > 1 for run in c.runs)]
+    if not curves:
+        return None
+    panels, look, unit = _panels(report), looks([c.name for c in report.curves]), time_unit(report)
+    figure, axes = new_figure(
+        len(panels), reading="thick: mean over seeds; thin: each seed; bars: sample deviation over seeds"
+    )
+    for panel, (title, scenes) in zip(axes, panels):
+        ends = [end for c in curves if (end := _timeline(panel, c, scenes, look[c.name], unit)) is not None]
+        _finish(panel, title, f"training time ({unit.name})")
+        label_right(panel, ends)
+        panel.set_xlim(left=0.0)
+    return figure
+
+
+def _timeline(
+    axes: Any, curve: Curve, scenes: tuple[str, ...], look: dict[str, Any], unit: Unit
+) -> Any | None:
+    scale = unit.per_minute / 60.0
+    if len(scenes) == 1:
+        for run in curve.on(scenes[0]):
+            at = np.array(run.points).reshape(-1, 2)
+            axes.plot(at[:, 0] * scale, at[:, 1], **look, linewidth=0.7, alpha=0.45)
+    seconds, psnr = timeline(curve, scenes)
+    x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
+    y = summary(curve, scenes, lambda run: run.psnr)
+    seconds = seconds * scale
+    if finite(x.mean, y.mean) and len(seconds) and x.mean >= seconds[-1]:  # the dot belongs to its curve
+        seconds, psnr = np.append(seconds, x.mean), np.append(psnr, y.mean)
+    axes.plot(seconds, psnr, **look, linewidth=2.0)
+    return _end(axes, curve.name, x, y, look)
+
+
+def _end(axes: Any, name: str, x: Summary, y: Summary, look: dict[str, Any]) -> Any | None:
+    if not finite(x.mean, y.mean):
+        return None
+    _dot(axes, x, y, look["color"])
+    return name, x.mean, y.mean, look["color"]
+
+
+def _dot(axes: Any, x: Summary, y: Summary, colour: Any, *, hollow: bool = False) -> None:
+    xerr, yerr = (e if finite(e) else None for e in (x.spread, y.spread))
+    axes.errorbar(x.mean, y.mean, xerr=xerr, yerr=yerr, fmt="o", color=colour, markersize=5.5, elinewidth=1.2,
+                  capsize=2.5, zorder=3, markerfacecolor="white" if hollow else colour)  # fmt: skip
+
+
+def draw_budgets(report: CostReport) -> Any | None:
+    """PSNR at the end of runs of several lengths: each dot was trained for that long from the start."""
+    lengths = {name: [c for c in report.curves if c.name == name] for name in {c.name for c in report.curves}}
+    if all(len(curves) < 2 for curves in lengths.values()):
+        return None
+    panels, look, unit = _panels(report), looks(list(lengths)), time_unit(report)
+    figure, axes = new_figure(
+        len(panels), reading="every dot is a training of that length; bars: sample deviation over seeds"
+    )
+    for panel, (title, scenes) in zip(axes, panels):
+        ends, times = [], []
+        for name in sorted(lengths):
+            ends_of = _joined(panel, lengths[name], scenes, look[name], unit)
+            times += [x for x, _ in ends_of]
+            ends += [(name, *ends_of[-1], look[name]["color"])] if ends_of else []
+        _finish(panel, title, f"training time ({unit.name})")
+        label_right(panel, ends)
+        if times:
+            ticks_of_time(panel, _few(times))
+    return figure
+
+
+def _joined(
+    axes: Any, curves: Sequence[Curve], scenes: tuple[str, ...], look: dict[str, Any], unit: Unit
+) -> list[tuple[float, float]]:
+    ends = []
+    for curve in curves:
+        x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
+        y = summary(curve, scenes, lambda run: run.psnr)
+        if finite(x.mean, y.mean):
+            ends.append((x.mean, y.mean))
+            _dot(axes, Summary(x.mean), y, look["color"])
+    ends.sort()
+    axes.plot([x for x, _ in ends], [y for _, y in ends], **look, linewidth=2.0)
+    return ends
+
+
+def _few(times: Sequence[float]) -> list[float]:
+    """Times rounded to two digits, those that would touch left out."""
+    kept: list[float] = []
+    for time in sorted({float(f"{t:.2g}") for t in times}):
+        if not kept or time > 1.3 * kept[-1]:
+            kept.append(time)
+    return kept
+
+
+def draw_front(report: CostReport) -> Any | None:
+    """PSNR against time, megabytes and frames a second; the grey line is the Pareto front."""
+    look, unit = looks([p.curve for p in report.points]), time_unit(report)
+    panels = [
+        axis for axis in AXES if any(finite(_x(p, axis[0], unit).mean, p.psnr.mean) for p in report.points)
+    ]
+    if not panels:
+        return None
+    figure, axes = new_figure(
+        len(panels),
+        reading="grey: Pareto front; hollow: time not ranked; bars: sample deviation over seeds",
+    )
+    for panel, (key, label, less_is_better) in zip(axes, panels):
+        known = [p for p in report.points if finite(_x(p, key, unit).mean, p.psnr.mean)]
+        # a time that is not ranked is drawn, and never on the front
+        rivals = [p for p in known if not knows_truth(p.method) and not (p.unranked and key != "model_mb")]
+        _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in rivals], less_is_better)
+        for p in known:
+            hollow = bool(p.unranked) and key != "model_mb"
+            _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"], hollow=hollow)
+        for name in dict.fromkeys(p.curve for p in known):  # trainings of several lengths
+            line = [(_x(p, key, unit).mean, p.psnr.mean) for p in known if p.curve == name]
+            panel.plot([x for x, _ in line], [y for _, y in line], **look[name], linewidth=1.0, alpha=0.6)
+        last = {p.curve: p for p in known}  # of a curve of several lengths, the longest has the name
+        ends = [(p.curve, _x(p, key, unit).mean, p.psnr.mean, look[p.curve]["color"]) for p in last.values()]
+        if key == "minutes":
+            label = f"{label}{' and set-up' if report.setup else ''} ({unit.name})"
+        over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
+        panel.margins(x=0.08, y=0.1)
+        _finish(panel, over, f"{label}, {'less' if less_is_better else 'more'} is better")
+        times = [_x(p, key, unit).mean for p in known]
+        if key == "minutes" and max(times) > 5.0 * min(times) > 0.0:
+            ticks_of_time(panel, _few(times))
+        label_points(panel, ends)
+    return figure
+
+
+def _x(point: Point, key: str, unit: Unit) -> Summary:
+    return unit.of(point.minutes) if key == "minutes" else point.numbers[key]
+
+
+def _front_line(axes: Any, at: Sequence[tuple[float, float]], less_is_better: bool) -> None:
+    front: list[tuple[float, float]] = []
+    for x, y in sorted(at, key=lambda p: (p[0] if less_is_better else -p[0], -p[1])):
+        if not front or y > front[-1][1]:
+            front.append((x, y))
+    # the ring shows a front of one point, which has no line
+    axes.step([x for x, _ in front], [y for _, y in front], where="post", color="0.82", linewidth=5.0,
+              solid_capstyle="round", marker="o", markersize=13, zorder=1)  # fmt: skip
+
+
+def draw_changes(report: CostReport) -> Any | None:
+    """A row a change: dB gained with its interval, and beside it what it costs."""
+    rows = [c for c in report.changes if finite(c.db.mean)]
+    if not rows:
+        return None
+    unit = time_unit(report)
+    figure, (axes,) = new_figure(1, panel=(8.6, 1.1 + 0.36 * len(rows)))
+    for height, change in enumerate(reversed(rows)):
+        colour = plot_colour(CATEGORIES[KINDS[change.kind]])
+        if finite(change.low, change.high):
+            axes.plot([change.low, change.high], [height, height], color=colour, linewidth=2.0)
+        axes.plot([change.db.mean], [height], "o", color=colour, markersize=6)
+        axes.annotate(_price(change, unit), (1.02, height), xycoords=("axes fraction", "data"), fontsize=8,
+                      va="center", color=GREY, annotation_clip=False)  # fmt: skip
+    axes.axvline(0.0, color="0.6", linewidth=0.8)
+    axes.set_yticks(range(len(rows)), [plain(_what(c)) for c in reversed(rows)], fontsize=8, parse_math=False)
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.grid(axis="x", color="0.92")
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("PSNR gained (dB), bar: 95 % interval over the test images", fontsize=8)
+    return figure
+
+
+def _what(change: Change) -> str:
+    plus = "+ " if change.kind == "effect" else ""
+    return f"{change.method}: {plus}{change.what}, {change.length}"
+
+
+def _price(change: Change, unit: Unit) -> str:
+    if not finite(change.minutes.mean):
+        return "time unknown"
+    if change.same_time:
+        return "in the same time"
+    extra, rate = unit.of(change.minutes).mean, per_minute(change)
+    return f"{extra:+.{unit.digits}f} {unit.name}" + (f", {rate} dB a minute" if extra > 0.0 else "")
+
+
+def _finish(axes: Any, title: str, x_label: str) -> None:
+    text(axes, "title", label=title, fontsize=9, loc="left")
+    text(axes, "xlabel", label=x_label, fontsize=8)
+    text(axes, "ylabel", label="test PSNR (dB)", fontsize=8)

@@ -1,0 +1,293 @@
+"""Runs as the cost report reads them: settings, result, and PSNR over time.
+
+Unlike a comparison, this takes many runs of one method on one scene with one seed: they differ in length,
+effects or options, and their differences are what is measured.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash, flatten
+from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, RunResult, mean_of, read_result
+from ambiguous_wild.harness.store import read_config, run_folders
+from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
+from ambiguous_wild.metrics import stats
+
+# of the training: they change how a run is kept and watched, not its result
+BOOKKEEPING = ("seed", "checkpoint_every_s", "probes", "iterations", "budget_s")
+SETTINGS = ("resolution", "max_gaussians")  # of the training: they change the result as options do
+NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")
+
+
+@dataclass(frozen=True, order=True)
+class Length:
+    """How long a run was asked to train."""
+
+    budget_s: float  # 0.0: as many iterations as below
+    iterations: int  # 0: a budget
+
+    @property
+    def text(self) -> str:
+        if not self.budget_s:
+            return f"{self.iterations} iterations"
+        minutes = self.budget_s / 60.0
+        return (
+            f"{minutes:g} min" if self.budget_s % 30.0 == 0.0 and minutes >= 1.0 else f"{self.budget_s:g} s"
+        )
+
+
+@dataclass(frozen=True)
+class CostRun:
+    """One run, finished or failed."""
+
+    folder: Path
+    method: str
+    scene: str
+    seed: int
+    asked: str  # effects as they were asked for: "auto", "all", or their names
+    effects: frozenset[str]  # that were on
+    options: tuple[tuple[str, Any], ...]  # of the method, flat
+    length: Length
+    rest: str  # hash of whatever else decides the result: scene, device, code, protocol
+    psnr: float  # dB, mean over the test images; NaN: failed or not measured
+    images: dict[str, float]  # PSNR by test image
+    train_s: float
+    setup_s: float  # features and masks before the first step; short where a cache held them
+    numbers: dict[str, float]  # see NUMBERS, and metrics of one's own; NaN where not measured
+    points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
+    timing: Timing
+    samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
+    kernel_reference_s: float = math.nan
+    scene_hash: str = ""
+    reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
+    error: str = ""
+    blind: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
+
+    @property
+    def base(self) -> str:
+        """The method's own name: an ablation calls its runs method@group-variant."""
+        host, at, part = self.method.partition("@")
+        return host if at and "=" not in part else self.method
+
+
+@dataclass(frozen=True)
+class CostRuns:
+    """Every run below some folders. Times are reference seconds where every finished run was calibrated."""
+
+    runs: tuple[CostRun, ...]
+    notes: tuple[str, ...]  # what could not be read, failed or is not finished
+    reference: bool = False  # times are reference seconds; False: wall seconds
+
+
+def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> CostRuns:
+    """Every run below the folders, each once.
+
+    Args:
+        folders: of `aw bench` or `aw ablate`, or folders of such folders.
+        scenes: only these; empty = all.
+
+    Raises:
+        AwError: no such folder, no finished run, an unknown scene, or one run twice.
+    """
+    runs: list[CostRun] = []
+    notes: list[str] = []
+    for folder in _each_once(folders):
+        path = next((folder / n for n in (RESULT, FAILED) if (folder / n).exists()), None)
+        if path is None:
+            notes.append(f"not finished, left out: {folder}")
+            continue
+        try:
+            runs.append(_run(folder, read_result(path)))
+        except AwError as error:
+            notes.append(f"left out: {error}")
+    known = sorted({run.scene for run in runs})
+    for name in scenes:
+        if name not in known:
+            from ambiguous_wild.core.errors import unknown
+
+            raise unknown("scene", name, known)
+    runs = [run for run in runs if not scenes or run.scene in scenes]
+    if all(math.isnan(run.psnr) for run in runs):
+        raise AwError(
+            "no finished run with a PSNR below "
+            + ", ".join(str(f) for f in folders)
+            + ": 'aw bench --method NAME --scene SCENE -o RUNS' makes one"
+        )
+    _refuse_twice(runs)
+    notes += [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in runs if r.error]
+    reference = _all_calibrated(runs)
+    if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
+        notes.append("wall seconds: some runs were not calibrated, or on another kind of device")
+    return CostRuns(tuple(map(_in_reference, runs) if reference else runs), tuple(notes), reference)
+
+
+def _all_calibrated(runs: Iterable[CostRun]) -> bool:
+    done = [run for run in runs if not run.error]
+    calibrated = all(math.isfinite(run.timing.reference_s) for run in done)
+    return calibrated and len({run.timing.kernel for run in done}) == 1
+
+
+def _in_reference(run: CostRun) -> CostRun:
+    """The run with every time in seconds of the reference machine."""
+    if run.error:
+        return run
+    total = run.timing.reference_s
+    ratio = total / run.train_s if run.train_s > 0.0 else 1.0
+    early = run.kernel_reference_s / run.samples[0][1] if run.samples else ratio
+    walls = [at for at, _ in run.points]
+    if run.samples:
+        times = in_reference_seconds(run.samples, run.kernel_reference_s, walls)
+    else:
+        times = np.array(walls) * ratio
+    points = tuple((float(at), psnr) for at, (_, psnr) in zip(times, run.points))
+    late = run.kernel_reference_s / run.samples[-1][1] if run.samples else ratio
+    per_second = {"ms_per_iteration": ratio, "fps": 1.0 / late if late > 0.0 else math.nan}
+    numbers = {name: value * per_second.get(name, 1.0) for name, value in run.numbers.items()}
+    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points, numbers=numbers)
+
+
+def why_unranked(runs: Iterable[CostRun]) -> str:
+    """Why times of these runs are not ranked: a run that was not alone; empty where they are."""
+    timings = [run.timing for run in runs if not run.error]
+    wrong = [timing for timing in timings if timing.verdict != "alone"]
+    return f"{len(wrong)} of {len(timings)} runs {wrong[0].verdict}: {wrong[0].reason}" if wrong else ""
+
+
+def _each_once(folders: Sequence[Path]) -> list[Path]:
+    """The run folders below; one folder may lie in another that is given too."""
+    found: dict[Path, Path] = {}
+    for root in folders:
+        if not root.is_dir():
+            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+        for folder in run_folders(root):
+            found.setdefault(folder.resolve(), folder)
+    return list(found.values())
+
+
+def _run(folder: Path, result: RunResult) -> CostRun:
+    config = read_config(folder)
+    train, scene = _mapping(config.get("train")), _mapping(config.get("scene"))
+    cost, record = result["cost"], _mapping(result["cost"].get("timing"))
+    images = {row["name"]: _number(row.get("psnr")) for row in result["per_image"]}
+    psnr, train_s = stats.mean(list(images.values())), _number(cost.get("train_s"))
+    effects = config.get("effects") or result["facts"].get("effects") or []
+    rest = {
+        "scene": result["scene_hash"],
+        "factor": scene.get("factor"),
+        "train": {k: v for k, v in train.items() if k not in (*BOOKKEEPING, *SETTINGS)},
+        "device": config.get("device", cost.get("device")),
+        "protocol": config.get("protocol", "full"),
+        "code": [config.get("source"), result["version"]],
+        "images": sorted(images),
+    }
+    points, damage = _points(folder / "timeline.csv", train_s, psnr)
+    unprobed = f"no probes in {folder / 'timeline.csv'}" if len(points) < 2 else ""
+    return CostRun(
+        folder=folder,
+        method=result["method"],
+        scene=result["scene"],
+        seed=result["seed"],
+        asked=_asked(folder) or ", ".join(effects),
+        effects=frozenset(map(str, effects)),
+        options=tuple(sorted((_options(result["options"]) | _settings(train)).items())),
+        length=_length(train, cost),
+        rest=config_hash(rest),
+        psnr=psnr,
+        images=images,
+        train_s=train_s,
+        setup_s=_number(cost.get("setup_s")),
+        numbers={name: _number(cost.get(name)) for name in NUMBERS}
+        | {key: mean_of(result, key) for key in result.get("metrics", {})},
+        points=points,
+        timing=timing_of(cost),
+        samples=tuple((float(at), float(kernel)) for at, kernel in record.get("samples", ())),
+        kernel_reference_s=_number(record.get("kernel_reference_s")),
+        scene_hash=result["scene_hash"],
+        reproduce=str(result.get("reproduce", "")),
+        error=result["error"] or "",
+        blind="" if result["error"] else damage or unprobed,
+    )
+
+
+def _settings(train: Mapping[str, Any]) -> dict[str, Any]:
+    """Resolution and number of Gaussians, where config.yaml has them; "auto" is the method's own."""
+    known = {name: train[name] for name in SETTINGS if name in train}
+    return {name: "auto" if value is None else value for name, value in known.items()}
+
+
+def _length(train: Mapping[str, Any], cost: Cost) -> Length:
+    budget = _number(train.get("budget_s"))
+    if budget > 0.0:
+        return Length(budget, 0)
+    iterations = _number(train.get("iterations", cost.get("iterations")))
+    return Length(0.0, 0 if math.isnan(iterations) else int(iterations))
+
+
+def _asked(folder: Path) -> str:
+    """The word given to --effects (auto, all), or empty: with a word, effects differ between scenes."""
+    try:
+        said = json.loads((folder / "effects.json").read_text(encoding="utf-8")).get("asked", "")
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return ""
+    return said if said in ("auto", "all") else ""
+
+
+def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[tuple[float, float], ...], str]:
+    """The probes of a timeline, with the measured PSNR as the last of them; and what is wrong with it."""
+    points, damage = [], ""
+    try:
+        with open(path, newline="", encoding="utf-8") as f:
+            table = csv.DictReader(f)
+            columns = table.fieldnames or ()
+            if absent := [name for name in ("wall_s", "psnr_probe") if name not in columns]:
+                raise ValueError(f"no column {' and '.join(absent)}")
+            for row in table:
+                at, value = _number(row.get("wall_s")), _number(row.get("psnr_probe"))
+                if math.isfinite(at) and math.isfinite(value):
+                    points.append((at, value))
+    except OSError:  # an external program leaves none
+        points = []
+    except (ValueError, csv.Error) as error:
+        points, damage = [], f"{path} is damaged ({error})"
+    if math.isfinite(train_s) and math.isfinite(psnr):
+        # The timeline rounds to milliseconds; the last probe is the result, measured before it was saved.
+        points = [p for p in points if p[0] < train_s - 0.002] + [(train_s, psnr)]
+    return tuple(sorted(points)), damage
+
+
+def _refuse_twice(runs: Iterable[CostRun]) -> None:
+    seen: dict[tuple[Any, ...], Path] = {}
+    for run in runs:
+        key = (run.method, run.scene, run.seed, run.effects, run.options, run.length, run.rest)
+        if key in seen:
+            raise AwError(
+                f"two runs of {run.method} on {run.scene} with seed {run.seed} and the same settings: "
+                f"{seen[key]} and {run.folder}; leave one of them out"
+            )
+        seen[key] = run.folder
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _number(value: Any) -> float:
+    try:
+        return math.nan if value is None or isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _options(tree: dict[str, Any]) -> dict[str, Any]:
+    """Options by their dotted names; lists as what can be compared and hashed."""
+    return {k: tuple(map(str, v)) if isinstance(v, list) else v for k, v in flatten(tree).items()}

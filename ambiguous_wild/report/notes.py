@@ -1,0 +1,286 @@
+"""Notes below a comparison: missing, failed and unfinished runs, results and times that do not compare."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ambiguous_wild.core.config import flatten
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.store import Runs, read_config
+from ambiguous_wild.methods.graft import members
+from ambiguous_wild.methods.registry import all_methods, knows_truth
+
+LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
+REFERENCE = "reference_s"  # compares machines; other times compare runs of one machine
+
+
+def notes(
+    runs: Runs, columns: Sequence[Measure], methods: Sequence[str], scenes: Sequence[str]
+) -> tuple[str, ...]:
+    """One line a fact, the gravest first."""
+    return (
+        *unequal(runs.runs),
+        *_mixed(runs.runs),
+        *_failed(runs),
+        *_absent(runs, methods, scenes),
+        *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
+        *_not_ranked(runs),
+        *_references(methods),
+        *_fitted(runs),
+        *_missing(runs, columns),
+        *_infinite(runs, columns),
+        *_not_comparable(runs, columns),
+        *_about(runs, methods),
+        *time_notes(runs.runs, columns),
+    )
+
+
+UNEQUAL = "not comparable"  # begins a note that every format shows where it shows ranks
+CONDITIONS = {
+    "effects": "effects",
+    "length": "lengths",
+    "fit": "protocols",
+    "features": "features",
+}
+
+
+def unequal(frame: pd.DataFrame) -> list[str]:
+    """A line for each condition that differs between the methods of a scene, and one for what all share.
+
+    Args:
+        frame: `Runs.runs`.
+    """
+    done = frame[frame["status"] == "ok"]
+    lines = []
+    for column, what in CONDITIONS.items():
+        if column not in done:
+            continue
+        known = done[done[column].astype(str) != ""]  # a method without features is not another condition
+        apart = [scene for scene, of in known.groupby("scene") if of[column].astype(str).nunique() > 1]
+        if apart:
+            rows = known[known["scene"].isin(apart)].groupby("method")[column]
+            each = [f"{method}: {_shared(values)}" for method, values in rows]
+            lines.append(
+                f"{UNEQUAL}: {what} differ on {shortlist(map(str, apart))}: {shortlist(each, limit=12)}; a "
+                "rank may be due to this and not to the method"
+            )
+        elif column == "effects" and len(known):
+            scenes = known.groupby("scene")[column].first()
+            each = [f"{names} ({shortlist(of.index)})" for names, of in scenes.groupby(scenes)]
+            all_of = str(scenes.iloc[0]) if len(each) == 1 else "; ".join(each)
+            lines.append(f"all methods trained with effects: {all_of}")
+    return lines
+
+
+def _mixed(frame: pd.DataFrame) -> list[str]:
+    """A line for each reason to doubt test photos, with the scenes."""
+    rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
+    return [f"{reason} ({shortlist(sorted(set(of['scene'])))})" for reason, of in rows.groupby("test_photos")]
+
+
+def _shared(values: pd.Series) -> str:
+    return " or ".join(dict.fromkeys(map(str, values)))
+
+
+def _failed(runs: Runs) -> list[str]:
+    frame = runs.runs[runs.runs["status"] == "failed"]
+    return [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in frame.itertuples()]
+
+
+def _absent(runs: Runs, methods: Sequence[str], scenes: Sequence[str]) -> list[str]:
+    done = set(zip(runs.runs["method"], runs.runs["scene"]))
+    # methods that lack the same scenes share a line
+    lacking: dict[tuple[str, ...], list[str]] = {}
+    for method in methods:
+        if gone := tuple(scene for scene in scenes if (method, scene) not in done):
+            lacking.setdefault(gone, []).append(method)
+    return [
+        f"no result: {', '.join(names)} on {shortlist(gone)}; no mean over scenes"
+        for gone, names in lacking.items()
+    ]
+
+
+def _not_ranked(runs: Runs) -> list[str]:
+    done = set(zip(runs.runs["method"], runs.runs["scene"]))
+    open_runs = Counter((i.method, i.scene) for i in runs.incomplete)
+    return [
+        f"not ranked: {method} on {scene}: {count} run{'' if count == 1 else 's'} of it incomplete"
+        for (method, scene), count in open_runs.items()
+        if (method, scene) in done
+    ]
+
+
+def _references(methods: Sequence[str]) -> list[str]:
+    known = [method for method in methods if knows_truth(method)]
+    return [f"references, not ranked: {shortlist(known)} (exact masks or clean photos)"] if known else []
+
+
+FITTED = {
+    "fitted": "colours fitted on the left half of each test photo, the right half measured",
+    "read": "colours read from the left half of each test photo, the right half measured",
+    "plain": "nothing fitted, the right half measured",
+    "unknown": "the right half measured; what was fitted is not recorded",
+    "full": "whole test photos measured, nothing fitted",
+}
+
+
+def _fitted(runs: Runs) -> list[str]:
+    """What every method was allowed to see of test photos; nothing where no run was allowed anything."""
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    if "fit" not in ok or not len(ok) or set(ok["fit"]) == {"full"}:
+        return []
+    lines = []
+    for kind, text in FITTED.items():
+        names = sorted(set(ok[ok["fit"] == kind]["method"]))
+        if names:
+            lines.append(f"test photos: {shortlist(names, limit=30)}: {text}")
+    return lines
+
+
+def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
+    """What each method, or donor of a graft, says about itself; `{key}` stands for an option of its runs."""
+    known = all_methods()
+    lines = []
+    for name in dict.fromkeys(member for method in methods for member in members(method)):
+        if name not in known or not known[name].note:
+            continue
+        own = runs.runs[[name in members(method) for method in runs.runs["method"]]]
+        options = [_options_of(Path(folder), name) for folder in own["folder"]]
+        lines.append(f"{name}: {known[name].about(options)}")
+    return lines
+
+
+def _options_of(folder: Path, name: str) -> dict[str, Any]:
+    """The options of that method in a run, flat; those of a graft stand below its places."""
+    config = read_config(folder)
+    options = config.get("options")
+    if not isinstance(options, dict):
+        return {}
+    written = str(config.get("method"))
+    if "=" in written:
+        host, _, rest = written.rpartition("@")
+        places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
+        options = next((options.get(p) for p, member in places.items() if member == name), {})
+    elif "host" in options:  # a graft that is the variant of an ablation: the method is its donor
+        options = next((value for place, value in options.items() if place != "host"), {})
+    return flatten(options) if isinstance(options, dict) else {}
+
+
+def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    """One line a metric and reason; names the runs unless it concerns all of them."""
+    lines = []
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    for column in columns:
+        rows = runs.missing[runs.missing["metric"] == column.key]
+        for reason, group in rows.groupby("reason", sort=False):
+            names = [f"{r.method} on {r.scene}" for r in group.itertuples()]
+            who = "" if len(group) >= len(ok) else f" for {shortlist(dict.fromkeys(names))}"
+            lines.append(f"missing: {column.key}{who}: {reason}")
+        # A null without a reason must not pass in silence.
+        told = set(zip(rows["scene"], rows["method"], rows["seed"]))
+        images = runs.images[runs.images["metric"] == column.key]
+        have = told | set(zip(images["scene"], images["method"], images["seed"]))
+        others = [r for r in ok.itertuples() if (r.scene, r.method, r.seed) not in have]
+        if len(images) and others:
+            who = shortlist(dict.fromkeys(f"{r.method} on {r.scene}" for r in others))
+            lines.append(f"missing: {column.key} for {who}: not measured there; 'aw rescore' adds it")
+        gaps = images[images["value"].isna()]
+        silent = [r for r in gaps.itertuples() if (r.scene, r.method, r.seed) not in told]
+        if silent:
+            names = [f"{r.image} ({r.method} on {r.scene})" for r in silent]
+            lines.append(f"missing: {column.key}, no reason given, for {shortlist(names)}")
+    return lines
+
+
+def _infinite(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    """One line a metric, method and scene of whose mean some values are no part."""
+    rows = runs.images[runs.images["metric"].isin([c.key for c in columns])]
+    lines = []
+    for (metric, method, scene), of in rows.groupby(["metric", "method", "scene"]):
+        finite = int(np.isfinite(of["value"].dropna()).sum())
+        if finite < of["value"].notna().sum():
+            count = f"{finite} of {len(of)} values"
+            lines.append(f"{metric} of {method} on {scene}: mean of {count}, the others are not finite")
+    return lines
+
+
+def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    lines = []
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    for scene, group in ok.groupby("scene"):
+        if group["scene_hash"].nunique() > 1:
+            lines.append(
+                f"{UNEQUAL}: results for {scene} come from {group['scene_hash'].nunique()} versions of "
+                "the scene (scene_hash differs); run them again on one"
+            )
+        images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
+        if len({frozenset(names) for _, names in images}) > 1:
+            lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
+    if "iterations" in ok and not any("lengths differ" in line for line in unequal(ok)):
+        lengths = ok["iterations"].astype(float)
+        longest = lengths[np.isfinite(lengths)].groupby(ok["method"]).max()
+        if len(longest) and longest.max() > LENGTHS_DIFFER * longest.min():
+            each = shortlist((f"{m} {n:.10g}" for m, n in longest.items()), limit=12)
+            lines.append(f"trainings differ in length (iterations): {each}")
+    shows_cost = any(not c.quality for c in columns)
+    if shows_cost and "device" in ok and ok["device"].nunique() > 1:
+        each = shortlist(sorted({f"{m} {d}" for m, d in zip(ok["method"], ok["device"])}), limit=12)
+        lines.append(f"costs were measured on different devices: {each}")
+    if ok["version"].nunique() > 1:
+        lines.append(
+            "results of different versions of ambiguous_wild: " + ", ".join(sorted(set(ok["version"])))
+        )
+    return lines
+
+
+def untimed(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
+    """(method, scene) -> why its times are not ranked: one of its runs was not alone, or not calibrated.
+
+    Args:
+        frame: `Runs.runs`.
+    """
+    done = frame[frame["status"] == "ok"]
+    found: dict[tuple[str, str], str] = {}
+    for row in done[done["timing"] != "alone"].itertuples():
+        found.setdefault((str(row.method), str(row.scene)), f"{row.timing}: {row.timing_reason}")
+    return found
+
+
+def incomparable(frame: pd.DataFrame, columns: Sequence[Measure]) -> frozenset[str]:
+    """Keys of timed columns whose values come from machines, or calibrations, that differ."""
+    alone = frame[(frame["status"] == "ok") & (frame["timing"] == "alone")]
+    differ = {
+        REFERENCE: alone["timing_kernel"].nunique() > 1,
+        "": alone["hardware"].nunique() > 1,
+    }
+    return frozenset(c.key for c in columns if c.timed and differ[REFERENCE if c.key == REFERENCE else ""])
+
+
+def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
+    """One line a reason for times that are not ranked."""
+    if not any(c.timed for c in columns):
+        return []
+    reasons: dict[str, list[str]] = {}
+    for (method, scene), reason in untimed(frame).items():
+        reasons.setdefault(reason, []).append(f"{method} on {scene}")
+    total = len(frame[frame["status"] == "ok"].groupby(["method", "scene"]))
+    lines = [
+        f"times not ranked: {'all' if len(who) == total else shortlist(who)} ({reason})"
+        for reason, who in reasons.items()
+    ]
+    unranked = incomparable(frame, columns)
+    if unranked - {REFERENCE}:
+        machines = sorted(set(frame[frame["timing"] == "alone"]["hardware"]))
+        lines.append(
+            f"times of different machines, ranked by reference seconds alone: {shortlist(machines, 4)}"
+        )
+    if REFERENCE in unranked:
+        lines.append("reference seconds of CPU and GPU are not ranked against each other")
+    return lines

@@ -1,0 +1,325 @@
+"""Comparisons side by side: the papers' tables, means over datasets, memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, Number, read_tables
+from ambiguous_wild.report.comparison import comparison
+from ambiguous_wild.report.table import BLANK, Cell, Column, Row, Table
+
+PER_TABLE = 6  # scenes side by side, as the papers have it
+LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
+MEMORY = ("model_mb",)
+
+
+def in_blocks(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> list[Table]:
+    """Tables of `comparison`, a table a scene, with the cells marked that do not differ from the best."""
+    tables = comparison(runs, metrics=metrics, scenes=scenes)
+    return Ties(runs).marked(tables, [table.title for table in tables if table.columns[0].scene])
+
+
+def paper(
+    runs: Runs,
+    *,
+    metrics: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    datasets: Mapping[str, Sequence[str]] | None = None,
+    per_table: int = PER_TABLE,
+    subject: str = "",
+) -> list[Table]:
+    """Scenes side by side, PSNR / SSIM / LPIPS under each, the mean last.
+
+    Args:
+        runs: from `store.read_runs`.
+        metrics: columns under each scene; empty = PSNR, SSIM and the LPIPS that was measured.
+        scenes: only these; empty = all.
+        datasets: scenes by dataset: each has tables and a mean of its own; what is in none comes last.
+        per_table: more scenes than this go into several tables; the mean stands in the last.
+        subject: what the tables are of, where the columns do not say it.
+
+    Raises:
+        AwError: unknown metric, scene, or a scene in two datasets.
+    """
+    ties, made, begin = Ties(runs), [], f"{subject}, " if subject else ""
+    for name, members in divided(runs, scenes, datasets or {}).items():
+        tables = comparison(
+            runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
+        )
+        tables = ties.marked(tables, members)
+        by_scene, mean = (tables[1:], tables[:1]) if len(members) > 1 else (tables, [])
+        title = begin + (name or (f"{len(members)} scenes" if mean else tables[0].title))
+        chunks = [by_scene[i : i + per_table] for i in range(0, len(by_scene), per_table)]
+        for number, chunk in enumerate(chunks, start=1):
+            part = f" ({number} of {len(chunks)})" if len(chunks) > 1 else ""
+            shown = [(table.title, table) for table in chunk]
+            shown += [("Mean", table) for table in mean if number == len(chunks)]
+            made.append(side_by_side(title + part, shown, dataset=name).with_notes(*tables[-1].notes))
+    return made
+
+
+def means(
+    runs: Runs,
+    *,
+    metrics: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    datasets: Mapping[str, Sequence[str]] | None = None,
+) -> list[Table]:
+    """One table: the mean over each dataset's scenes side by side; arguments as for `paper`."""
+    ties = Ties(runs)
+    parts: list[Table] = []
+    notes: dict[str, None] = {}
+    for name, members in divided(runs, scenes, datasets or {}).items():
+        tables = comparison(
+            runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
+        )
+        heading = f"{name or ('other scenes' if parts else 'all scenes')} ({len(members)})"
+        (mean,) = ties.marked(tables[:1], members)
+        part = side_by_side("", [(heading, mean)], dataset=name)
+        parts.append(replace(part, columns=tuple(replace(column, scene="") for column in part.columns)))
+        notes |= dict.fromkeys(tables[-1].notes)
+    methods = sorted({row.name for part in parts for row in part.rows})
+    rows = [Row(m, tuple(cell for part in parts for cell in _cells(part, m))) for m in methods]
+    columns = tuple(column for part in parts for column in part.columns)
+    return [Table("means over scenes, by dataset (number of scenes)", columns, tuple(rows), tuple(notes))]
+
+
+def side_by_side(title: str, tables: Sequence[tuple[str, Table]], *, dataset: str = "") -> Table:
+    """One table of tables with the same rows.
+
+    Args:
+        title: of the table.
+        tables: (heading of its columns, table), from the left; their notes are left out.
+        dataset: that the scenes belong to.
+    """
+    shown, rows = [], []
+    for number, (group, table) in enumerate(tables, start=1):
+        # words about a row stand once, at its end
+        own = [i for i, c in enumerate(table.columns) if not c.words or number == len(tables)]
+        shown.append((group, table.picked(own)))
+    tables = shown
+    columns = [
+        replace(c, group="" if c.words else group, dataset=dataset)
+        for group, table in tables
+        for c in table.columns
+    ]
+    for same in zip(*(table.rows for _, table in tables)):
+        note = next((row.note for row in same if row.note), "")
+        rows.append(Row(same[0].name, tuple(cell for row in same for cell in row.cells), note=note))
+    return Table(title, tuple(columns), tuple(rows))
+
+
+def cost_at_the_end(tables: Sequence[Table]) -> Table:
+    """Tables of `comparison` as one without a title: quality scene by scene, the mean last, then cost."""
+    ordered = [*tables[1:], tables[0]] if len(tables) > 1 else list(tables)
+    numbers = range(len(tables[0].columns))
+    quality = [i for i in numbers if tables[0].columns[i].measure.quality]
+    cost = [i for i in numbers if i not in quality]
+    shown = [(table.title, table.picked(quality)) for table in ordered if quality]
+    if cost:
+        shown.append(("cost" if quality else ordered[-1].title, ordered[-1].picked(cost)))
+    return side_by_side("", shown).with_notes(*tables[-1].notes)
+
+
+def divided(
+    runs: Runs, scenes: Sequence[str], datasets: Mapping[str, Sequence[str]]
+) -> dict[str, tuple[str, ...]]:
+    """The scenes by dataset, in the order given; those of none under "".
+
+    Raises:
+        AwError: an unknown scene, or one in two datasets.
+    """
+    known = sorted(set(runs.runs["scene"]) | {i.scene for i in runs.incomplete})
+    for name in [*scenes, *(s for members in datasets.values() for s in members)]:
+        if name not in known:
+            raise unknown("scene", name, known)
+    wanted = list(dict.fromkeys(scenes)) or sorted(set(runs.runs["scene"]))
+    of: dict[str, str] = {}
+    for dataset, members in datasets.items():
+        for scene in members:
+            if of.setdefault(scene, dataset) != dataset:
+                raise AwError(
+                    f"scene {scene!r} is in two datasets, {of[scene]!r} and {dataset!r}: leave one out"
+                )
+    found = {name: tuple(s for s in wanted if of.get(s, "") == name) for name in [*datasets, ""]}
+    return {name: members for name, members in found.items() if members}
+
+
+def quality_columns(runs: Runs) -> tuple[str, ...]:
+    """PSNR, SSIM and the first LPIPS that was measured; without any, the one that says why it is missing."""
+    measured = set(runs.images.dropna(subset=["value"])["metric"])
+    present = measured | set(runs.images["metric"])
+    lpips = next((k for k in LPIPS if k in measured), next((k for k in LPIPS if k in present), ""))
+    return ("psnr", "ssim", *([lpips] if lpips else []))
+
+
+def _cells(part: Table, method: str) -> tuple[Cell, ...]:
+    found = [row.cells for row in part.rows if row.name == method]
+    return found[0] if found else tuple(Cell(state="absent") for _ in part.columns)
+
+
+LEVEL = 0.95
+RESAMPLES = 2000
+LEAST = 6  # images: five differences all have the same sign by chance once in 16
+
+
+def difference_interval(
+    differences: Sequence[np.ndarray],  # one a scene: [n], a method less another on the same images
+    *,
+    level: float = LEVEL,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean over scenes of the mean over images.
+
+    Images are drawn within their scene. NaN where a value is missing or a scene has fewer than two images.
+    """
+    if not differences or any(len(d) < 2 or not np.isfinite(d).all() for d in differences):
+        return math.nan, math.nan
+    rng = np.random.default_rng(seed)
+    total = np.zeros(resamples)
+    for values in differences:
+        total += values[rng.integers(0, len(values), size=(resamples, len(values)))].mean(axis=1)
+    means, tail = np.sort(total / len(differences)), (1.0 - level) / 2.0
+    return (
+        float(means[math.floor(tail * (resamples - 1))]),
+        float(means[math.ceil((1.0 - tail) * (resamples - 1))]),
+    )
+
+
+class Ties:
+    """Methods that do not differ significantly from the best: a paired bootstrap over the test images.
+
+    The same pictures are drawn for both methods, scene by scene, so that a hard picture affects both alike.
+    Seeds are averaged before; no correction is made for the number of methods that are compared.
+    """
+
+    def __init__(self, runs: Runs) -> None:
+        self._rows = dict(iter(runs.images.groupby(["scene", "metric"])))
+        self._values: dict[tuple[str, str], pd.DataFrame] = {}
+
+    def values(self, scene: str, metric: str) -> pd.DataFrame:
+        """A row an image, a column a method: means over seeds, NaN where a seed has none."""
+        key = (scene, metric)
+        if key not in self._values:
+            if key not in self._rows:
+                return pd.DataFrame()
+            cells = self._rows[key].groupby(["image", "method"])["value"].agg(["mean", "count", "size"])
+            means = cells["mean"].where(cells["count"] == cells["size"])
+            self._values[key] = means.unstack("method")
+        return self._values[key]
+
+    def marked(self, tables: Sequence[Table], scenes: Sequence[str]) -> list[Table]:
+        """Tables of `comparison` with the cells marked that do not differ from the best of their column.
+
+        `scenes`: that a mean is over.
+        """
+        return [
+            replace(table, rows=tuple(self._marked(row, table, scenes) for row in table.rows))
+            for table in tables
+        ]
+
+    def _marked(self, row: Row, table: Table, scenes: Sequence[str]) -> Row:
+        cells = []
+        for i, (column, cell) in enumerate(zip(table.columns, row.cells)):
+            best = [other.name for other in table.rows if other.cells[i].rank == 1]
+            of = (column.scene,) if column.scene else scenes
+            tie = (
+                row.ranked and cell.state == "ok" and column.measure.per_image
+                and bool(best) and row.name not in best
+                and self.tied(best[0], row.name, of, column.measure.key)
+            )  # fmt: skip
+            cells.append(replace(cell, tie=tie))
+        return replace(row, cells=tuple(cells))
+
+    def tied(self, best: str, other: str, scenes: Sequence[str], metric: str) -> bool:
+        """Whether the interval of their difference holds zero, or it is of too few images to tell; False
+        where it is not known."""
+        differences = []
+        for scene in scenes:
+            values = self.values(scene, metric)
+            if best not in values or other not in values:
+                return False
+            a, b = values[best].to_numpy(float), values[other].to_numpy(float)
+            finite = ~(np.isinf(a) | np.isinf(b))  # what enters no mean decides no difference of means
+            differences.append((a - b)[finite])
+        low, high = difference_interval(differences)
+        few = sum(map(len, differences)) < LEAST and not math.isnan(low)
+        return few or low <= 0.0 <= high
+
+
+FAMILIES = ("psnr", "ssim", "lpips")
+NAMES = {"model_mb": "memory"}  # a measure -> how papers call it
+
+
+def read_reported(folder: Path | None = None) -> list[Number]:
+    """The transcribed tables.
+
+    Raises:
+        AwError: there are none, or one cannot be read.
+    """
+    folder = folder or REPORTED
+    if not folder.exists():
+        raise AwError(f"no reported numbers in {folder}: say where they are with --reported-from")
+    return read_tables([folder])
+
+
+def datasets_of(numbers: Sequence[Number], scenes: Sequence[str]) -> dict[str, list[str]]:
+    """Our scenes by the dataset that a reported table has a scene of this name in."""
+    of = {_plain(n.scene): n.dataset for n in numbers if n.known}
+    found: dict[str, list[str]] = {}
+    for scene in scenes:
+        if _plain(scene) in of:
+            found.setdefault(of[_plain(scene)], []).append(scene)
+    return found
+
+
+def with_reported(table: Table, numbers: Sequence[Number]) -> Table:
+    """The table with a row for every method that some paper reports on what it shows.
+
+    Only methods as published: a row of an ablation has no place here. Where tables contradict each other,
+    all their values are shown. A paper's mean over a dataset stands under ours, over the same scenes or not.
+
+    Args:
+        table: a table of `papers`.
+        numbers: from `read_reported`.
+    """
+    texts: dict[tuple[str, str, str], dict[str, list[str]]] = {}  # (method, scene, metric) -> by dataset
+    for n in numbers:
+        if n.known and not n.setting:
+            texts.setdefault((n.method, _plain(n.scene), n.metric), {}).setdefault(n.dataset, []).append(
+                n.text
+            )
+    rows = []
+    for method in dict.fromkeys(key[0] for key in texts):
+        cells = tuple(_cell(texts, method, column) for column in table.columns)
+        if any(cell.printed for cell in cells):
+            rows.append(Row(method, cells, kind="reported"))
+    if not rows:
+        return table.with_notes("reported: no table has these scenes")
+    return replace(table, rows=(*table.rows, *rows))
+
+
+def _cell(texts: Mapping[tuple[str, str, str], Mapping[str, list[str]]], method: str, column: Column) -> Cell:
+    family = column.measure.key.partition("_")[0]
+    metric = NAMES.get(column.measure.key, family if family in FAMILIES else "")
+    by_dataset = texts.get((method, _plain(column.scene or MEAN), metric), {})
+    if column.dataset:
+        found = by_dataset.get(column.dataset, [])
+    else:  # a scene is told by its name alone, a mean is not
+        found = [text for of in by_dataset.values() for text in of] if column.scene else []
+    return Cell(printed=" / ".join(dict.fromkeys(found))) if found else BLANK
+
+
+def _plain(name: str) -> str:
+    """A scene's name without what its spellings differ in."""
+    return "".join(c for c in name.casefold() if c.isalnum())

@@ -1,0 +1,368 @@
+"""Tables for a terminal, as Markdown and as CSV.
+
+Names of methods and scenes come from others' files: in every format they stay text. Control characters
+and invisible direction marks are written out, so that a name cannot steer a terminal either.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.harness.measures import MEASURES, Measure
+from ambiguous_wild.report.table import ARROWS, TIE, Cell, Column, Row, Table
+
+RANKS = "(1) (2) (3): first, second and third in the column"
+COLORS = {1: "green", 2: "cyan", 3: "yellow"}  # of the terminal
+
+
+def plain(text: str) -> str:
+    """The text on one line, with control and format characters written as escapes."""
+    hidden = ("Cc", "Cf", "Zl", "Zp", "Cs")
+    return "".join(
+        c.encode("unicode_escape").decode() if unicodedata.category(c) in hidden else c for c in str(text)
+    )
+
+
+def display_width(text: str) -> int:
+    """Columns of a terminal: wide characters take two, combining ones none."""
+    wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
+    return len(text) + wide - sum(unicodedata.combining(c) > 0 for c in text)
+
+
+def marked(cell: Cell, measure: Measure) -> str:
+    """The cell with its rank and whether it is told apart from the best."""
+    text = plain(cell.text(measure))
+    return text + (f" ({cell.rank})" if cell.rank else "") + (f" {TIE}" if cell.tie else "")
+
+
+def row_name(row: Row) -> str:
+    """What stands in front of a row of text."""
+    return plain(f"  {row.name}" if row.kind == "reported" else row.name)
+
+
+def to_text(tables: Sequence[Table], *, color: bool = False) -> str:
+    """Aligned for a terminal; with `color`, the three best are coloured."""
+    parts = []
+    for table, below in _with_below(tables):
+        parts += [plain(table.title), *_aligned(table, color), ""]
+        parts += [*map(plain, below), ""] if below else []
+    return "\n".join(parts).rstrip("\n") + "\n"
+
+
+def _with_below(tables: Sequence[Table]) -> Iterator[tuple[Table, list[str]]]:
+    """Every table with the lines below it: what its marks mean, and notes."""
+    before: list[Table] = []
+    for table in tables:
+        before.append(table)
+        if table.continued:
+            yield table, []
+            continue
+        ranks = [RANKS] if any(cell.rank for one in before for cell in one.cells) else []
+        legend = dict.fromkeys(line for one in before for line in one.legend)
+        yield table, [*ranks, *legend, *(note for one in before for note in one.notes)]
+        before = []
+
+
+def _aligned(table: Table, color: bool) -> list[str]:
+    head = [table.head, *(plain(column.label) for column in table.columns)]
+    body = [
+        [row_name(row), *(marked(e, c.measure) for c, e in zip(table.columns, row.cells))]
+        for row in table.rows
+    ]
+    widths = [max(display_width(line[i]) for line in [head, *body]) for i in range(len(head))]
+    top, at = [" " * widths[0]], 1
+    for title, count in table.groups:
+        room = sum(widths[at : at + count]) + 2 * (count - 1)
+        name = plain(title)
+        if display_width(name) > room:  # a long name makes room for itself
+            widths[at] += display_width(name) - room
+            room = display_width(name)
+        top.append(name + " " * (room - display_width(name)))
+        at += count
+    lines = ["  ".join(top).rstrip()] if any(title for title, _ in table.groups) else []
+    lines += [_text_row(head, widths), "  ".join("─" * w for w in widths)]
+    before = "measured"
+    for row, cells in zip(table.rows, body):
+        lines += ["reported:"] if row.kind != before else []
+        before = row.kind
+        lines.append(_text_row(cells, widths, [cell.rank for cell in row.cells] if color else None))
+    return lines
+
+
+def _text_row(cells: Sequence[str], widths: Sequence[int], ranks: Sequence[int | None] | None = None) -> str:
+    out = [cells[0] + " " * (widths[0] - display_width(cells[0]))]
+    for i, (cell, width) in enumerate(zip(cells[1:], widths[1:])):
+        gap = " " * (width - display_width(cell))
+        if ranks is not None and ranks[i]:
+            import click
+
+            cell = click.style(cell, fg=COLORS[ranks[i] or 1], bold=ranks[i] == 1)
+        out.append(gap + cell)
+    return "  ".join(out).rstrip()
+
+
+def to_markdown(tables: Sequence[Table]) -> str:
+    """GitHub tables; the best of a column is bold, the three best are numbered."""
+    parts = []
+    for table, below in _with_below(tables):
+        parts += [f"**{markdown_text(table.title)}**", ""] if table.title else []
+        head = [
+            f"{markdown_text(c.group)} {c.measure.label} {ARROWS[c.measure.better]}".strip()
+            for c in table.columns
+        ]
+        parts.append(_markdown_row([table.head, *head]))
+        parts.append("|---|" + "".join("---|" if c.words else "---:|" for c in table.columns))
+        for row in table.rows:
+            name = markdown_text(row.name) + (" (reported)" if row.kind == "reported" else "")
+            cells = [_markdown(cell, column) for column, cell in zip(table.columns, row.cells)]
+            parts.append(_markdown_row([name, *cells]))
+        parts += ["", *(f"- {markdown_text(text)}" for text in below), *([""] if below else [])]
+    return "\n".join(parts).rstrip("\n") + "\n"
+
+
+def markdown_text(text: str) -> str:
+    """Escaped for a GitHub table: neither HTML, nor a link, nor a new column."""
+    text = plain(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    text = re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", text)
+    # A scheme makes a link without any bracket.
+    return re.sub(r"(?i)\b(https?|ftp|www)(:|\.)", r"\1&#8203;\2", text)
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _markdown(cell: Cell, column: Column) -> str:
+    if cell.markdown:
+        return cell.markdown.replace("|", "\\|")
+    text = _markdown_cell(marked(cell, column.measure))
+    if cell.rank != 1:
+        return text
+    value, _, mark = text.rpartition(" (")
+    return f"**{value}** ({mark}"
+
+
+def _markdown_cell(text: str) -> str:
+    """Numbers and intervals unchanged; everything else escaped."""
+    return text if re.fullmatch(r"[-\d.,%\[\]{}— ]*", text) else markdown_text(text)
+
+
+def csv_text(text: str) -> str:
+    """A cell that a spreadsheet takes for text: a leading formula character gets an apostrophe."""
+    text = plain(text) if not str(text).startswith("\t") else "'" + plain(text)
+    return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") else text
+
+
+def exact(value: float) -> str:
+    """Digits that read back as the same number: 3.0 for 3.0."""
+    return repr(float(value))
+
+
+def shortest(value: float) -> str:
+    """The fewest digits that read back as the same number: 3 for 3.0."""
+    whole = math.isfinite(value) and value == int(value) and abs(value) < 2**53
+    return str(int(value)) if whole else exact(value)
+
+
+def to_csv(
+    head: Sequence[str],
+    rows: Iterable[Iterable[Any]],
+    *,
+    text: Callable[[str], str] = csv_text,
+    number: Callable[[float], str] = exact,
+) -> str:
+    """CSV of texts, numbers, yes and no; None and NaN are empty cells, so that what is missing is no number.
+
+    Args:
+        head: names of the columns.
+        rows: one value a column.
+        text: guards a text against spreadsheets that calculate it.
+        number: writes a float.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([text(name) for name in head])
+    for row in rows:
+        writer.writerow([_csv_cell(value, text, number) for value in row])
+    return out.getvalue()
+
+
+def _csv_cell(value: Any, text: Callable[[str], str], number: Callable[[float], str]) -> str:
+    if value is None or value == "":
+        return ""
+    if isinstance(value, str):
+        return text(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return "" if math.isnan(value) else number(value)
+    return str(value)
+
+
+def read_csv(
+    path: Path, required: Sequence[str], most_bytes: int, advice: str
+) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Columns, and (line, cells by column) of each row; cells as they stand.
+
+    Args:
+        path: the file.
+        required: columns that it must have.
+        most_bytes: a larger file is not read.
+        advice: ends an error.
+
+    Raises:
+        AwError: unreadable, malformed, or without a column that must be there.
+    """
+    try:
+        if path.stat().st_size > most_bytes:
+            raise AwError(f"{path} is larger than {most_bytes // 1_000_000} MB; {advice}")
+        with open(path, newline="", encoding="utf-8-sig") as f:
+            reader = csv.reader(f, strict=True)
+            head = next(reader, [])
+            rows = [(reader.line_num, cells) for cells in reader if cells]
+    except UnicodeDecodeError:
+        raise AwError(f"{path} is no text in UTF-8: save it as CSV in UTF-8; {advice}") from None
+    except csv.Error as error:
+        raise AwError(f"{path} is malformed CSV ({error}); {advice}") from None
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror}") from None
+    missing = [column for column in required if column not in head]
+    named = [column for column in head if column]  # spreadsheets write empty ones at the end
+    if missing or len(set(named)) != len(named):
+        what = f"lacks the column {shortlist(missing)}" if missing else "names a column twice"
+        raise AwError(f"{path} {what}; {advice}")
+    for line, cells in rows:
+        if len(cells) != len(head):
+            raise AwError(f"{path} line {line} has too few or too many cells; {advice}")
+    return head, [(line, dict(zip(head, cells))) for line, cells in rows]
+
+
+LONG_HEAD = ("table", "kind", "method", "dataset", "column", "scene", "metric", "value", "std", "rank",
+             "not_significant", "status", "printed")  # fmt: skip
+
+
+def to_long_csv(tables: Sequence[Table]) -> str:
+    """One number a row. What was measured has a value, what a paper prints is under `printed` alone."""
+    rows = (
+        (
+            table.title, row.kind, row.name, column.dataset, column.group, column.scene, column.measure.key,
+            cell.value, cell.spread, cell.rank, "yes" if cell.tie else "",
+            "" if cell.printed else cell.state, cell.printed,
+        )
+        for table in tables
+        for row in table.rows
+        for column, cell in zip(table.columns, row.cells)
+        if cell.state != "blank"
+    )  # fmt: skip
+    return to_csv(LONG_HEAD, rows)
+
+
+def to_wide_csv(tables: Sequence[Table]) -> str:
+    """One row a scene and method; the mean has an empty scene. The tables have the same columns.
+
+    For every column: the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 %
+    bootstrap interval over the test images of one scene, and `_tied`, yes where not told from the best.
+    """
+    head = ["scene", "method", "status", "runs"]
+    for column in tables[0].columns:
+        key = column.measure.key
+        head += [key] if column.words else [key, f"{key}_std"]
+        head += [f"{key}_low", f"{key}_high", f"{key}_tied"] if column.measure.per_image else []
+    rows = (
+        [table.columns[0].scene, row.name, _status(row), row.runs, *_wide_values(table, row)]
+        for table in tables
+        for row in table.rows
+    )
+    return to_csv(head, rows, number=shortest)
+
+
+def _wide_values(table: Table, row: Row) -> Iterator[float | str]:
+    for column, cell in zip(table.columns, row.cells):
+        yield from (cell.printed,) if column.words else (cell.value, cell.spread)
+        yield from (cell.low, cell.high, "yes" if cell.tie else "") if column.measure.per_image else ()
+
+
+def _status(row: Row) -> str:
+    states = {cell.state for cell in row.cells}
+    return next((s for s in ("failed", "absent", "ok") if s in states), "missing")
+
+
+WIDTH = 100
+# What is shown first; what is not listed comes after, in the order of the table.
+FIRST = (
+    "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
+    "flip", "fps", "model_mb",
+)  # fmt: skip
+
+
+def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
+    """Tables of the same columns with the most important ones that fit, in their order.
+
+    A note below the last table names the others. At least one column is kept, however long the names are.
+    """
+    columns = tables[0].columns
+    names = [tables[0].head, *(row_name(row) for table in tables for row in table.rows)]  # with their head
+    left = width - max(map(display_width, names))
+    order = sorted(range(len(columns)), key=lambda i: (_importance(columns[i].measure), i))
+    kept: list[int] = []
+    for i in order:
+        need = max(_column_width(table, i) for table in tables)
+        if kept and need > left:
+            continue
+        kept.append(i)
+        left -= need
+    out = [column.measure.label for i, column in enumerate(columns) if i not in kept]
+    if not out:
+        return list(tables)
+    shown = [table.picked(sorted(kept)) for table in tables]
+    note = f"not shown, to fit {width} columns: {', '.join(out)}; --all shows them"
+    return [*shown[:-1], shown[-1].with_notes(note)]
+
+
+def _importance(column: Measure) -> int:
+    if column.per_image and column.key not in MEASURES:
+        return 0  # who measures by a metric of their own wants to see it
+    return FIRST.index(column.key) if column.key in FIRST else len(FIRST)
+
+
+def divided(table: Table, width: int = WIDTH) -> list[Table]:
+    """The table as tables that fit: columns of one heading stay together where they can."""
+    room = width - max(map(display_width, [table.head, *map(row_name, table.rows)]))
+    parts: list[list[int]] = [[]]
+    left, at = room, 0
+    for title, count in table.groups:
+        group = list(range(at, at + count))
+        at += count
+        needs = [_column_width(table, i) for i in group]
+        needs[0] += max(0, display_width(plain(title)) + 2 - sum(needs))
+        if parts[-1] and sum(needs) > left:
+            parts.append([])
+            left = room
+        for i, need in zip(group, needs):
+            if parts[-1] and need > left:
+                parts.append([])
+                left = room
+            parts[-1].append(i)
+            left -= need
+    return [_part(table, columns, k, len(parts)) for k, columns in enumerate(parts)]
+
+
+def _part(table: Table, columns: list[int], k: int, count: int) -> Table:
+    """Notes stand below the last part."""
+    title = f"{table.title}, part {k + 1} of {count}" if count > 1 else table.title
+    return replace(table.picked(columns), title=title, notes=table.notes if k == count - 1 else ())
+
+
+def _column_width(table: Table, i: int) -> int:
+    column = table.columns[i]
+    cells = [marked(row.cells[i], column.measure) for row in table.rows]
+    return 2 + max(display_width(text) for text in (column.label, *cells))

@@ -1,0 +1,147 @@
+"""Metrics that were missing when a run ended, computed from its saved pictures; nothing is trained.
+
+Before anything is added, every number of the result is computed again from renders and photos. Where one
+differs, a file was changed since, and the run is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from ambiguous_wild import __version__
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.cell import code_hash, config_identity, refuse_other_scene, scene_identity
+from ambiguous_wild.harness.evaluate import kernel_threads
+from ambiguous_wild.harness.measures import ImageRow, Metric, measure_images, metrics, records
+from ambiguous_wild.harness.result_file import (
+    RESULT,
+    RunResult,
+    metrics_of,
+    read_result,
+    write_result,
+)
+from ambiguous_wild.harness.store import lacks, read_config, run_folders
+from ambiguous_wild.io.files import folder_lock
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.report.board_verify import check_photos, renders_of
+
+Outcome = Literal["rescored", "complete", "unfinished", "refused"]
+
+
+@dataclass(frozen=True)
+class Rescored:
+    """What became of one run."""
+
+    run: Path
+    outcome: Outcome
+    added: tuple[str, ...] = ()  # metrics
+    missing: tuple[str, ...] = ()  # that are still missing
+    error: str = ""
+
+
+def rescore(
+    folders: Sequence[Path],
+    *,
+    scene: Path | None = None,
+    tick: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Rescored]:
+    """Add what can be measured now to every run below the folders.
+
+    Args:
+        folders: of `aw bench`, or folders of such folders.
+        scene: where the scene lies now; None = where each run says.
+        tick: told (runs done, runs) after each.
+
+    Raises:
+        AwError: no such folder, or no run in it.
+    """
+    runs: dict[Path, Path] = {}
+    for root in folders:
+        if not root.is_dir():
+            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+        runs |= {run.resolve(): run for run in run_folders(root)}
+    if not runs:
+        raise AwError(f"no run in {', '.join(map(str, folders))}: 'aw bench -o' makes one")
+    found, scenes = [], _Scenes(scene)
+    for done, run in enumerate(runs.values(), 1):
+        try:
+            found.append(_rescore(run, scenes))
+        except AwError as error:
+            found.append(Rescored(run, "refused", error=str(error)))
+        tick(done, len(runs))
+    return found
+
+
+class _Scenes:
+    """Scenes that were opened."""
+
+    def __init__(self, given: Path | None) -> None:
+        self.given = given
+        self._open: dict[tuple[str, int | None], tuple[Scene, str]] = {}
+
+    def find(self, run: Path, result: RunResult, settings: object) -> Scene:
+        """The run's scene, as it was when it was measured."""
+        known = settings if isinstance(settings, dict) else {}
+        path, factor = str(self.given or known.get("path") or ""), known.get("factor")
+        if not path or not Path(path).is_dir():
+            raise AwError(
+                f"{run}: its scene {path or 'is not named in config.yaml'} is not there: name it with --scene"
+            )
+        key = path, factor if isinstance(factor, int) else None
+        if key not in self._open:
+            scene = load_scene(path, factor=key[1])
+            self._open[key] = scene, scene_identity(scene)
+        scene, identity = self._open[key]
+        refuse_other_scene(run, Path(path), identity, result["scene_hash"])
+        return scene
+
+
+def _rescore(run: Path, scenes: _Scenes) -> Rescored:
+    with folder_lock(run, "aw rescore"):
+        if not (run / RESULT).is_file():
+            return Rescored(run, "unfinished", error=f"no {RESULT}: failed, running or stopped")
+        result, config = read_result(run / RESULT), read_config(run)
+        try:
+            identity = config_identity(config)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            identity = ""
+        if identity != result["config_hash"]:
+            raise AwError(f"{run}: config.yaml is absent, or not that of {RESULT}; restore both files")
+        if not result["per_image"]:
+            return Rescored(run, "complete", missing=tuple(sorted(result["missing"])))
+        half = config.get("protocol", "full") == "half"
+        scene = scenes.find(run, result, config.get("scene"))
+        renders = renders_of(run, result)
+        if gone := shortlist(path.name for path in renders.values() if not path.is_file()):
+            raise AwError(f"{run} lacks its renders {gone}: restore them, or run it again")
+        wanted = [metric for key, metric in metrics().items() if lacks(result, key)]
+        for row in result["per_image"]:
+            for metric in wanted:
+                cast(dict[str, Any], row).pop(metric.key, None)  # of another state of its file
+        check_photos(run, scene, result["per_image"], renders, half=half)
+        added = _add(result, scene, wanted, renders, half=half)
+        missing = tuple(sorted(result["missing"]))
+        if not added:
+            return Rescored(run, "complete", missing=missing)
+        record = {"metrics": list(added), "version": __version__, "code_hash": code_hash()}
+        write_result(run / RESULT, {**result, "rescored": [*result.get("rescored", []), record]})
+    return Rescored(run, "rescored", added, missing)
+
+
+def _add(
+    result: RunResult, scene: Scene, wanted: Sequence[Metric], renders: dict[str, Path], *, half: bool
+) -> tuple[str, ...]:
+    """Put the metrics that the result lacks into it; those that no image has a value of stay missing."""
+    photos = {view.name: view.image_path for view in scene.test}
+    pictures = ((name, read_png_rgb(path), read_png_rgb(photos[name])) for name, path in renders.items())
+    rows, missing = measure_images(pictures, wanted, scene, half=half, around=kernel_threads)
+    result["per_image"] = [cast(ImageRow, {**old, **new}) for old, new in zip(result["per_image"], rows)]
+    added = {key for row in rows for key in metrics_of(row)}
+    result["missing"] = {key: why for key, why in (result["missing"] | missing).items() if key not in added}
+    result["metrics"] = {**result.get("metrics", {}), **records(added)}
+    return tuple(sorted(added))

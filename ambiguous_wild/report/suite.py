@@ -1,0 +1,154 @@
+"""A whole published table: import a suite's scenes, choose methods, print beside the reported numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.datasets.foreign import plain
+from ambiguous_wild.datasets.suites import Suite, find_scenes, scene_id
+
+if TYPE_CHECKING:
+    from ambiguous_wild.report.table import Table
+
+SCENES = ".scenes"  # below the runs: imported scenes
+
+
+@dataclass(frozen=True)
+class PreparedSuite:
+    """Scene folders that are ready to train."""
+
+    suite: Suite
+    scenes: dict[str, Path]  # name in runs -> folder
+    absent: tuple[str, ...]  # scenes of the table that are not there
+
+
+def prepare_suite(
+    suite: Suite,
+    root: Path,
+    output: Path,
+    *,
+    jobs: int | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> PreparedSuite:
+    """Find and import the suite's scenes.
+
+    Args:
+        suite: of `datasets.suites`.
+        root: folder with a folder a scene, in any layout that `aw import` reads, or as scene folders.
+        output: of the runs; imported scenes lie below it.
+        jobs: threads.
+        say: told what is done.
+
+    Raises:
+        AwError: no scene there, or one that cannot be imported or is another scene than its folder says.
+    """
+    found, absent = find_scenes(suite, root)
+    if absent:
+        count = f"{len(absent)} of {len(suite.scenes)} scenes"
+        say(f"{suite.name}: {count} are not in {root}: {shortlist(absent, 20)}")
+    ready = {}
+    for scene, folder in found.items():
+        name = scene_id(scene)
+        ready[name] = _ready(suite, name, folder, output / SCENES / name, jobs, say)
+    return PreparedSuite(suite, ready, tuple(absent))
+
+
+def _ready(
+    suite: Suite, name: str, folder: Path, target: Path, jobs: int | None, say: Callable[[str], None]
+) -> Path:
+    from ambiguous_wild.datasets.write import ImportSettings, import_scene
+    from ambiguous_wild.io.scene_folder import read_scene_json
+
+    info = read_scene_json(folder)
+    if info is not None:
+        called = str(info.get("name", folder.name))
+        if plain(called) != plain(name):
+            raise AwError(
+                f"{folder} is the scene {called!r} by its scene.json, not {name!r}: runs and tables "
+                "would name it "
+                "wrongly; rename the folder, or import it again with --name"
+            )
+        if suite.factor and info["factor"] != suite.factor:
+            say(
+                f"warning: {folder} has factor {info['factor']}; {suite.dataset} is measured at "
+                f"{suite.factor}"
+            )
+        return folder
+    settings = ImportSettings(
+        factor=suite.factor or None, name=name, dataset=suite.dataset, license=suite.license
+    )
+    done = import_scene(folder, target, settings, jobs=jobs)
+    if not done.up_to_date:
+        say(f"imported {folder} ({done.info['imported']['layout']}, {done.why}) into {target}")
+        for warning in done.info["warnings"]:
+            say(f"warning: {name}: {warning}")
+    return target
+
+
+def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
+    """Our methods that tables of the suite's dataset report; 3DGS and RefineSplat where none does."""
+    from ambiguous_wild.methods.registry import all_methods
+    from ambiguous_wild.report.papers import read_reported
+
+    numbers = read_reported(reported_from)
+    reported = {plain(n.method) for n in numbers if n.dataset == suite.dataset and not n.setting}
+    return [name for name in all_methods() if plain(name) in reported] or ["3dgs", "refinesplat"]
+
+
+def suite_tables(prepared: PreparedSuite, runs: Path, reported_from: Path | None = None) -> list[Table]:
+    """The tables, each scene set as printed, our runs above the reported rows; nothing is averaged together.
+
+    Args:
+        prepared: of `prepare_suite`.
+        runs: folder of the runs.
+        reported_from: reported tables; None = those that come with the package.
+
+    Raises:
+        AwError: no finished run.
+    """
+    from ambiguous_wild.harness.store import read_runs
+    from ambiguous_wild.report.papers import paper, read_reported, with_reported
+
+    suite, found = prepared.suite, read_runs(runs)
+    known = set(found.runs["scene"]) if len(found.runs) else set()
+    numbers = read_reported(reported_from)
+    made = []
+    for title, scenes in suite.tables.items():
+        names = [scene_id(s) for s in scenes if scene_id(s) in known]
+        if not names:
+            continue
+        for table in paper(found, scenes=names, datasets={suite.dataset: names}):
+            named = dataclasses.replace(table, title=f"{suite.dataset}, {title}")
+            # A paper's mean is over all scenes of its table: beside a mean over some it would mislead.
+            whole = len(names) == len(scenes) and len(suite.tables) == 1
+            shown = with_reported(named, numbers)
+            made.append(shown if whole else _without_reported_mean(shown))
+    if not made:
+        raise AwError(f"{runs} has no finished run of {suite.name}")
+    note = _note(prepared)
+    return [table.with_notes(note) if note else table for table in made]
+
+
+def _without_reported_mean(table: Table) -> Table:
+    from ambiguous_wild.report.table import BLANK
+
+    rows = [
+        row
+        if row.kind == "measured"
+        else dataclasses.replace(
+            row, cells=tuple(cell if c.scene else BLANK for c, cell in zip(table.columns, row.cells))
+        )
+        for row in table.rows
+    ]
+    return dataclasses.replace(table, rows=tuple(rows))
+
+
+def _note(prepared: PreparedSuite) -> str:
+    if not prepared.absent:
+        return ""
+    return f"not here: {', '.join(prepared.absent)}; our mean is over fewer scenes than the papers'"

@@ -1,0 +1,247 @@
+"""Tables as LaTeX (booktabs, ready to `\\input`) and as one HTML page without script, font or request."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+from ambiguous_wild.harness.choosing import MIXED
+from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.report.notes import UNEQUAL
+from ambiguous_wild.report.plain_formats import plain
+from ambiguous_wild.report.table import TIE, Cell, Row, Table
+
+NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}"
+COLORS = (("awfirst", "1,0.75,0.75"), ("awsecond", "1,0.87,0.72"), ("awthird", "1,0.98,0.72"))
+APPROX = r"$\approx$"
+WIDE = 3  # a table of more columns spans both columns of text
+FIT = (
+    "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%"  # shrunk only where it must be
+)
+SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    # \textquotedbl needs fontenc T1, which not every class loads.
+    '"': "{''}",
+    # A row end takes these two for its own options when a name begins with them.
+    "[": "{[}",
+    "*": "{*}",
+    "–": "--",
+    "—": "---",
+}
+
+
+def latex_text(text: str) -> str:
+    """Escaped; what pdflatex's own fonts lack is written out, so that any name compiles."""
+    return "".join(map(_latex_character, plain(text)))
+
+
+def _latex_character(c: str) -> str:
+    if c in SPECIAL:
+        return SPECIAL[c]
+    if c in "&%$#_{}":
+        return f"\\{c}"
+    in_fonts = c.isascii() or c == "±" or ("À" <= c <= "ÿ" and c not in "ÐðÞþ×÷")
+    return c if in_fonts else f"(U+{ord(c):04X})"
+
+
+def to_latex(tables: Sequence[Table]) -> str:
+    """One float a table, with a caption; a table without a title is a bare tabular, for a float of its own.
+
+    The notes and the command that made it stand below as comments.
+    """
+    parts = [NEEDS, *(f"\\providecolor{{{name}}}{{rgb}}{{{rgb}}}" for name, rgb in COLORS)]
+    for table in tables:
+        parts += ["", *_float(table)] if table.title else _tabular(table)
+        legend = [] if table.title else table.legend
+        parts += [f"% {plain(line)}" for line in (*legend, *table.notes)]
+    return "\n".join(parts) + "\n"
+
+
+def _float(table: Table) -> list[str]:
+    star = "*" if len(table.columns) > WIDE else ""
+    begin = [f"\\begin{{table{star}}}[t]", "\\centering", f"\\caption{{{_caption(table)}}}\\vspace{{4pt}}"]
+    return [*begin, *_tabular(table), f"\\end{{table{star}}}"]
+
+
+def _tabular(table: Table) -> list[str]:
+    lines = [FIT, f"\\begin{{tabular}}{{l{'c' * len(table.columns)}}}", "\\toprule", *_latex_head(table)]
+    lines.append("\\midrule")
+    before = "measured"
+    for row in table.rows:
+        if row.kind != before:
+            span = len(table.columns) + 1
+            lines += [
+                "\\midrule",
+                f"\\multicolumn{{{span}}}{{l}}{{\\emph{{reported, not measured here}}}} \\\\",
+            ]
+            before = row.kind
+        lines.append(_latex_row(table, row))
+    # the other notes are comments: these say what a printed rank is worth
+    below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
+    if not table.title and any(cell.tie for cell in table.cells):  # there is no caption that says it
+        below.append(f"{TIE}: not significantly different from the best (paired bootstrap, 95 %).")
+    width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
+    lines += [
+        "\\bottomrule",
+        *(
+            f"{width}{{\\footnotesize {latex_text(note).replace(latex_text(TIE), APPROX)}}} \\\\"
+            for note in below
+        ),
+    ]
+    return [*lines, "\\end{tabular}}"]
+
+
+def _caption(table: Table) -> str:
+    text = latex_text(table.title) + "."
+    if any(cell.rank for cell in table.cells):
+        names = ("first", "second", "third")
+        shown = [f"\\colorbox{{{colour}}}{{{name}}}" for (colour, _), name in zip(COLORS, names)]
+        text += " " + ", ".join(shown[:2]) + " and " + shown[2] + " of each column."
+    if any(cell.tie for cell in table.cells):
+        text += " $\\approx$: not significantly different from the best (paired bootstrap, 95\\,\\%)."
+    if any("\u00b1" in rest for rest in table.legend):
+        text += f" $\\pm$: sample standard deviation over {table.spread_over}."
+    if table.contradicts:
+        text += " a / b: tables that contradict each other."
+    return text
+
+
+def _latex_head(table: Table) -> list[str]:
+    top, rules, begin = [""], [], 2
+    for title, count in table.groups:
+        top.append(f"\\multicolumn{{{count}}}{{c}}{{{latex_text(title)}}}")
+        rules.append(f"\\cmidrule(lr){{{begin}-{begin + count - 1}}}")
+        begin += count
+    head = table.head[:1].upper() + table.head[1:]
+    labels = (
+        " & ".join([latex_text(head), *(_latex_label(column.measure) for column in table.columns)]) + r" \\"
+    )
+    if not any(title for title, _ in table.groups):
+        return [labels]
+    return [" & ".join(top) + r" \\", " ".join(rules), labels]
+
+
+def _latex_label(measure: Measure) -> str:
+    arrow = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", None: ""}[measure.better]
+    return latex_text(measure.label) + arrow
+
+
+def _latex_row(table: Table, row: Row) -> str:
+    cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
+    return " & ".join([latex_text(row.name), *cells]) + r" \\"
+
+
+def _latex_cell(cell: Cell, measure: Measure) -> str:
+    if cell.state == "missing":
+        return "--"
+    text = latex_text(cell.text(measure)).replace("±", r"$\pm$").replace("inf", r"$\infty$")
+    text += r"$^{\approx}$" if cell.tie else ""
+    return text if cell.rank is None else f"\\cellcolor{{{COLORS[cell.rank - 1][0]}}}{text}"
+
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; margin: 1.5rem auto;
+  max-width: 96rem; padding: 0 1rem; }
+h2 { font-size: 1.05rem; margin: 2rem 0 .5rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; border-top: 2px solid #1a1a1a; border-bottom: 2px solid #1a1a1a; }
+th, td { padding: .25rem .6rem; text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
+th { font-weight: 600; }
+thead tr:last-child th { border-bottom: 1px solid #1a1a1a; }
+th.group { text-align: center; border-bottom: 1px solid #bbb; }
+th.name { text-align: left; font-weight: normal; position: sticky; left: 0; background: #fff; }
+.first { background: #ffbfbf; font-weight: 600; }
+.second { background: #ffdeb8; }
+.third { background: #fffab8; }
+.begins { border-left: 1px solid #ddd; }
+.spread { color: #666; font-size: .85em; }
+tr.reported td, tr.reported th { color: #666; font-style: italic; }
+tr.divider th { text-align: left; color: #666; font-size: .85em; border-top: 1px solid #1a1a1a; }
+ul { padding-left: 1.1rem; color: #555; font-size: .85rem; overflow-wrap: anywhere; }
+.key span { padding: 0 .4rem; }
+"""
+RANKS = ("first", "second", "third")
+
+
+def to_html(tables: Sequence[Table]) -> str:
+    """The tables on one page; names are text, whatever they hold."""
+    title = escape(plain(tables[0].title)) if len(tables) == 1 else "Results"
+    head = (
+        '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{title}</title>\n<style>{STYLE}</style>"
+    )
+    body = "\n".join(_section(table) for table in tables)
+    return f'<!doctype html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n{body}\n</body>\n</html>\n'
+
+
+def _section(table: Table) -> str:
+    parts = [f"<h2>{_text(table.title)}</h2>", '<div class="scroll">', html_table(table), "</div>"]
+    return "\n".join([*parts, _below(table)])
+
+
+def html_table(table: Table) -> str:
+    """The element alone, for a page with a style of its own; names are text."""
+    parts = ["<table>", "<thead>"]
+    begins = _begins(table)
+    if any(title for title, _ in table.groups):
+        groups = "".join(
+            f'<th class="group" colspan="{count}" scope="colgroup">{_text(title)}</th>'
+            for title, count in table.groups
+        )
+        parts.append(f"<tr><th></th>{groups}</tr>")
+    labels = "".join(f"<th{_class([b])}>{_text(c.label)}</th>" for c, b in zip(table.columns, begins))
+    parts += [f'<tr><th class="name">{_text(table.head)}</th>{labels}</tr>', "</thead>", "<tbody>"]
+    before = "measured"
+    for row in table.rows:
+        if row.kind != before:
+            span = len(table.columns) + 1
+            parts.append(
+                f'<tr class="divider"><th colspan="{span}">reported by papers, not measured here</th></tr>'
+            )
+            before = row.kind
+        parts.append(_row(table, row, begins))
+    return "\n".join([*parts, "</tbody>", "</table>"])
+
+
+def _begins(table: Table) -> list[str]:
+    """A class for the first column of every group but the first."""
+    return [
+        "begins" if i and c.group != table.columns[i - 1].group else "" for i, c in enumerate(table.columns)
+    ]
+
+
+def _row(table: Table, row: Row, begins: Sequence[str]) -> str:
+    cells = "".join(_cell(e, c.measure, b) for c, e, b in zip(table.columns, row.cells, begins))
+    title = f' title="{_text(row.note)}"' if row.note else ""
+    return f'<tr{_class([row.kind])}><th class="name" scope="row"{title}>{_text(row.name)}</th>{cells}</tr>'
+
+
+def _cell(cell: Cell, measure: Measure, begins: str) -> str:
+    value, sign, spread = cell.text(measure).partition(" ± ")
+    text = _text(value) + (f' <span class="spread">{_text(sign + spread).strip()}</span>' if sign else "")
+    if cell.tie:
+        text += f' <span title="not significantly different from the best">{TIE}</span>'
+    rank = RANKS[cell.rank - 1] if cell.rank else ""
+    return f"<td{_class([rank, begins])}>{text}</td>"
+
+
+def _below(table: Table) -> str:
+    items = [f"<li>{_text(line)}</li>" for line in (*table.legend, *table.notes)]
+    if any(cell.rank for cell in table.cells):
+        key = " ".join(f'<span class="{rank}">{rank}</span>' for rank in RANKS)
+        items.insert(0, f'<li class="key">{key} of each column</li>')
+    return f"<ul>{''.join(items)}</ul>" if items else ""
+
+
+def _class(names: Sequence[str]) -> str:
+    used = " ".join(name for name in names if name)
+    return f' class="{used}"' if used else ""
+
+
+def _text(text: str) -> str:
+    return escape(plain(text), quote=True)

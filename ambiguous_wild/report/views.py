@@ -1,0 +1,279 @@
+"""What `aw export`, `aw video` and `aw view --live` do, as calls."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.harness.bench import BenchReport, bench
+from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
+from ambiguous_wild.harness.models import find_models, open_scene, read_models
+from ambiguous_wild.io.files import check_output, refuse_files_there
+from ambiguous_wild.io.page_parts import narrowed
+from ambiguous_wild.splat.calibration import prepare_cpu
+from ambiguous_wild.viewing.live import LiveView
+from ambiguous_wild.viewing.model import FORMATS, Exported, export
+from ambiguous_wild.viewing.video import (
+    Frame,
+    Tick,
+    draw_frames,
+    from_file,
+    orbit,
+    through_views,
+    write_gif,
+    write_mp4,
+)
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.cell import Cell, CellReport
+    from ambiguous_wild.splat.trainer import Trainer
+
+
+FOLDER = "export"  # in a run folder
+
+
+def export_runs(
+    paths: Sequence[Path],
+    formats: Sequence[str],
+    output: Path | None = None,
+    *,
+    loss: bool = True,
+    scene_folder: Path | None = None,
+    threads: int | None = None,
+    overwrite: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[tuple[str, list[Exported]]]:
+    """Write the models of runs in other formats.
+
+    Args:
+        paths: run folders, or folders of runs.
+        formats: of `viewing.export.FORMATS`.
+        output: folder for all files, named after the models' labels; None = RUN/export.
+        loss: render the test views to measure what rounding costs. Without scene or test views only sizes
+            are reported.
+        scene_folder: where the scene lies; None = where the runs say.
+        threads: of the kernels; None = all.
+        overwrite: replace files of these names in `output`; those in RUN/export are replaced anyway.
+        say: told what is left out, and why.
+
+    Returns:
+        (label of the model, its files), in the order of the runs' paths.
+
+    Raises:
+        AwError: no run with a model, a folder that cannot be written, or files of these names in `output`.
+    """
+    found, notes = find_models(paths)
+    for note in notes:
+        say(note)
+    names = _file_names([f.scene for f in found], [f.model.label for f in found])
+    for f in found:
+        check_output((f.run / FOLDER if output is None else output) / "file")
+    if output is not None and not overwrite:
+        wanted = [FORMATS[form][0] for form in formats if form in FORMATS]
+        refuse_files_there(output, (name + ending for name in names for ending in wanted), "--overwrite")
+    if loss:
+        prepare_cpu(threads, say)
+    reports = []
+    for f, name in zip(found, names):
+        views: tuple[View, ...] = ()
+        if loss:
+            try:
+                views = open_scene(f.run, scene_folder).test
+            except AwError as error:
+                say(f"{f.model.label}: loss not measured: {error}")
+        folder, stem = (f.run / FOLDER, "point_cloud") if output is None else (output, name)
+        reports.append((f.model.label, export(f.model, folder, formats, views, name=stem)))
+    return reports
+
+
+def _file_names(scenes: Sequence[str], labels: Sequence[str]) -> list[str]:
+    """A file name for each model: letters, digits and a few signs of its label, after its scene's name where
+    there are several scenes, made unique by a number."""
+    several = len(set(scenes)) > 1
+    taken: dict[str, int] = {}
+    names = []
+    for scene, label in zip(scenes, labels):
+        text = f"{scene}-{label}" if several else label
+        name = re.sub(r"[^\w.+@=-]+", "-", text).strip(".-")[:80] or "model"
+        taken[name] = taken.get(name, 0) + 1
+        names.append(name if taken[name] == 1 else f"{name}-{taken[name]}")
+    return names
+
+
+GIF_FPS = 12.0
+PATHS = ("test", "orbit")
+
+
+@dataclass(frozen=True)
+class Video:
+    """What was written."""
+
+    path: Path
+    gif: Path | None
+    frames: int
+    seconds: float
+    labels: tuple[str, ...]
+
+
+def video_runs(
+    paths: Sequence[Path],
+    output: Path,
+    *,
+    path: str | Path = "test",
+    seconds: float = 8.0,
+    fps: float = 24.0,
+    width: int | None = None,
+    columns: int | None = None,
+    gif: Path | None = None,
+    gif_seconds: float = 4.0,
+    gif_width: int = 640,
+    scene: str | None = None,
+    scene_folder: Path | None = None,
+    threads: int | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    tick: Tick = lambda done, total: None,
+) -> Video:
+    """Film the models of runs side by side along one camera path.
+
+    Args:
+        paths: run folders, or folders of runs, all of one scene.
+        output: the .mp4 file.
+        path: "test" (through the test cameras), "orbit", or a file of a viewer.
+        seconds, fps: length and frames per second.
+        width: of each method's picture, px; None = the photos'.
+        columns: pictures in a row.
+        gif: also an animation of the video, played faster so that it lasts `gif_seconds`.
+        gif_seconds, gif_width: its length and width, px.
+        scene: name of the scene, where the runs are of several.
+        scene_folder: where it lies; None = where the runs say.
+        threads: of the kernels; None = all.
+        say, tick: told what is done.
+
+    Raises:
+        AwError: no run with a model, several scenes, no scene, no camera path, or no place for the file.
+    """
+    if output.suffix.lower() != ".mp4":
+        raise AwError(f"-o {output}: give a name that ends in .mp4")
+    if gif is not None and gif.suffix.lower() != ".gif":
+        raise AwError(f"--gif {gif}: give a name that ends in .gif")
+    frames = round(seconds * fps)
+    if frames < 2:
+        raise AwError(f"{seconds:g} seconds at {fps:g} frames per second are fewer than two frames")
+    for wanted in (output, *([gif] if gif else [])):
+        check_output(wanted)
+    shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    for note in shown.notes:
+        say(note)
+    cameras = _cameras(shown.scene, path, frames, width)
+    prepare_cpu(threads, say)
+    kept: list[Frame] = []
+    chosen = {
+        round(k * (frames - 1) / max(1, round(gif_seconds * GIF_FPS) - 1))
+        for k in range(round(gif_seconds * GIF_FPS))
+    }
+
+    def watched() -> Iterator[Frame]:
+        for number, frame in enumerate(draw_frames(shown.models, cameras, columns=columns, tick=tick)):
+            if gif is not None and number in chosen:
+                kept.append(narrowed(frame, gif_width))
+            yield frame
+
+    written = write_mp4(output, watched(), fps)
+    if gif is not None:
+        write_gif(gif, kept, len(kept) / gif_seconds)
+    return Video(output, gif, written, written / fps, tuple(model.label for model in shown.models))
+
+
+def _cameras(scene: Scene, path: str | Path, frames: int, width: int | None) -> list[Camera]:
+    lens = (scene.test or scene.views)[0].camera
+    wide = lens.width if width is None else width
+    size = (wide, max(2, round(lens.height * wide / lens.width)))
+    if path == "test":
+        return through_views(scene, frames, size)
+    if path == "orbit":
+        return orbit(scene, frames, size)
+    return from_file(Path(path), scene, frames, size)
+
+
+class Watched(Callbacks):
+    """Shows every step of a run to a live view."""
+
+    def __init__(self, view: LiveView, say: Callable[[str], None] = lambda text: None) -> None:
+        self.view, self._say = view, say
+
+    def say(self, text: str) -> None:
+        self._say(text)
+
+    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
+        assert one_by_one, "only then is tick called"
+
+    def started(self, cell: Cell, folder: Path) -> None:
+        self._say(f"{run_name(cell)} -> {folder}")
+
+    def tick(self, trainer: Trainer) -> None:
+        self.view.tick(trainer)
+
+    def ended(self, cell: Cell, report: CellReport) -> None:
+        told = f"{run_name(cell)}: {outcome_line(report)}"
+        self.view.end(told)
+        self._say(told)
+
+
+def watch(
+    scene: Path,
+    method: str,
+    output: Path,
+    *,
+    iterations: int | None = None,
+    max_gaussians: int | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    device: str = "auto",
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    paused: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+    view: LiveView | None = None,
+) -> BenchReport:
+    """Train a method on a scene and show it in a browser.
+
+    Args:
+        scene: its folder.
+        method: as `aw bench --method`.
+        output: folder of the run, as `aw bench -o`; a run that stopped goes on.
+        iterations, max_gaussians, seed, threads, device: as in `bench`.
+        host, port: where the page is served.
+        paused: pause after the first step.
+        say: told the address and the outcome.
+        view: a view to use instead of a new one; it stays open.
+
+    Raises:
+        AwError: viser is missing, the port is taken, or the run failed.
+    """
+    from ambiguous_wild.core import AwError
+
+    shown = LiveView(host, port, paused=paused) if view is None else view
+    try:
+        say(f"watch it at http://{host}:{shown.port}")
+        report = bench(
+            method,
+            scene,
+            output=output,
+            seeds=(seed,),
+            iterations=iterations,
+            train={} if max_gaussians is None else {"max_gaussians": max_gaussians},
+            threads=threads,
+            device=device,  # type: ignore[arg-type]
+            jobs=1,
+            callbacks=Watched(shown, say),
+        )
+    finally:
+        if view is None:
+            shown.stop()
+    if report.failed:
+        raise AwError(report.failed[0].error)
+    return report

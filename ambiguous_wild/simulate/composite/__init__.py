@@ -1,1 +1,0 @@
-"""Distractors with exact masks, added to a scene of real photos."""

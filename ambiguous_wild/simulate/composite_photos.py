@@ -1,0 +1,287 @@
+"""Add distractors to plain photos, before structure from motion: a raw capture, with the truth.
+
+RAW/train/<stem>.jpg                quality 95, upright; some with distractors
+RAW/test/<stem>.jpg                 every sixth photo, without distractors
+RAW/truth/distractor/<stem>.png     of train photos: 255 where a distractor is, else 0
+RAW/truth/clean/<stem>.png          the train photo as it was
+RAW/truth/composite.json            config, cut-outs with sha256; per photo source, pieces and coverage
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+
+from ambiguous_wild import __version__
+from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
+from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES, Exif, UnreadablePhoto, read_photo
+from ambiguous_wild.simulate.composite_scene import check_folders
+from ambiguous_wild.simulate.cutouts import (
+    SMALLEST_PX,
+    TRUTH_COVER,
+    Cutout,
+    CutoutPlacement,
+    blobs,
+    composed,
+    filled,
+    layer,
+    read_cutouts,
+    truth,
+)
+from ambiguous_wild.simulate.placement import CompositeConfig, natural_heights
+from ambiguous_wild.simulate.records import Spread, spread
+
+_TEST_EVERY = 6  # photos; also the fewest that make a capture
+_MOST_PIECES = 3  # of a photo
+_SPREAD = (0.5, 1.5)  # of the mean coverage: that of one photo
+_MOST_COVER = 0.6  # of a photo, in the mean of those with distractors
+_MIDDLE = (0.15, 0.85)  # of the photo's sides: where the middle of a piece lies
+_LONGEST = 1.2  # of the photo's longer side: largest piece
+_WINDOW = 0.6  # of the photo's sides: largest piece of another photo
+_PREVIEW_PX = 160
+
+
+class PastedPiece(TypedDict):
+    """One distractor in one plain photo."""
+
+    cutout: str
+    photo: str  # that the piece was cut from; empty for cut-outs
+    mirrored: bool
+    x: float  # of its middle, over the photo's width
+    y: float  # of its middle, over the photo's height
+    height: float  # over the photo's height
+
+
+class PastedPhoto(TypedDict):
+    """One training photo of a capture with pasted distractors."""
+
+    source: str  # file name of the clean photo
+    sha256: str  # of the clean photo
+    occlusion: float
+    distractors: list[PastedPiece]
+
+
+class PhotoFolder(TypedDict):
+    """The folder of photos that a capture is made from."""
+
+    name: str
+    photos: int
+
+
+class PastedCutout(TypedDict):
+    """One cut-out of a capture with pasted distractors."""
+
+    name: str
+    sha256: str  # of its file
+
+
+class PastedRecord(TypedDict):
+    """truth/composite.json of a capture with pasted distractors."""
+
+    schema: int
+    version: str
+    source: PhotoFolder
+    config: dict[str, Any]  # `CompositeConfig` without pose and shadow
+    mask: str
+    cutouts: list[PastedCutout]
+    occlusion: Spread
+    photos: dict[str, PastedPhoto]
+
+
+def is_photo_folder(path: Path | str) -> bool:
+    """Whether the folder holds neither scene.json nor a COLMAP model."""
+    root = Path(path)
+    return root.is_dir() and not any((root / part).exists() for part in ("scene.json", "sparse", "colmap"))
+
+
+def composite_photos(
+    source: Path | str,
+    output: Path | str,
+    config: CompositeConfig,
+    cutouts: Path | str | None = None,
+    progress: Callable[[Sequence[Path]], Iterable[Path]] = iter,
+) -> PastedRecord:
+    """Make the capture; returns truth/composite.json.
+
+    Args:
+        source: folder of at least six photos without distractors; every sixth becomes a test photo.
+        output: the folder to write; it appears complete or not at all.
+        config: coverage, presence (share of train photos with distractors), patches and seed are used.
+        cutouts: folder of PNG files with alpha; may be None with ``config.patches``.
+        progress: wraps the photos, for a bar.
+
+    Raises:
+        AwError: too few or unreadable photos, bad cut-outs or settings, or an output that exists.
+    """
+    config.check()
+    root, target = Path(source), Path(output)
+    check_folders(root, target)
+    if cutouts is None and not config.patches:
+        raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
+    mean = config.coverage / config.presence  # of the photos with distractors
+    if mean > _MOST_COVER:
+        raise AwError(
+            f"--coverage {config.coverage:g} with --presence {config.presence:g} covers {mean:.2f} of a "
+            f"photo, more than {_MOST_COVER:g}; lower --coverage or raise --presence"
+        )
+    shapes = [] if cutouts is None else read_cutouts(cutouts)
+    paths = _list_photos(root)
+    is_test = [i % _TEST_EVERY == _TEST_EVERY // 2 for i in range(len(paths))]
+    train = [path for path, test in zip(paths, is_test, strict=True) if not test]
+    choice_seed, *seeds = np.random.SeedSequence(config.seed).spawn(1 + len(paths))
+    order = np.random.default_rng(choice_seed).permutation(len(train))
+    chosen = {train[i] for i in order[: max(1, round(config.presence * len(train)))]}
+    photos: dict[str, PastedPhoto] = {}
+    with atomic_dir(target, replace=False) as folder:
+        for part in ("train", "test"):
+            (folder / part).mkdir()
+        for path, test, seed in zip(progress(paths), is_test, seeds, strict=True):
+            (clean, exif), name = _read(path), f"{path.stem}.jpg"
+            if test:
+                _write_jpeg(folder / "test" / name, clean, exif)
+                continue
+            changed, mask, pieces = clean, np.zeros(clean.shape[:2], np.uint8), list[PastedPiece]()
+            if path in chosen:
+                rng = np.random.default_rng(seed)
+                cover = float(mean * rng.uniform(*_SPREAD))
+                others = [p for p in train if p != path]
+                drawn = _draw(shapes, others, cover * mask.size, config.patches, rng)
+                over, pieces = _layer(drawn, clean.shape, cover, rng)
+                changed, mask = composed(clean, over), truth(over)
+            _write_jpeg(folder / "train" / name, changed, exif)
+            write_png(folder / "truth" / "clean" / f"{path.stem}.png", clean)
+            write_png(folder / "truth" / "distractor" / f"{path.stem}.png", mask)
+            share, sha256 = round(float((mask > 0).mean()), 6), sha256_file(path)
+            photos[name] = PastedPhoto(source=path.name, sha256=sha256, occlusion=share, distractors=pieces)
+        shares = [p["occlusion"] for p in photos.values()]
+        facts: PastedRecord = {
+            "schema": 1,
+            "version": __version__,
+            "source": {"name": root.resolve().name, "photos": len(paths)},
+            "config": {k: v for k, v in to_plain(config).items() if k not in ("pose", "shadow")},
+            "mask": "255 where a distractor covers at least a quarter of the pixel; no others change",
+            "cutouts": [{"name": c.name, "sha256": c.source} for c in shapes],
+            "occlusion": spread(shares),
+            "photos": photos,
+        }
+        write_json(folder / "truth" / "composite.json", facts)
+    return facts
+
+
+def _list_photos(root: Path) -> list[Path]:
+    def of(folder: Path) -> list[Path]:
+        return sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
+
+    paths = of(root)
+    if not paths and (root / "images").is_dir():
+        paths = of(root / "images")
+    if len(paths) < _TEST_EVERY:
+        raise AwError(
+            f"{root} is no scene and holds {len(paths)} photos itself, at least {_TEST_EVERY} are needed for "
+            "train and test; give a folder with more photos in it, or a scene of 'aw build-scene'"
+        )
+    stems = [p.stem.casefold() for p in paths]
+    twice = [p.name for p, stem in zip(paths, stems, strict=True) if stems.count(stem) > 1]
+    if twice:
+        raise AwError(f"{root}: photos have the same name: {shortlist(twice)}; rename or remove one of each")
+    return paths
+
+
+def _read(path: Path) -> tuple[np.ndarray, Exif]:
+    try:
+        photo, pixels = read_photo(path)
+    except UnreadablePhoto as error:
+        raise AwError(f"cannot read photo {path}: {error.reason}; replace or remove it") from error
+    return pixels, photo.exif
+
+
+def _write_jpeg(path: Path, pixels: np.ndarray, exif: Exif) -> None:
+    """JPEG at quality 95 without chroma subsampling, with the camera settings of a source photo.
+
+    Args:
+        path: the file.
+        pixels: [H, W, 3] uint8, upright.
+        exif: of the source photo; its orientation and position are left out.
+    """
+    from PIL import Image, TiffImagePlugin
+
+    def rational(value: float) -> Any:
+        fraction = Fraction(value).limit_denominator(100_000)
+        return TiffImagePlugin.IFDRational(fraction.numerator, fraction.denominator)
+
+    tags = Image.Exif()
+    fields = tags.get_ifd(0x8769)
+    texts = {0x010F: exif.make, 0x0110: exif.model, 0x0132: exif.taken_at}
+    tags.update({tag: value for tag, value in texts.items() if value is not None})
+    rationals = {0x829A: exif.exposure_s, 0x829D: exif.f_number, 0x920A: exif.focal_mm}
+    whole = {0x8827: exif.iso, 0xA403: exif.white_balance, 0xA405: exif.focal_35mm}
+    fields.update({tag: rational(value) for tag, value in rationals.items() if value is not None})
+    fields.update({tag: round(value) for tag, value in whole.items() if value is not None})
+    if exif.taken_at is not None:
+        fields[0x9003] = exif.taken_at
+    Image.fromarray(pixels).save(path, quality=95, subsampling=0, exif=tags)
+
+
+def _draw(
+    shapes: list[Cutout], others: list[Path], area: float, patches: bool, rng: np.random.Generator
+) -> list[tuple[Cutout, str, bool]]:
+    """One to three pieces that fill `area` px, the photo that each was cut from, whether it is mirrored."""
+    count = int(rng.integers(1, _MOST_PIECES + 1))
+    shown = [shapes[int(rng.integers(len(shapes)))] for _ in range(count)] if shapes else blobs(rng)[:count]
+    drawn = []
+    for cutout in shown:
+        origin = ""
+        if patches:
+            path = others[int(rng.integers(len(others)))]
+            photo, origin = _read(path)[0], path.name
+            # As large as it will appear, where the other photo allows it.
+            tall = np.sqrt(area / count / (cutout.aspect * cutout.filled))
+            tall = min(tall, _WINDOW * photo.shape[0], _WINDOW * photo.shape[1] / cutout.aspect)
+            height, width = (max(SMALLEST_PX, round(s)) for s in (tall, tall * cutout.aspect))
+            corner = [int(rng.integers(0, n - s + 1)) for n, s in zip(photo.shape, (height, width))]
+            cutout = filled(cutout, photo, corner, (height, width))
+        mirrored = bool(rng.random() < 0.5)
+        light = np.ascontiguousarray(cutout.light[:, ::-1]) if mirrored else cutout.light
+        drawn.append((replace(cutout, light=light), origin, mirrored))
+    return drawn
+
+
+def _layer(
+    drawn: list[tuple[Cutout, str, bool]], size: tuple[int, ...], cover: float, rng: np.random.Generator
+) -> tuple[np.ndarray, list[PastedPiece]]:
+    """The pieces at random places, of the size that covers `cover`, as a layer of the photo's size."""
+    cutouts, (height, width) = [cutout for cutout, _, _ in drawn], size[:2]
+    middles = rng.uniform(*_MIDDLE, (len(drawn), 2))  # x and y over width and height
+    places = enumerate(middles * [width / height, 1.0])
+    placements = [CutoutPlacement(k, (float(x), float(y), 1.0), 0.0, False) for k, (x, y) in places]
+    natural, small = natural_heights(cutouts, rng), [c.reduced(_PREVIEW_PX) for c in cutouts]
+    preview = _camera(width, height, _PREVIEW_PX / max(width, height))
+    longest = max(h * max(1.0, c.aspect) for h, c in zip(natural, cutouts, strict=True))
+    low, high = 0.0, _LONGEST * max(1.0, width / height) / longest
+    for _ in range(14):
+        scale = (low + high) / 2
+        share = (layer(small, list(natural * scale), placements, preview)[..., 3] >= TRUTH_COVER).mean()
+        low, high = (scale, high) if share < cover else (low, scale)
+    heights = natural * (low + high) / 2
+    over = layer(cutouts, list(heights), placements, _camera(width, height, 1.0))
+    over[over[..., 3] < TRUTH_COVER] = 0  # what the mask leaves out keeps its bytes
+    pieces = [
+        PastedPiece(cutout=c.name, photo=p, mirrored=m, x=float(x), y=float(y), height=float(tall))
+        for (c, p, m), (x, y), tall in zip(drawn, middles, heights, strict=True)
+    ]
+    return over, pieces
+
+
+def _camera(width: int, height: int, scale: float) -> Camera:
+    """A camera at the origin whose unit is the photo's height, so that (x, y, 1) is a place in the photo."""
+    w, h = max(1, round(width * scale)), max(1, round(height * scale))
+    return Camera(w, h, w * height / width, float(h), 0.0, 0.0, np.eye(4))

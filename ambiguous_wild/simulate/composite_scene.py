@@ -1,0 +1,314 @@
+"""Add distractors to the train photos of a real scene: a complete scene folder, with the truth.
+
+SCENE2/images* sparse masks lists     as in the source scene; train photos changed, test photos not
+SCENE2/truth/distractor/<stem>.png    255 where a cut-out or its shadow covers a quarter of the pixel or more
+SCENE2/truth/clean/<stem>.png         the train photo as it was
+SCENE2/truth/composite.json           config, cut-outs with sha256; per photo placed cut-outs and coverage
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypedDict, cast
+
+import numpy as np
+
+from ambiguous_wild import __version__
+from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.names import check_name
+from ambiguous_wild.core.scene import Scene, SceneInfo, View
+from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
+from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, load_scene, read_scene_json
+from ambiguous_wild.simulate.cutouts import (
+    Cutout,
+    CutoutPlacement,
+    blobs,
+    composed,
+    layer,
+    read_cutouts,
+    resized,
+    truth,
+)
+from ambiguous_wild.simulate.placement import (
+    CompositeConfig,
+    cut_patches,
+    local_colours,
+    natural_heights,
+    place,
+    scene_spread,
+    solve_heights,
+    visible_points,
+)
+from ambiguous_wild.simulate.records import Spread, spread
+
+
+class PlacedCutout(TypedDict):
+    """One cut-out in one photo: `layers.CutoutPlacement` with its name."""
+
+    cutout: str
+    which: int
+    position: tuple[float, float, float]
+    turn_deg: float
+    standing: bool
+
+
+class CompositePhoto(TypedDict):
+    """One training photo of a composite."""
+
+    occlusion: float
+    distractors: list[PlacedCutout]
+
+
+class CutoutRecord(TypedDict):
+    """One cut-out of a composite."""
+
+    name: str
+    sha256: str  # of its file; empty where it was drawn
+    height: float  # scene units
+
+
+class CompositeSource(TypedDict):
+    """The scene that a composite is made from."""
+
+    name: str
+    scene_json: str | None  # sha256
+
+
+class CompositeRecord(TypedDict):
+    """truth/composite.json."""
+
+    schema: int
+    version: str
+    source: CompositeSource
+    config: dict[str, Any]  # `CompositeConfig`
+    mask: str
+    poses: str
+    cutouts: list[CutoutRecord]
+    occlusion: Spread
+    photos: dict[str, CompositePhoto]
+
+
+ViewProgress = Callable[[Sequence[View]], Iterable[View]]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    cutouts: list[Cutout]
+    heights: np.ndarray  # [K] scene units
+    placements: list[tuple[CutoutPlacement, ...]]  # of every train photo
+
+
+def composite(
+    source: Path | str,
+    output: Path | str,
+    config: CompositeConfig,
+    cutouts: Path | str | None = None,
+    progress: ViewProgress = iter,
+) -> CompositeRecord:
+    """Make the scene; returns truth/composite.json.
+
+    Poses and points are those of the clean photos, so they are better than from photos with distractors.
+
+    Args:
+        source: a scene folder, ours or a plain COLMAP scene.
+        output: the folder to write; it appears complete or not at all.
+        config: see `CompositeConfig`.
+        cutouts: folder of PNG files with alpha; may be None with ``config.patches``.
+        progress: wraps the train views, for a bar.
+
+    Raises:
+        AwError: a bad scene, bad cut-outs, a coverage that cannot be reached, or an output that exists.
+    """
+    config.check()
+    root, target = Path(source), Path(output)
+    name = check_name("scene name (the folder's)", target.resolve().name)
+    check_folders(root, target)
+    if cutouts is None and not config.patches:
+        raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
+    shape_rng, place_rng, patch_rng = (
+        np.random.default_rng(s) for s in np.random.SeedSequence(config.seed).spawn(3)
+    )
+    shapes = blobs(shape_rng) if cutouts is None else read_cutouts(cutouts)
+    scene = load_scene(root)
+    _check_scene(scene)
+    plan = _plan(scene, shapes, config, place_rng, patch_rng)
+    with atomic_dir(target, replace=False) as folder:
+        photos = _write_photos(scene, plan, config, folder, progress)
+        _copy_rest(scene, folder)
+        facts = _facts(scene, plan, config, photos)
+        write_json(folder / "truth" / "composite.json", facts)
+        _write_scene_json(scene, folder, name, facts)
+    return facts
+
+
+def check_folders(root: Path, target: Path) -> None:
+    """Raise AwError where source and output lie inside each other, or the output exists."""
+    if target.resolve().is_relative_to(root.resolve()) or root.resolve().is_relative_to(target.resolve()):
+        raise AwError(f"{target} and {root} lie inside each other; choose another folder for -o")
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise AwError(f"{target} exists; remove it or choose another folder for -o")
+
+
+def _check_scene(scene: Scene) -> None:
+    """Raise AwError where photos share a name, or the scene has distractors already."""
+    stems = [Path(v.name).stem for v in scene.views]
+    twice = sorted({s for s in stems if stems.count(s) > 1})
+    if twice:
+        raise AwError(
+            f"{scene.root}: two folders have photos of the same name: {shortlist(twice)}; rename them"
+        )
+    for view in scene.train:
+        mask = scene.root / "truth" / "distractor" / f"{Path(view.name).stem}.png"
+        if mask.is_file() and read_gray(mask).any():
+            raise AwError(
+                f"{scene.root} has distractors already ({mask.name} is not empty); choose a scene without any"
+            )
+
+
+def _plan(
+    scene: Scene,
+    shapes: list[Cutout],
+    config: CompositeConfig,
+    place_rng: np.random.Generator,
+    patch_rng: np.random.Generator,
+) -> _Plan:
+    sites = visible_points(scene)
+    if config.patches:
+        largest = _folders(scene.root)[0]  # images, or the smallest factor there is
+        shown, colours, origins = cut_patches(shapes, sites, _pictures(scene, largest), config, patch_rng)
+        backgrounds = [local_colours(read_png_rgb(s.view.image_path)) for s in sites]
+        chosen = {"colours": colours, "backgrounds": backgrounds, "origins": origins}
+    else:
+        shown, chosen = shapes, {}
+    natural = natural_heights(shown, place_rng)
+    placements = place(sites, scene_spread(scene), config, place_rng, len(shown), **chosen)  # type: ignore[arg-type]
+    heights = solve_heights(shown, natural, sites, placements, config)
+    return _Plan(shown, heights, placements)
+
+
+def _folders(root: Path) -> list[str]:
+    """images, then every images_N by its factor."""
+    found = [p.name for p in root.iterdir() if p.is_dir() and p.name.removeprefix("images_").isdigit()]
+    found.sort(key=lambda name: int(name.removeprefix("images_")))
+    return (["images"] if (root / "images").is_dir() else []) + found
+
+
+def _write_photos(
+    scene: Scene, plan: _Plan, config: CompositeConfig, folder: Path, progress: ViewProgress
+) -> dict[str, CompositePhoto]:
+    """Write the photos of all sizes, and the truth at the size of training."""
+    kinds = [(f, _pictures(scene, f)) for f in _folders(scene.root)]
+    placements = dict(zip((v.name for v in scene.train), plan.placements, strict=True))
+    photos: dict[str, CompositePhoto] = {}
+    for _, pictures in kinds:
+        for view in scene.test:
+            _copy(pictures[view.name], scene.root, folder)
+    with ThreadPoolExecutor(2) as writers:
+        for view in progress(scene.train):
+            sizes = [image_size(pictures[view.name]) for _, pictures in kinds]
+            full = view.camera.resized(*max(sizes))
+            over = layer(plan.cutouts, list(plan.heights), placements[view.name], full, config.shadow)
+            jobs = []
+            for (_, pictures), (width, height) in zip(kinds, sizes, strict=True):
+                path = pictures[view.name]
+                photo = read_png_rgb(path)
+                changed = composed(photo, resized(over, width, height))
+                # Changed photos become PNG: no second JPEG compression.
+                out = (folder / path.relative_to(scene.root)).with_suffix(".png")
+                jobs.append(writers.submit(write_png, out, changed))
+                if path == view.image_path:
+                    mask = truth(resized(over, width, height))
+                    stem = Path(view.name).stem
+                    jobs.append(writers.submit(write_png, folder / "truth" / "clean" / f"{stem}.png", photo))
+                    jobs.append(
+                        writers.submit(write_png, folder / "truth" / "distractor" / f"{stem}.png", mask)
+                    )
+                    photos[view.name] = _photo_facts(plan, placements[view.name], mask)
+            for job in jobs:
+                job.result()
+    return photos
+
+
+def _pictures(scene: Scene, folder: str) -> dict[str, Path]:
+    factor = 1 if folder == "images" else int(folder.removeprefix("images_"))
+    return {v.name: v.image_path for v in load_scene(scene.root, factor=factor, verify=False).views}
+
+
+def _photo_facts(plan: _Plan, placements: tuple[CutoutPlacement, ...], mask: np.ndarray) -> CompositePhoto:
+    placed = [cast(PlacedCutout, {"cutout": plan.cutouts[p.which].name, **asdict(p)}) for p in placements]
+    return {"occlusion": round(float((mask > 0).mean()), 6), "distractors": placed}
+
+
+def _copy(path: Path, root: Path, folder: Path) -> None:
+    target = folder / path.relative_to(root)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, target)
+
+
+def _copy_rest(scene: Scene, folder: Path) -> None:
+    """Copy the model and the user's keep masks; write the lists."""
+    for part in ("sparse", "colmap/sparse", "masks"):
+        for path in sorted(p for p in (scene.root / part).rglob("*") if p.is_file()):
+            _copy(path, scene.root, folder)
+    if (scene.root / "nb-info.json").is_file():
+        _copy(scene.root / "nb-info.json", scene.root, folder)
+    for side, views in (("train", scene.train), ("test", scene.test)):
+        text = "".join(f"{v.name}\n" for v in views)
+        (folder / f"{side}_list.txt").write_text(text, encoding="utf-8", errors="surrogateescape")
+
+
+def _facts(
+    scene: Scene, plan: _Plan, config: CompositeConfig, photos: dict[str, CompositePhoto]
+) -> CompositeRecord:
+    shares = [p["occlusion"] for p in photos.values()]
+    record = scene.root / "scene.json"
+    return {
+        "schema": 1,
+        "version": __version__,
+        "source": {"name": scene.name, "scene_json": sha256_file(record) if record.is_file() else None},
+        "config": to_plain(config),
+        "mask": "255 where a cut-out or its shadow covers at least a quarter of the pixel",
+        "poses": "structure from motion of the photos before anything was put in",
+        "cutouts": [
+            {"name": c.name, "sha256": c.source, "height": float(h)}
+            for c, h in zip(plan.cutouts, plan.heights, strict=True)
+        ],
+        "occlusion": spread(shares),
+        "photos": photos,
+    }
+
+
+def _write_scene_json(scene: Scene, folder: Path, name: str, facts: CompositeRecord) -> None:
+    """The source's scene.json, without the keys by which 'aw build-scene' knows its own scenes."""
+    before: SceneInfo = read_scene_json(scene.root) or {"license": "not stated"}
+    license_ = before.get("license", "not stated")
+    kept = {k: v for k, v in before.items() if k not in ("build_key", "inputs", "seconds", "files")}
+    factor = scene.info["loaded_factor"]
+    content: dict[str, Any] = {
+        **kept,
+        "schema": "ambiguous_wild.scene",
+        "schema_version": SCENE_SCHEMA,
+        "name": name,
+        "factor": factor,
+        "images": "images" if factor == 1 else f"images_{factor}",
+        "license": license_ if facts["config"]["patches"] else f"{license_}; cut-outs: not stated",
+        "truth": {"distractor": len(scene.train), "clean": len(scene.train)},
+        "composite": {
+            "source": facts["source"],
+            "config": facts["config"],
+            "cutouts": facts["cutouts"],
+            "occlusion": facts["occlusion"],
+            "poses": facts["poses"],
+        },
+    }
+    paths = sorted(p for p in folder.rglob("*") if p.is_file())
+    content["files"] = {
+        p.relative_to(folder).as_posix(): {"sha256": sha256_file(p), "bytes": p.stat().st_size} for p in paths
+    }
+    write_json(folder / "scene.json", content)

@@ -254,7 +254,7 @@ Answer = Literal["on", "off", "unknown"]
 SCHEMA = 1
 
 # Set on tracks with the effect injected and without (tests/harness/test_planning.py) and on the captures of
-# docs/effects.md, which says how near to them what was measured lies.
+# docs/notes/effects.md, which says how near to them what was measured lies.
 EXPOSURE = 0.05
 APPEARANCE = 0.043
 # A highlight is not linear in the direction: what is left of it, times its linear part (1.7 at the strongest
@@ -264,11 +264,11 @@ SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
 # cameras around something have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1:
-# there a dense start of 30 photos paid (docs/effects.md)
+# there a dense start of 30 photos paid (docs/notes/effects.md)
 OUTWARD = 2.0
-# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/effects.md)
+# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/notes/effects.md)
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24
-# simulated courtyards, rooms and yards have 0.01 to 0.05, real captures 0.09 to 0.66 (docs/effects.md)
+# simulated courtyards, rooms and yards have 0.01 to 0.05, real captures 0.09 to 0.66 (docs/notes/effects.md)
 UNCOVERED = 0.07
 
 
@@ -326,7 +326,7 @@ class Plan:
         """Names for `--effects`: effects that were decided on, among those allowed.
 
         A lower SH degree is never among them: it saves no time worth mentioning, and on matt scenes too cost
-        a third to half a decibel (docs/effects.md).
+        a third to half a decibel (docs/notes/effects.md).
         """
         found = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
         return tuple(name for name in found if among is None or name in tuple(among))

@@ -313,7 +313,7 @@ def publish(
         raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
     if reported_from is not None and not reported_from.is_dir():
         raise AwError(
-            f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/audit.md"
+            f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/tables.md"
         )
     source = reported_from
     if reported and source is None:

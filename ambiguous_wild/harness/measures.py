@@ -134,7 +134,7 @@ COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model
 # A metric that is not known takes everything but its name from its family: psnr_distractor is a PSNR.
 FAMILIES = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_alex"}
 
-_own: dict[str, Metric] = {}  # registered; without a function: as a result that was read describes it
+own_metrics: dict[str, Metric] = {}  # registered; without a function: as a result that was read describes it
 
 
 @cache
@@ -147,17 +147,17 @@ def _installed() -> dict[str, Metric]:
 def metrics() -> dict[str, Metric]:
     """Every metric that can be computed, by key: built in, registered, installed as entry points."""
     for key, metric in _installed().items():
-        if key not in _own or not _own[key].function:  # what a result describes has none
+        if key not in own_metrics or not own_metrics[key].function:  # what a result describes has none
             register(metric)
-    return {k: m for k, m in (MEASURES | _own).items() if isinstance(m, Metric) and m.function}
+    return {k: m for k, m in (MEASURES | own_metrics).items() if isinstance(m, Metric) and m.function}
 
 
 def measure(key: str) -> Measure:
     """The column of that key; of one that is not known what its family tells."""
-    if key not in MEASURES and key not in _own:
+    if key not in MEASURES and key not in own_metrics:
         metrics()  # an installed package may have it
-    if key in MEASURES or key in _own:
-        return MEASURES.get(key) or _own[key]
+    if key in MEASURES or key in own_metrics:
+        return MEASURES.get(key) or own_metrics[key]
     family = FAMILIES.get(key.partition("_")[0])
     return replace(MEASURES[family], key=key, label=key) if family else Measure(key, key, None)
 
@@ -182,7 +182,7 @@ def register(metric: Metric) -> Metric:
     ):
         if not right:
             raise AwError(f"metric {metric.key!r}: {field} is {value!r}: write {form}")
-    _own[metric.key] = replace(metric, label=f"{metric.label} {metric.unit}".strip(), unit="")
+    own_metrics[metric.key] = replace(metric, label=f"{metric.label} {metric.unit}".strip(), unit="")
     return metric
 
 
@@ -227,7 +227,7 @@ def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
 def remember(known: Mapping[str, MetricRecord]) -> None:
     """Name the columns of a result's metrics as the run that measured them did."""
     for key in known.keys() - MEASURES:
-        _own.setdefault(key, Metric(key, function="", **known[key]))
+        own_metrics.setdefault(key, Metric(key, function="", **known[key]))
 
 
 class ImageRow(TypedDict, total=False):

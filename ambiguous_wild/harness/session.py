@@ -202,7 +202,7 @@ class _Worker:
         # Not forked: the threads of torch and Numba do not survive that.
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs,))
+        self.process = context.Process(target=serve, args=(theirs,))
         # there from the start: spawn imports the caller's main module first, and CUDA reads it once
         before = os.environ.get(VISIBLE)
         if gpu is not None:
@@ -243,7 +243,7 @@ class _Worker:
         return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
 
-def _serve(connection: Connection) -> None:
+def serve(connection: Connection) -> None:
     """The loop of a worker process; it ends when the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends us
     threading.Thread(target=_follow_parent, daemon=True).start()

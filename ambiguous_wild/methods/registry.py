@@ -2,7 +2,7 @@
 
 A method of one's own is found in four ways: `register(...)`, the entry-point group
 `ambiguous_wild.methods`, a file given as `--plugin my_method.py`, or a reference to a recipe in a file,
-`--method my_method.py:my_recipe` (see docs/add-a-method.md).
+`--method my_method.py:my_recipe` (see docs/extend.md).
 """
 
 from __future__ import annotations

@@ -189,7 +189,7 @@ def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
     if not (re.fullmatch(r"[0-9a-f]{64}", source) or (named and not source)):
         raise AwError(
             f"{run}: method {method[:60]!a} is none of this package and config.yaml has no hash of its code, "
-            "so its code is unknown; run it as a file, see docs/add-a-method.md"
+            "so its code is unknown; run it as a file, see docs/extend.md"
         )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -156,7 +156,8 @@ def undistort(
 
 def _truth(folder: Path, lens: Lens, fact: ScreenedPhoto, truth: Path) -> list[str]:
     """Undistort the truth of one photo: the mask by nearest pixel, the clean photo like the photo."""
-    original = fact["source"].rsplit("/", 1)[-1].rsplit(".", 1)[0]
+    parts = PurePosixPath(fact["source"]).with_suffix("").parts
+    original = "/".join(parts[parts[0] in ("train", "test", "images") :])
     found = []
     for part in TRUTH_PARTS:
         path = truth / part / f"{original}.png"

@@ -202,7 +202,7 @@ def _find_regions(scene: Scene) -> Regions:
 
 def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
     """[H, W] bool, True on distractors, where the capture brought the truth."""
-    path = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png").name
+    path = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png")
     if not path.exists():
         return None
     mask = read_gray(path) >= 128

@@ -154,6 +154,7 @@ def bench(
     engine: Engine | None = None,
     factor: int | None = None,
     protocol: Protocol | None = None,
+    start: Words | None = None,
     overwrite: Overwrite = "missing",
     cache: Words | None = None,
     pictures: bool = True,
@@ -182,10 +183,9 @@ def bench(
         jobs: cells at a time on this machine; None = what `engine` says.
         engine: where cells run; None = this machine.
         factor: which images_N; None = what the scene was built for.
-        protocol: "full" measures whole test photos, "half" the right half (NeRF-W); None = what the scene's
-            scene.json says, else "full".
-        overwrite: "missing" keeps what is finished and resumes what stopped, "changed" also trains again
-            where a method's file has changed, "always" starts anew, "never" leaves folders that exist.
+        protocol: "full" or "half" (right halves are measured, NeRF-W); None = scene.json's, else "full".
+        start: a splat file or a point cloud (PLY) to start from; None = the scene's points.
+        overwrite: as `aw bench --overwrite`.
         cache: for features and instance masks; None = OUTPUT/.cache.
         pictures: draw what the method saw into RUN/pictures.
         callbacks: told what happens; None = nothing is. `Lines()` prints a line a run.
@@ -252,6 +252,7 @@ def bench(
                 effects=wanted,
                 plan=read,
                 protocol=protocol,
+                start=None if start is None else Path(start),
                 probing=probing,
             )
             for wanted in dict.fromkeys(choices)
@@ -266,7 +267,8 @@ def bench(
         for cell in {cell.method.name: cell for cell in to_run}.values():
             check_program(cell)
         to_train = [cell for cell in to_run if cell.method.program is None]
-        try_recipes(to_train)
+        for line in try_recipes(to_train):
+            told.say(line)
         for cell in {cell.scene_id: cell for cell in to_run}.values():
             try_own(cell.scene)
         check_output(out / "run")  # before half a minute of compiling

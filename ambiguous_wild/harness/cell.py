@@ -35,6 +35,7 @@ from ambiguous_wild.harness.result_file import (
     RunResult,
     UnusualConfig,
 )
+from ambiguous_wild.harness.start import StartFile
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.motion_points import FILE as MOTION
 from ambiguous_wild.methods.graft import Graft
@@ -90,6 +91,7 @@ def _cpu_name() -> str:
 IGNORED: dict[str, tuple[str, ...]] = {
     "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
     "scene": ("path",),
+    "start": ("path",),
 }
 # Files of a scene that say how it came to be, versions included, and that nothing is trained or scored on:
 # the same photos simulated by a later version are the same scene.
@@ -107,8 +109,8 @@ def config_identity(config: Mapping[str, Any]) -> str:
         TypeError: it holds what JSON does not.
     """
     known = {k: v for k, v in config.items() if k != "config_hash"}
-    for part, keys in IGNORED.items():
-        known[part] = {k: v for k, v in config[part].items() if k not in keys}
+    for part in IGNORED.keys() & known.keys():
+        known[part] = {k: v for k, v in config[part].items() if k not in IGNORED[part]}
     return config_hash(known)
 
 
@@ -198,6 +200,7 @@ class Cell:
     device: str = "cpu"
     chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
+    start: StartFile | None = None  # what it starts from instead of the scene's points
     group: str = ""  # folder below the output, where one output takes several lengths or effects
 
     @property
@@ -209,6 +212,8 @@ class Cell:
             unusual["effects"] = list(self.chosen.effects)
         if self.protocol != "full":
             unusual["protocol"] = self.protocol
+        if self.start is not None:
+            unusual["start"] = {"sha256": self.start.sha256, "path": str(self.start.path)}
         return {
             **unusual,
             "method": self.method.name,
@@ -227,11 +232,7 @@ class Cell:
 
     @property
     def identity(self) -> str:
-        """Hash of all settings that decide the result; how often it is saved and where the scene lies do not.
-
-        `on_nonfinite` is left out too: without such a value it does nothing, and with one the facts of the
-        result say so.
-        """
+        """Hash of all settings that decide the result."""
         return config_identity(self.config)
 
     def result(
@@ -257,6 +258,8 @@ class Cell:
         known: dict[str, Any] = {**(facts or {}), "length": asked_length(self.train)}
         if mixed := mixed_tests(self.scene):
             known["test_photos"] = mixed
+        if self.start is not None:
+            known["start"] = f"{self.start.path.name} ({self.start.sha256[:8]})"
         return {
             "schema": SCHEMA,
             "method": self.method.name,
@@ -319,10 +322,7 @@ def code_hash() -> str:
 
 
 def reproduce(cell: Cell) -> str:
-    """The command that makes this result again, whatever the defaults of a later version are.
-
-    Where it is written to is left to whoever runs it (-o, by default runs/).
-    """
+    """The command that makes this result again, whatever the defaults of a later version are."""
     method, train = cell.method, cell.train
     name = _base(method).name
     given = method.given_as or name
@@ -331,6 +331,7 @@ def reproduce(cell: Cell) -> str:
     words += ["--resolution", train.resolution, "--effects", ",".join(cell.chosen.effects) or "none"]
     factor = cell.scene.info.get("loaded_factor")
     words += ["--factor", str(factor)] if factor else []
+    words += ["--start", str(cell.start.path)] if cell.start is not None else []
     words += ["--max-gaussians", str(train.max_gaussians)] if train.max_gaussians is not None else []
     words += ["--protocol", cell.protocol] if cell.protocol != scene_protocol(cell.scene) else []
     for setting in _settings(method, name, cell.options):

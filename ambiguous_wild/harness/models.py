@@ -20,8 +20,9 @@ from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
-from ambiguous_wild.viewing.model import Model, RenderSettings
+from ambiguous_wild.viewing.model import Model, RenderSettings, file_model
 from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
+from ambiguous_wild.viewing.video import scene_around
 
 MASKS = "masks"
 
@@ -50,17 +51,26 @@ class SceneModels:
 def read_models(
     paths: Sequence[Path], *, scene: str | None = None, scene_folder: Path | None = None
 ) -> SceneModels:
-    """The models of the runs below some folders, and the scene they were trained on.
+    """The models of the runs below some folders and of splat files, and the scene they are of.
 
     Args:
-        paths: run folders, or folders of runs.
+        paths: run folders, folders of runs, or splat files.
         scene: name of the scene, where the runs are of several.
-        scene_folder: where it lies; None = where the runs say.
+        scene_folder: where it lies; None = where the runs say. Files without runs: without it, a scene
+            without photos.
 
     Raises:
         AwError: no run, no model in any, runs of several scenes, or the scene is not where it was.
     """
-    found, notes = find_models(paths)
+    files, notes = read_files(paths)
+    folders = [path for path in paths if not path.is_file()]
+    if files and not folders:
+        opened = scene_around(files[0]) if scene_folder is None else load_scene(scene_folder)
+        if scene_folder is None:
+            notes.append(f"no --scene: the cameras are on a circle around {files[0].ply.name}, y down")
+        return SceneModels(opened, tuple(model.within(opened.place) for model in files), tuple(notes))
+    found, more = find_models(folders if files else paths)
+    notes += more
     names = sorted({f.scene for f in found})
     if scene is not None:
         found = [f for f in found if f.scene == scene]
@@ -77,7 +87,20 @@ def read_models(
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
     opened = open_scene(found[0].run, scene_folder)
     notes += [mixed] if (mixed := mixed_tests(opened)) else []
-    return SceneModels(opened, tuple(f.model for f in found), tuple(notes))
+    models = (*(f.model for f in found), *(model.within(opened.place) for model in files))
+    return SceneModels(opened, models, tuple(notes))
+
+
+def read_files(paths: Sequence[Path]) -> tuple[list[Model], list[str]]:
+    """The models of the splat files among the paths, of one label each, and notes.
+
+    Raises:
+        AwError: a file that is none.
+    """
+    read = [file_model(path) for path in dict.fromkeys(paths) if path.is_file()]
+    count = Counter(model.label for model, _ in read)
+    models = [replace(m, label=str(m.ply)) if count[m.label] > 1 else m for m, _ in read]
+    return models, [note for _, note in read if note]
 
 
 def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
@@ -93,7 +116,8 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
     for root in paths:
         if not root.is_dir():
             raise AwError(
-                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, or a run in it"
+                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, a run in it, or a "
+                "splat file"
             )
         for run in dict.fromkeys(run_folders(root)):
             if any(f.run.samefile(run) for f in found):

@@ -26,7 +26,7 @@ CONFIG = "config.yaml"
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
     "timing_kernel", "hardware", "effects", "length", "features",
-    "test_photos",
+    "test_photos", "start",
 )  # fmt: skip
 FoundResult = tuple[Path, RunResult]  # of this run folder
 
@@ -251,6 +251,7 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
             "length": str(result["facts"].get("length") or _length(read_config(run))),
             "test_photos": str(result["facts"].get("test_photos", "")),
             "features": _features(result["options"]),
+            "start": str(result["facts"].get("start", "the scene's points")),
         }
         | {"folder": str(run), "images": len(result["per_image"])}
         | cost

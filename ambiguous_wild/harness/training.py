@@ -25,6 +25,7 @@ from ambiguous_wild.harness import pictures as pictures_of_training
 from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
 from ambiguous_wild.harness.meter import Meter
 from ambiguous_wild.harness.result_file import Cost, RunResult, TimeRecord
+from ambiguous_wild.harness.start import started
 from ambiguous_wild.io.files import atomic_dir, write_json
 from ambiguous_wild.io.images import read_keep_map, write_png
 from ambiguous_wild.io.ply import write_splat_ply
@@ -44,8 +45,6 @@ _NO_MEMORY = ("CUDA out of memory", "CUDA error: out of memory")
 def reset_peak(device: str = "cpu") -> None:
     """Forget the peaks so far: of the process where the system can (Linux), and of a GPU."""
     if device.startswith("cuda"):
-        import torch
-
         torch.cuda.reset_peak_memory_stats(device)
     try:
         (_PROC / "clear_refs").write_text("5")
@@ -58,8 +57,6 @@ def peak_memory(device: str = "cpu") -> Cost:
     rss = peak_rss_mb()
     peaks: Cost = {"peak_rss_mb": rss} if math.isfinite(rss) else {}
     if device.startswith("cuda"):
-        import torch
-
         peaks["peak_cuda_mb"] = torch.cuda.max_memory_allocated(device) / 1e6
     return peaks
 
@@ -85,8 +82,6 @@ def peak_rss_mb() -> float:
 
 def is_out_of_gpu_memory(error: BaseException) -> bool:
     """Whether a GPU had no memory left; gsplat's kernels say so by a RuntimeError of another name."""
-    import torch
-
     if isinstance(error, torch.OutOfMemoryError):
         return True
     return isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
@@ -286,7 +281,9 @@ def _make_trainer(
     folder.mkdir(parents=True, exist_ok=True)
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
-    parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
+    parts = started(
+        with_effects(cell.method.build(cell.options), cell.chosen.effects), cell.start, cell.scene
+    )
     if first is not None:
         parts = replace(parts, mask=FixedMasks(first.keeps))
 

@@ -23,7 +23,7 @@ from ambiguous_wild.report.notes import unequal
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import START_SHARE, Parts
-from ambiguous_wild.viewing.model import Look, Renderer
+from ambiguous_wild.viewing.model import Renderer, RenderSettings
 from tests.io.test_place import UTM, moved
 from tests.viewing.wall_runs import wall_model
 
@@ -97,7 +97,8 @@ def test_a_start_is_in_the_coordinates_of_the_files(tmp_path, kind, shift, scale
     assert isinstance(found, Gaussians) and found.sh_rest.shape == (2500, 8, 3)
     camera = scene.test[0].camera
     here, there = (
-        Renderer(a, Look(sh_degree=2))(camera) for a in (arrays, {k: v.numpy() for k, v in found.items()})
+        Renderer(a, RenderSettings(sh_degree=2))(camera)
+        for a in (arrays, {k: v.numpy() for k, v in found.items()})
     )
     assert here.std() > 10 and psnr(there, here) > (60 if kind == "ply" else 35)
 

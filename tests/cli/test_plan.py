@@ -63,7 +63,7 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
         (["plan", "SCENE", "-o", "SCENE/plan.json"], "would change the scene"),
         (["plan", "SCENE/nothing"], "there is no scene folder"),
         (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "poss"], "did you mean 'poses'"),
-        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "stands alone"),
+        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "cannot be combined"),
         (["bench", "--method", "refinesplat", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
         (
             ["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "plan.json", "--effects", "none"],

@@ -29,7 +29,7 @@ from ambiguous_wild.harness.result_file import (
     SCHEMA,
     Cost,
     Environment,
-    Facts,
+    RunFacts,
     MaskScores,
     Options,
     Provenance,
@@ -242,7 +242,7 @@ class Cell:
         per_image: Sequence[ImageRow] = (),
         missing: Mapping[str, str] | None = None,
         masks: MaskScores | None = None,
-        facts: Facts | None = None,
+        facts: RunFacts | None = None,
         cost: Cost | None = None,
     ) -> RunResult:
         """Return the result of this cell, made by a training or a program; with an error, of a failure.
@@ -255,7 +255,7 @@ class Cell:
             facts: what the method, its effects and the watchdog report.
             cost: time, memory and size.
         """
-        all_facts: Facts = {**(facts or {}), "length": asked_length(self.train)}
+        all_facts: RunFacts = {**(facts or {}), "length": asked_length(self.train)}
         if mixed := mixed_tests(self.scene):
             all_facts["test_photos"] = mixed
         return {

@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.measures import ImageRow, MetricRecord, measure, remember
+from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, MetricRecord, measure, remember
 from ambiguous_wild.io.files import sha256_file, write_json
 from ambiguous_wild.metrics import stats
 
@@ -29,7 +29,7 @@ Count = Annotated[int, Meta(ge=0, le=10**15)]  # more is no number of anything
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
 Options = dict[str, Any]  # plain values of a method's options: every method has its own keys
-Facts = dict[str, Any]  # of a run; beside the keys of `Cell.result`, methods and effects add their own
+RunFacts = dict[str, Any]  # of a run; beside the keys of `Cell.result`, methods and effects add their own
 
 
 def metrics_of(row: ImageRow) -> dict[str, float | None]:
@@ -42,6 +42,12 @@ def mean_of(result: RunResult | None, metric: str) -> float:
     rows = [] if result is None else [metrics_of(row) for row in result["per_image"]]
     values = [row.get(metric) for row in rows if metric in row or not measure(metric).partial]
     return stats.mean([math.nan if value is None else value for value in values])
+
+
+def mask_scores(result: RunResult) -> dict[str, float]:
+    """Return the mask scores that a result has, by the keys of `MASK_LABELS`."""
+    scores = result["masks"] or {}
+    return {k: v for k, v in scores.items() if k in MASK_LABELS and isinstance(v, float | int)}
 
 
 class MaskScores(TypedDict, total=False):
@@ -137,7 +143,7 @@ class RunResult(TypedDict):
     per_image: list[ImageRow]
     missing: dict[str, str]  # metric -> why it is missing
     masks: MaskScores | None  # None: no masks, or no exact ones to compare with
-    facts: Facts  # of the method, its effects and the watchdog
+    facts: RunFacts  # of the method, its effects and the watchdog
     cost: Cost
     config_hash: str
     scene_hash: str

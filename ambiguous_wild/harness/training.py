@@ -23,7 +23,7 @@ from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness import evaluate, pictures
 from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
 from ambiguous_wild.harness.meter import Meter
-from ambiguous_wild.harness.result_file import Cost, Facts, RunResult, TimeRecord
+from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult, TimeRecord
 from ambiguous_wild.io.files import atomic_dir, write_json
 from ambiguous_wild.io.images import read_keep_map, write_png
 from ambiguous_wild.io.ply import write_splat_ply
@@ -386,9 +386,9 @@ def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto])
     return f"{done}{psnr}; model and renders in {folder / STOPPED}; {end}"
 
 
-def _effect_facts(cell: Cell, trainer: Trainer) -> Facts:
+def _effect_facts(cell: Cell, trainer: Trainer) -> RunFacts:
     """Return which effects were on and what they learnt; empty without any."""
-    facts: Facts = {}
+    facts: RunFacts = {}
     if cell.protocol == "half":
         nothing = {"effects": [], "steps": 0}
         facts |= {

@@ -82,8 +82,11 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     ("text", "said"),
     [
         (OWN.replace("* 1", "* wrong"), "NameError: name 'wrong' is not defined (my_metric.py, line 5)"),
-        (OWN.replace("return", "x ="), "metric grey_error: it returned NoneType, not one number"),
-        (OWN.replace("render.std()", "render - 1"), "metric contrast: it returned ndarray, not one number"),
+        (OWN.replace("return", "x ="), "metric grey_error: the function returned NoneType, not one number"),
+        (
+            OWN.replace("render.std()", "render - 1"),
+            "metric contrast: the function returned ndarray, not one number",
+        ),
         (OWN.replace('"grey_error", "grey', '"psnr", "grey'), "metric 'psnr' is one of ours"),
         (OWN.replace('"grey_error", "grey', '"Grey error", "grey'), "'Grey error' cannot name a metric"),
         (OWN.replace('"lower"', '"low"'), "'grey_error': better is 'low': write 'higher', 'lower' or None"),

@@ -29,11 +29,11 @@ from ambiguous_wild.harness.result_file import (
     SCHEMA,
     Cost,
     Environment,
-    RunFacts,
     MaskScores,
     Options,
     Provenance,
     RunConfig,
+    RunFacts,
     RunResult,
     UnusualConfig,
 )

@@ -111,7 +111,7 @@ def _effect_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
 
 
 def _part_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
-    """Pair each variant of an ablation with the unchanged method or, if that has no run, the first variant."""
+    """Pair each variant of an ablation with the unchanged method or, without a run of it, the first one."""
     pairs: dict[Key, Pairs] = {}
     for group in _groups(runs, lambda r: (r.base, r.scene, r.seed, r.length, r.rest, r.effects)):
         plain = [run for run in group if run.method == run.base]

@@ -1,4 +1,4 @@
-"""What `aw export`, `aw video` and `aw view --live` do, as calls."""
+"""Export and film the models of runs, and watch a training, as `aw export`, `aw video`, `aw view --live`."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def export_runs(
 
     Args:
         paths: run folders, or folders of runs.
-        formats: of `viewing.export.FORMATS`.
+        formats: names in `viewing.model.FORMATS`.
         output: folder for all files, named after the models' labels; None = RUN/export.
-        loss: render the test views to measure what rounding costs. Without scene or test views only sizes
+        loss: render the test views to measure the loss by rounding; without scene or test views only sizes
             are reported.
         scene_folder: where the scene lies; None = where the runs say.
-        threads: of the kernels; None = all.
-        overwrite: replace files of these names in `output`; those in RUN/export are replaced anyway.
-        say: told what is left out, and why.
+        threads: threads of the kernels; None = all cores.
+        overwrite: replace files of these names in `output`; those in RUN/export are always replaced.
+        say: gets a line about each run that is left out.
 
     Returns:
         (label of the model, its files), in the order of the runs' paths.
@@ -66,33 +66,32 @@ def export_runs(
     Raises:
         AwError: no run with a model, a folder that cannot be written, or files of these names in `output`.
     """
-    found, notes = find_models(paths)
+    trained, notes = find_models(paths)
     for note in notes:
         say(note)
-    names = _file_names([f.scene for f in found], [f.model.label for f in found])
-    for f in found:
-        check_output((f.run / FOLDER if output is None else output) / "file")
+    names = _file_names([t.scene for t in trained], [t.model.label for t in trained])
+    for t in trained:
+        check_output((t.run / FOLDER if output is None else output) / "file")
     if output is not None and not overwrite:
         wanted = [FORMATS[form][0] for form in formats if form in FORMATS]
         refuse_files_there(output, (name + ending for name in names for ending in wanted), "--overwrite")
     if loss:
         prepare_cpu(threads, say)
     reports = []
-    for f, name in zip(found, names):
+    for t, name in zip(trained, names):
         views: tuple[View, ...] = ()
         if loss:
             try:
-                views = open_scene(f.run, scene_folder).test
+                views = open_scene(t.run, scene_folder).test
             except AwError as error:
-                say(f"{f.model.label}: loss not measured: {error}")
-        folder, stem = (f.run / FOLDER, "point_cloud") if output is None else (output, name)
-        reports.append((f.model.label, export(f.model, folder, formats, views, name=stem)))
+                say(f"{t.model.label}: the loss is not measured: {error}")
+        folder, stem = (t.run / FOLDER, "point_cloud") if output is None else (output, name)
+        reports.append((t.model.label, export(t.model, folder, formats, views, name=stem)))
     return reports
 
 
 def _file_names(scenes: Sequence[str], labels: Sequence[str]) -> list[str]:
-    """A file name for each model: letters, digits and a few signs of its label, after its scene's name where
-    there are several scenes, made unique by a number."""
+    """Return a unique file name for each model, from its label and, with several scenes, the scene's name."""
     several = len(set(scenes)) > 1
     taken: dict[str, int] = {}
     names = []
@@ -110,7 +109,7 @@ PATHS = ("test", "orbit")
 
 @dataclass(frozen=True)
 class Video:
-    """What was written."""
+    """The video that was written."""
 
     path: Path
     gif: Path | None
@@ -144,14 +143,15 @@ def video_runs(
         output: the .mp4 file.
         path: "test" (through the test cameras), "orbit", or a file of a viewer.
         seconds, fps: length and frames per second.
-        width: of each method's picture, px; None = the photos'.
-        columns: pictures in a row.
-        gif: also an animation of the video, played faster so that it lasts `gif_seconds`.
-        gif_seconds, gif_width: its length and width, px.
-        scene: name of the scene, where the runs are of several.
-        scene_folder: where it lies; None = where the runs say.
-        threads: of the kernels; None = all.
-        say, tick: told what is done.
+        width: width of each method's picture, px; None = that of the photos.
+        columns: number of pictures in a row.
+        gif: path of an animation, the video played faster so that it lasts `gif_seconds`; None = none.
+        gif_seconds, gif_width: length and width in px of the animation.
+        scene: name of the scene to show, if the runs are of several.
+        scene_folder: where the scene lies; None = where the runs say.
+        threads: threads of the kernels; None = all cores.
+        say: gets notes about the models.
+        tick: called with (frames done, frames).
 
     Raises:
         AwError: no run with a model, several scenes, no scene, no camera path, or no place for the file.
@@ -199,8 +199,8 @@ def _cameras(scene: Scene, path: str | Path, frames: int, width: int | None) -> 
     return from_file(Path(path), scene, frames, size)
 
 
-class Watched(Callbacks):
-    """Shows every step of a run to a live view."""
+class ShowInView(Callbacks):
+    """Callbacks that show every step of a run in a live view."""
 
     def __init__(self, view: LiveView, say: Callable[[str], None] = lambda text: None) -> None:
         self.view, self._say = view, say
@@ -209,7 +209,7 @@ class Watched(Callbacks):
         self._say(text)
 
     def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
-        assert one_by_one, "only then is tick called"
+        assert one_by_one, "tick is called only in this process"
 
     def started(self, cell: Cell, folder: Path) -> None:
         self._say(f"{run_name(cell)} -> {folder}")
@@ -218,9 +218,9 @@ class Watched(Callbacks):
         self.view.tick(trainer)
 
     def ended(self, cell: Cell, report: CellReport) -> None:
-        told = f"{run_name(cell)}: {outcome_line(report)}"
-        self.view.end(told)
-        self._say(told)
+        line = f"{run_name(cell)}: {outcome_line(report)}"
+        self.view.end(line)
+        self._say(line)
 
 
 def watch(
@@ -242,14 +242,14 @@ def watch(
     """Train a method on a scene and show it in a browser.
 
     Args:
-        scene: its folder.
+        scene: folder of the scene.
         method: as `aw bench --method`.
-        output: folder of the run, as `aw bench -o`; a run that stopped goes on.
+        output: folder of the run, as `aw bench -o`; a stopped run is resumed.
         iterations, max_gaussians, seed, threads, device: as in `bench`.
-        host, port: where the page is served.
+        host, port: address of the page.
         paused: pause after the first step.
-        say: told the address and the outcome.
-        view: a view to use instead of a new one; it stays open.
+        say: gets the address and the outcome.
+        view: a view to use instead of a new one; it is not closed.
 
     Raises:
         AwError: viser is missing, the port is taken, or the run failed.
@@ -269,7 +269,7 @@ def watch(
             threads=threads,
             device=device,  # type: ignore[arg-type]
             jobs=1,
-            callbacks=Watched(shown, say),
+            callbacks=ShowInView(shown, say),
         )
     finally:
         if view is None:

@@ -100,7 +100,7 @@ def _most(yes: np.ndarray | None, at: np.ndarray, sure: np.ndarray | None) -> bo
 
 
 BINS = np.linspace(0.0, math.sqrt(3.0), 53)  # edges of the residual's histogram
-# longer side of the photos for labhog, which has cells of 4 px: its scores must not depend on the photos' size
+# longer side of the photos for labhog, which has cells of 4 px: scores must not depend on the photos' size
 LOOKS_PX = 240
 FIT_PHOTOS = 24  # number of evenly spaced photos that features are fitted to
 Bar = Callable[[list[View]], Iterable[View]]

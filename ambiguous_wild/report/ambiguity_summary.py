@@ -19,9 +19,9 @@ from ambiguous_wild.report.ambiguity_measure import (
 )
 
 LOOKS = (
-    "weight-free features compare looks, not meaning: a distractor with the texture of a static object counts "
-    "as similar to it, and a red statue as different from a stone statue; --objects names the static objects "
-    "to compare with, --features dinov2-small compares kinds of objects"
+    "weight-free features compare looks, not meaning: a distractor with the texture of a static object "
+    "counts as similar to it, and a red statue as different from a stone statue; --objects names the static "
+    "objects to compare with, --features dinov2-small compares kinds of objects"
 )
 NAMED = "weight-free features compare looks, not meaning; compared with the objects of --objects"
 NO_DISTRACTORS = "no distractors"  # the class of a scene whose masks are empty

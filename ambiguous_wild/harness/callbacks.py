@@ -55,7 +55,7 @@ class Callbacks:
     """Called while runs are made; does nothing. A subclass overrides what it needs."""
 
     def say(self, text: str) -> None:
-        """One line: effects that a plan chose, a warning, what is compiled, the cluster."""
+        """A line for the user is due: effects of a plan, a warning, a compilation, the cluster."""
 
     def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
         """The runs are planned. `one_by_one`: they run in this process; only then is `tick` called."""

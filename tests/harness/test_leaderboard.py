@@ -299,7 +299,7 @@ def test_check_finds_what_was_changed_by_hand(runs: Path, tmp_path: Path) -> Non
     found = aw("check", "--board", tmp_path)
     assert found.exit_code == 2
     for part in (
-        "same numbers in all digits",
+        "agree in all digits",
         "same configuration hash",
         "tiny-set.csv row 7 (3dgs on wall with seed 7 (100 iterations)) was changed by hand",
     ):

@@ -54,28 +54,6 @@ def line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def demo() -> list[str]:
-    with (RESULTS / "demo.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    shown: dict[str, tuple[str, int]] = {
-        "psnr": (".2f", 1), "psnr_covered": (".2f", 1), "ssim": (".3f", 1), "lpips_alex": (".3f", -1),
-        "mask_iou": (".3f", 1), "train_s": (".1f", -1), "ms_per_iteration": (".1f", -1), "fps": (".1f", 1),
-        "gaussians": (",.0f", 0),
-    }  # fmt: skip
-    columns = []
-    for name, (form, sign) in shown.items():
-        numbers = [float(row[name]) if row[name] else None for row in rows]
-        best = max((sign * x for x in numbers if x is not None), default=0.0)
-        text = ["—" if x is None else format(x, form).replace(",", " ") for x in numbers]
-        columns.append(
-            [
-                f"**{t}**" if sign and x is not None and sign * x == best else t
-                for t, x in zip(text, numbers, strict=True)
-            ]
-        )
-    return [line([row["method"], *cells]) for row, *cells in zip(rows, *columns, strict=True)]
-
-
 def means() -> list[str]:
     board: dict[tuple[str, str], list[float]] = defaultdict(list)
     for name in ("simulated", "composites"):
@@ -113,23 +91,6 @@ def _means(label: str, found: dict[str, float]) -> str:
     return line([label, *bold(cells, numbers, range(len(RANKED)))])
 
 
-def speed() -> list[str]:
-    cases = json.loads((RESULTS / "rasterizer.json").read_text(encoding="utf-8"))["cases"]
-    labels = {
-        "render": "render (blending)", "loss": "loss with SSIM", "backward": "backward (blending)",
-        "adam": "Adam", "iteration": "whole iteration",
-    }  # fmt: skip
-    blending = {"render": "blend forward", "backward": "blend backward"}
-
-    def cell(parts: dict[str, dict[str, float]], part: str) -> str:
-        inner = f" ({parts[blending[part]]['best_ms']:.1f})" if part in blending else ""
-        return f"{parts[part]['best_ms']:.1f} ms{inner}"
-
-    return [
-        line([label, *(cell(case["parts"], part) for case in cases[:2])]) for part, label in labels.items()
-    ]
-
-
 def captures() -> list[str]:
     labels = {
         "plain": "plain, distinct colours", "colour": "colour of the background",
@@ -146,7 +107,7 @@ def captures() -> list[str]:
     for name, label in labels.items():
         rows = found[f"courtyard-{name}"]
         psnr.append([value(rows[method]["PSNR dB"]) for method in methods])
-        cells = bold([rows[m]["PSNR dB"].replace("+-", "±") for m in methods], psnr[-1], range(4))
+        cells = bold([f"{x:.2f}" for x in psnr[-1]], psnr[-1], range(4))
         for k in masks:
             row = rows[methods[k]]
             if name == "clean":
@@ -181,18 +142,9 @@ def composites() -> list[str]:
     return lines
 
 
-def worlds() -> list[str]:
-    methods = ("3dgs", "robustsplat", "refinesplat", "3dgs+truth")
-    lines = []
-    for capture, rows in sections("worlds.md").items():
-        cells = [rows[method]["PSNR dB"] for method in methods]
-        lines.append(line([f"`{capture}`", *bold(cells, [value(cell) for cell in cells], range(3))]))
-    return lines
-
-
 TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
-    "README.md": {"demo": demo, "means": means, "speed": speed},
-    "docs/refinesplat.md": {"captures": captures, "composites": composites, "worlds": worlds},
+    "README.md": {"means": means},
+    "docs/refinesplat.md": {"captures": captures, "composites": composites},
 }
 
 

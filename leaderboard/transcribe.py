@@ -3,7 +3,7 @@
     python leaderboard/transcribe.py paper.tex -o ambiguous_wild/report/reported
 
 Numbers are copied, never corrected. What the table itself does not say (which scene an ablation is on, which
-variant of a metric) comes from the text around it, or is "unknown". docs/audit.md describes the columns.
+variant of a metric) comes from the text around it, or is "unknown". docs/tables.md describes the columns.
 """
 
 from __future__ import annotations

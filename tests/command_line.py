@@ -23,8 +23,8 @@ def aw(*words: object, cwd: Path = ROOT) -> CompletedProcess[str]:
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", line)
-        patch.setattr(registry, "_registered", {})
-        patch.setattr(measures, "_own", {})
+        patch.setattr(registry, "registered", {})
+        patch.setattr(measures, "own_metrics", {})
         patch.chdir(cwd)
         try:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

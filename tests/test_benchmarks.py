@@ -1,5 +1,7 @@
 """Scripts of benchmarks/: they start; the sums of the table of captures by hand."""
 
+import csv
+import json
 import re
 import runpy
 import sys
@@ -66,6 +68,15 @@ def test_a_missing_run_is_missing_and_not_zero(report):
     assert got["best"] == "3dgs"
     assert got["iou_beats_both"] == []
     assert got["gaussians_ratio"]["a"] is None
+
+
+def test_the_readme_quotes_the_demo_and_the_speed_of_the_result_files():
+    readme, results = (BENCHMARKS.parent / "README.md").read_text(encoding="utf-8"), BENCHMARKS / "results"
+    with (results / "demo.csv").open(encoding="utf-8", newline="") as file:
+        first, second = (float(row["psnr"]) for row in csv.DictReader(file))
+    assert f"{first:.2f} dB with 3DGS and {second:.2f} dB with RefineSplat" in readme
+    for case in json.loads((results / "rasterizer.json").read_text(encoding="utf-8"))["cases"][:2]:
+        assert f"{case['parts']['iteration']['best_ms']:.1f} ms" in readme
 
 
 def test_the_tables_of_readme_and_docs_are_those_of_the_result_files():

@@ -1,6 +1,6 @@
-"""`aw capture`: sharp frames of a video or a camera, or copies of the photos in a folder.
+"""`aw capture`: sharp frames of videos or a camera, or copies of the photos in folders.
 
-RAW/<stem>.jpg ...   frames, or byte-for-byte copies with their EXIF
+RAW/<stem>.jpg ...   frames, or byte-for-byte copies with their EXIF; of several sources, in folders
 RAW/capture.json     origin, time and sharpness of each photo; files left out, and why
 
 The folder appears complete or not at all.
@@ -8,21 +8,30 @@ The folder appears complete or not at all.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
+import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 
 from ambiguous_wild import __version__
-from ambiguous_wild.builder.collect import MIN_PHOTOS, collect
+from ambiguous_wild.builder.collect import (
+    MIN_PHOTOS,
+    NO_PHOTOS,
+    VIDEO_SUFFIXES,
+    Capture,
+    clean_stem,
+    collect,
+    videos_in,
+)
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.records import CapturedPhoto, CaptureRecord, FrameCounts, LeftOut
+from ambiguous_wild.builder.records import CapturedPhoto, CaptureRecord, FrameCounts, Kind, LeftOut
 from ambiguous_wild.builder.screen import sharpness, without_copies
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.files import atomic_dir, check_output, write_json
@@ -30,6 +39,7 @@ from ambiguous_wild.io.photos import UnreadablePhoto, read_photo
 
 QUALITY = 97  # of JPEG; video is compressed harder
 RECORD = "capture.json"
+_HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273 that no 8-bit photo has
 _WARM_UP = 10  # frames until a camera's exposure and colour are stable
 
 
@@ -43,68 +53,170 @@ class VideoFrame:
     pixels: np.ndarray  # [H, W, 3] uint8, BGR
 
 
-def photos_from_folder(folder: Path, out: Path, *, jobs: int = 1, bar: Bar | None = None) -> CaptureRecord:
-    """Copy the readable photos of a folder byte for byte, each once.
+def photos_from(
+    sources: Sequence[Path], out: Path, *, frames: int = 60, jobs: int = 1, bar: Bar | None = None
+) -> CaptureRecord:
+    """Copy the readable photos of folders, each once, and save sharp frames of videos.
+
+    A frame is the sharpest of one of `frames` stretches of a video that are equally long, by the frames' time
+    stamps; a video with fewer frames gives all it has. Photos of several sources go to a folder each. One
+    frame is in memory at a time.
+
+    Args:
+        sources: folders and videos; a folder stands for all in it but videos beside photos.
+        out: the folder to make.
+        frames: of each video.
+        jobs: threads.
+        bar: progress.
 
     Raises:
-        AwError: no folder, too few readable photos, or `out` exists.
+        AwError: too few photos that can be read, a video that cannot be read or is HDR, or `out` exists.
     """
     check_free(out)
     bar = bar or Bar(False)
-    capture = collect(folder, jobs)
-    if out.resolve().is_relative_to(capture.root):
-        raise AwError(f"{out} lies inside {folder}; choose another -o")
+    folders = [s for s in sources if s.is_dir()]
+    if within := next((s for s in folders if out.resolve().is_relative_to(s.resolve())), None):
+        raise AwError(f"{out} lies inside {within}; choose another -o")
+    videos = [v for s in sources for v in (videos_in(s) if s.is_dir() else [s])]
+    capture = collect(folders, jobs, least=0 if videos else MIN_PHOTOS) if folders else None
+    for note in capture.notes if capture else ():
+        bar.say(note)
+    groups = dict.fromkeys(s.folder for s in capture.sources) if capture else {}
+    several = len(groups) + len(videos) > 1
+    taken_names = {"images", "train", "test", *NO_PHOTOS}  # mean something to `collect`
+
+    def place(name: str) -> str:
+        """A folder of that name that no other source has, the photos' own folder for a single source."""
+        number, free = 2, clean_stem(name)
+        while free.casefold() in taken_names:
+            free, number = f"{clean_stem(name)}_{number}", number + 1
+        taken_names.add(free.casefold())
+        return free if several else ""
+
+    places = {k: place(k or folders[0].resolve().name) for k in groups}
+    photos: list[CapturedPhoto] = []
+    left: list[LeftOut] = []
+    records: list[FrameCounts] = []
+    with atomic_dir(out, replace=False) as folder:
+        if capture is not None:
+            photos, left = _copy(capture, places, folder, bar)
+            stems = {PurePosixPath(s.relative).stem.casefold() for s in capture.sources}
+            left += [
+                {"source": str(name), "why": "a video beside photos: give it as a source"}
+                for name in map(PurePosixPath, capture.ignored)
+                if name.suffix.lower() in VIDEO_SUFFIXES and name.stem.casefold() not in stems
+            ]
+        side = "train" if capture and capture.has_sides else ""
+        for video in videos:
+            prefix = "".join(f"{part}/" for part in (side, place(video.stem)) if part and several)
+            taken, counts = _frames_of(video, folder / prefix, frames, bar)
+            for photo in taken if several else ():
+                photo["photo"], photo["source"] = prefix + photo["photo"], video.name
+            photos += taken
+            records.append({"source": str(video), **counts})
+        if len(photos) < MIN_PHOTOS:
+            why = f": {left[0]['source']} ({left[0]['why']})" if left else ""
+            named = ", ".join(map(str, sources))
+            raise AwError(f"only {len(photos)} photos of {named} can be used, {MIN_PHOTOS} are needed{why}")
+        kind: Kind = "folder" if not videos else "several" if several else "video"
+        return _record(folder, kind, ", ".join(s.name for s in sources), photos, left, records)
+
+
+def _copy(
+    capture: Capture, places: dict[str, str], folder: Path, bar: Bar
+) -> tuple[list[CapturedPhoto], list[LeftOut]]:
+    """Copy each photo byte for byte, once, to the place of its folder."""
     sources, copies = without_copies(capture)
     left: list[LeftOut] = [{"source": c, "why": f"the same file as {kept}"} for c, kept in copies.items()]
     photos: list[CapturedPhoto] = []
     bar.start("photos", len(sources))
-    with atomic_dir(out, replace=False) as folder_:
-        for source in sources:
-            bar.step()
-            try:
-                _, pixels = read_photo(source.path)
-            except UnreadablePhoto as error:
-                left.append({"source": source.relative, "why": error.reason})
-                continue
-            target = folder_ / (source.side or "") / source.work_name
-            target.parent.mkdir(exist_ok=True)
-            shutil.copyfile(source.path, target)
-            name = target.relative_to(folder_).as_posix()
-            photos.append(
-                {"photo": name, "source": source.relative, "sharpness": round(sharpness(pixels), 1)}
-            )
-        bar.finish()
-        if len(photos) < MIN_PHOTOS:
-            why = f": {left[0]['source']} ({left[0]['why']})" if left else ""
-            raise AwError(f"only {len(photos)} photos of {folder} can be used, {MIN_PHOTOS} are needed{why}")
-        return _record(folder_, "folder", Path(folder).name, photos, left)
+    for source in sources:
+        bar.step()
+        try:
+            _, pixels = read_photo(source.path)
+        except UnreadablePhoto as error:
+            left.append({"source": source.relative, "why": error.reason})
+            continue
+        side = source.side or ("train" if capture.has_sides else "")
+        # its folder tells it apart from now on
+        name = source.work_name.removeprefix(f"{source.folder}_" if source.folder else "")
+        target = folder / side / places[source.folder] / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists():  # `train_a.jpg` of train/ and the like
+            target = target.with_name(source.work_name)
+        shutil.copyfile(source.path, target)
+        relative = target.relative_to(folder).as_posix()
+        photos.append(
+            {"photo": relative, "source": source.relative, "sharpness": round(sharpness(pixels), 1)}
+        )
+    bar.finish()
+    return photos, left
 
 
-def photos_from_video(video: Path, out: Path, *, frames: int, bar: Bar | None = None) -> CaptureRecord:
-    """Save the sharpest frame of each of `frames` equal parts of a video; one frame is in memory at a time.
-
-    A video with fewer frames gives all it has.
-
-    Raises:
-        AwError: OpenCV cannot read the video, it has fewer frames than a scene needs, or `out` exists.
-    """
-    check_free(out)
-    bar = bar or Bar(False)
-    total, announced = _count(video, bar)
-    if total < MIN_PHOTOS:
-        raise AwError(f"{video} has {total} frames, a scene needs {MIN_PHOTOS}; give a longer video")
-    frames = min(frames, total)
+def _frames_of(video: Path, folder: Path, frames: int, bar: Bar) -> tuple[list[CapturedPhoto], FrameCounts]:
+    """Write the frames of one video into `folder`."""
+    if curve := hdr_curve(video):
+        raise AwError(
+            f"{video} is HDR video ({curve}), whose colours 8 bits do not hold; film without HDR, or "
+            f"convert it: ffmpeg -i {shlex.quote(video.name)} -vf zscale=t=linear:npl=100,format=gbrpf32le,"
+            "zscale=p=bt709,tonemap=hable:desat=0,zscale=t=bt709:m=bt709:r=tv,format=yuv420p -crf 12 sdr.mp4"
+        )
+    times, announced = _times(video, bar)
+    total = len(times)
+    parts = stretches(times, frames)
+    expected = len(set(np.searchsorted(parts, times, side="right")))
     bar.start("frames", total)
-    parts = [round(k * total / frames) for k in range(frames + 1)]
-    with atomic_dir(out, replace=False) as folder:
-        photos = _write(sharpest(_read(video, bar), parts), folder)
-        bar.finish()
-        if len(photos) < frames:
-            raise AwError(
-                f"{video} broke off: {len(photos)} of {frames} frames could be read; repair or convert it"
-            )
-        counts: FrameCounts = {"frames_read": total, "frames_announced": announced}
-        return _record(folder, "video", video.name, photos, [], counts)
+    folder.mkdir(parents=True, exist_ok=True)
+    photos = _write(sharpest(_read(video, times, bar), parts), folder)
+    bar.finish()
+    if len(photos) < expected:
+        raise AwError(
+            f"{video} broke off: {len(photos)} of {expected} frames could be read; repair or convert it"
+        )
+    if expected < min(frames, total):
+        bar.say(f"{video}: {min(frames, total) - expected} of {frames} equally long stretches hold no frame")
+    return photos, {"frames_read": total, "frames_announced": announced}
+
+
+def stretches(times: Sequence[float], frames: int) -> list[float]:
+    """Limits in seconds of `frames` equally long stretches of a video; of fewer frames, one a stretch.
+
+    Args:
+        times: of its frames, seconds, ascending.
+        frames: wanted.
+    """
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    first, end = times[0] - step / 2, times[-1] + step / 2
+    if frames >= len(times):
+        return [first, *((a + b) / 2 for a, b in itertools.pairwise(times)), end]
+    return [first + k * (end - first) / frames for k in range(frames + 1)]
+
+
+def hdr_curve(video: Path) -> str | None:
+    """ "PQ" or "HLG" where the container (MP4, MOV, Matroska) states it; the picture data are not searched.
+
+    OpenCV reduces such frames to 8 bits without their transfer curve: flat and pale.
+    """
+    with open(video, "rb") as f:
+        head = f.read(1 << 20)
+        if head[:4] == b"\x1aE\xdf\xa3":  # Matroska: before the first cluster
+            at = head.partition(b"\x1fC\xb6u")[0].rpartition(b"\x55\xba\x81")[2][:1]
+            return _HDR.get(at[0]) if at and b"\x55\xba\x81" in head else None
+        f.seek(0)
+        while len(box := f.read(8)) == 8:  # of MP4: size, kind
+            size = int.from_bytes(box[:4], "big")
+            header = 8
+            if size == 1:
+                size, header = int.from_bytes(f.read(8), "big"), 16
+            if box[4:] == b"moov":
+                inner = f.read(min(size - header, 1 << 26)) if size else f.read(1 << 26)
+                found = inner.find(b"colrncl")  # nclx, in MOV nclc: primaries, transfer, matrix
+                curve = int.from_bytes(inner[found + 10 : found + 12], "big")
+                return _HDR.get(curve) if found >= 0 else None
+            if size < header:
+                return None
+            f.seek(size - header, os.SEEK_CUR)
+    return None
 
 
 def photos_from_camera(
@@ -130,8 +242,9 @@ def photos_from_camera(
         step = max(round(fps * every_s), 1)
         bar.start("frames", frames * step)
         with atomic_dir(out, replace=False) as folder:
-            parts = [k * step for k in range(frames + 1)]
-            photos = _write(sharpest(_frames(reader, fps, bar, frames * step), parts), folder)
+            parts = [k * step / fps for k in range(frames + 1)]
+            taken = (i / fps for i in range(frames * step))
+            photos = _write(sharpest(_frames(reader, taken, bar), parts), folder)
             bar.finish()
             if len(photos) < frames:
                 raise AwError(
@@ -144,26 +257,26 @@ def photos_from_camera(
 
 def sharpest(
     frames: Iterator[tuple[int, float, np.ndarray]],  # index, seconds, BGR
-    parts: list[int],  # first frame of each part, and the end
+    parts: Sequence[float],  # seconds: where each part begins, and the end
 ) -> Iterator[VideoFrame]:
     """The sharpest frame in the middle half of each part; of equally sharp frames the first.
 
-    So neighbours are never closer than half a part.
+    So neighbours are never closer than half a part. A part without a frame is passed over.
     """
     best: VideoFrame | None = None
     k = 0
     for index, time_s, pixels in frames:
-        while k + 1 < len(parts) - 1 and index >= parts[k + 1]:
+        while k + 1 < len(parts) - 1 and time_s >= parts[k + 1]:
             if best is not None:
                 yield best
             best, k = None, k + 1
         first, last = parts[k], parts[k + 1]
         quarter = (last - first) / 4
-        if best is not None and not first + quarter <= index < last - quarter:
+        if best is not None and not first + quarter <= time_s < last - quarter:
             continue
         score = sharpness(np.ascontiguousarray(pixels[:, :, ::-1]))
-        inside = first + quarter <= index < last - quarter
-        was_inside = best is not None and first + quarter <= best.index < last - quarter
+        inside = first + quarter <= time_s < last - quarter
+        was_inside = best is not None and first + quarter <= best.time_s < last - quarter
         # The first frame of a part is kept until the middle half begins: no part is empty.
         if best is None or (inside and not was_inside) or score > best.sharpness:
             best = VideoFrame(index, time_s, score, pixels.copy())
@@ -205,39 +318,40 @@ def _opened(video: Path) -> cv2.VideoCapture:
     return reader
 
 
-def _count(video: Path, bar: Bar) -> tuple[int, int | None]:
-    """Number of frames that can be decoded, and the number in the header, which is often wrong."""
+def _times(video: Path, bar: Bar) -> tuple[list[float], int | None]:
+    """When each frame that can be decoded is shown, seconds from the first; the header's number of them."""
     reader = _opened(video)
-    announced = reader.get(cv2.CAP_PROP_FRAME_COUNT)
+    announced, fps = reader.get(cv2.CAP_PROP_FRAME_COUNT), reader.get(cv2.CAP_PROP_FPS)
     bar.start("counting frames", None)
-    count = 0
+    stamps = []
     while reader.grab():
-        count += 1
+        stamps.append(reader.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         bar.step()
     reader.release()
     bar.finish()
-    if count == 0:
+    if not stamps:
         raise AwError(f"{video} is no video that can be read (no frame in it)")
-    return count, round(announced) if math.isfinite(announced) and 0 < announced < 1e9 else None
+    times = [stamp - stamps[0] for stamp in stamps]
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():  # a stream without time stamps
+        fps = fps if math.isfinite(fps) and fps > 0 else 30.0
+        times = [index / fps for index in range(len(times))]
+    return times, round(announced) if math.isfinite(announced) and 0 < announced < 1e9 else None
 
 
-def _read(video: Path, bar: Bar) -> Iterator[tuple[int, float, np.ndarray]]:
+def _read(video: Path, times: Sequence[float], bar: Bar) -> Iterator[tuple[int, float, np.ndarray]]:
     reader = _opened(video)
-    fps = reader.get(cv2.CAP_PROP_FPS)
-    yield from _frames(reader, fps if math.isfinite(fps) and fps > 0 else 30.0, bar, None)
+    yield from _frames(reader, times, bar)
     reader.release()
 
 
 def _frames(
-    reader: cv2.VideoCapture, fps: float, bar: Bar, most: int | None
+    reader: cv2.VideoCapture, times: Iterable[float], bar: Bar
 ) -> Iterator[tuple[int, float, np.ndarray]]:
-    index = 0
-    while most is None or index < most:
+    for index, time_s in enumerate(times):
         there, pixels = reader.read()
         if not there:
             return
-        yield index, index / fps, pixels
-        index += 1
+        yield index, time_s, pixels
         bar.step()
 
 
@@ -262,19 +376,23 @@ def _write(frames: Iterator[VideoFrame], folder: Path) -> list[CapturedPhoto]:
 
 def _record(
     folder: Path,
-    kind: Literal["folder", "video", "camera"],
+    kind: Kind,
     source: str,
     photos: list[CapturedPhoto],
     left_out: list[LeftOut],
-    frames: FrameCounts | None = None,  # of a video
+    videos: Sequence[FrameCounts] = (),
 ) -> CaptureRecord:
     record: CaptureRecord = {
         "version": __version__,
         "kind": kind,
         "source": source,
-        **(frames or FrameCounts()),
         "photos": photos,
         "left_out": left_out,
     }
+    if kind == "several":
+        record["videos"] = list(videos)
+    elif videos:
+        record["frames_read"] = videos[0]["frames_read"]
+        record["frames_announced"] = videos[0]["frames_announced"]
     write_json(folder / RECORD, record)
     return record

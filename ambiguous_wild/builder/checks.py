@@ -30,6 +30,7 @@ from ambiguous_wild.builder.screen import (
     BLUR_RATIO,
     NEAR_DUPLICATE,
     exposure_stops,
+    panorama_warnings,
     read_capture,
 )
 from ambiguous_wild.core.errors import AwError, shortlist
@@ -150,6 +151,8 @@ def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
 
 def focal_length(facts: Sequence[CheckedPhoto]) -> Check:
     """One focal length per camera and one picture size, as a single-camera model assumes."""
+    if wide := panorama_warnings(facts):
+        return Check("focal length", "warning", "picture size", wide[0])
     advice = "do not zoom; or build with --camera per-image"
     spans = []
     for camera in sorted({f["camera"] or "" for f in facts}):
@@ -274,7 +277,9 @@ class CaptureReport:
         return [c for c in self.checks if c.state == "warning"]
 
 
-def check_capture(raw: Path | str, *, jobs: int = 1, bar: Bar | None = None) -> CaptureReport:
+def check_capture(
+    raw: Path | str | Sequence[Path | str], *, jobs: int = 1, bar: Bar | None = None
+) -> CaptureReport:
     """Check the capture in a folder of photos.
 
     Raises:
@@ -282,6 +287,8 @@ def check_capture(raw: Path | str, *, jobs: int = 1, bar: Bar | None = None) -> 
     """
     bar = bar or Bar(False)
     capture = collect(raw, jobs)
+    for note in capture.notes:
+        bar.say(note)
     read = read_capture(
         capture,
         lambda _, __, pixels: (noise(pixels), photo_features(pixels)),

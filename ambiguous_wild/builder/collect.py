@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import os
 import re
 import unicodedata
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -22,6 +24,9 @@ from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
+Side = Literal["train", "test"] | None
+NO_PHOTOS = ("masks", "truth")  # folders beside those of photos
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp")
 _MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the usual 255
 
 
@@ -32,8 +37,9 @@ class Source:
     path: Path  # absolute
     relative: str  # path relative to the capture folder
     stem: str  # unique in the scene; its files are <stem>.png
-    side: Literal["train", "test"] | None  # from the sub-folder, if the capture has them
+    side: Side  # from the sub-folder, if the capture has them
     sha256: str
+    folder: str = ""  # of several, a name that no other has; its stem starts with it
 
     @property
     def work_name(self) -> str:
@@ -43,52 +49,82 @@ class Source:
 
 @dataclass(frozen=True)
 class Capture:
-    """The user's folder of photos; it is not changed."""
+    """The user's folders of photos; they are not changed."""
 
-    root: Path
+    root: Path  # of several folders the one that holds them
     sources: tuple[Source, ...]  # natural order of their relative names
     has_sides: bool  # the photos are in train/ and test/
     truth: Path | None  # truth/ of a simulated capture
     ignored: tuple[str, ...]  # names of other files
+    notes: tuple[str, ...] = ()  # which folders are read, and which are not
 
 
-def collect(raw: Path | str, jobs: int = 1) -> Capture:
-    """List the photos of a capture folder: directly in it, in images/, or in train/ and test/.
+def collect(
+    raw: Path | str | Sequence[Path | str], jobs: int = 1, masks: Path | None = None, least: int = MIN_PHOTOS
+) -> Capture:
+    """List the photos of one capture folder or of several: directly in it, in images/, in train/ and test/.
+
+    A folder without photos of its own stands for the folders in it, at any depth.
+
+    Args:
+        raw: one folder, or several that become one capture.
+        jobs: threads.
+        masks: the user's folder of masks, which is not one of photos.
+        least: photos that are enough.
 
     Raises:
         AwError: no folder, no photo, too few photos, or only one of train/ and test/.
     """
-    root = Path(raw).resolve()
-    if not root.is_dir():
-        what = "is a file; give the folder of photos" if root.exists() else "does not exist"
-        raise AwError(f"capture {raw} {what}")
-    folders = _photo_folders(root)
-    files: list[tuple[Path, Literal["train", "test"] | None]] = []
+    given = [raw] if isinstance(raw, (str, Path)) else list(raw)
+    roots = _check_roots(given)
+    root = Path(os.path.commonpath(roots))
+    folders = [found for one in roots for found in _photo_folders(one, masks)]
+    files: list[tuple[Path, Side]] = []
+    labels: list[str] = []
     ignored: list[str] = []
-    for folder, side in folders:
+    for (folder, side), label in zip(folders, _labels(root, folders), strict=True):
         for path in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
             if path.name.startswith(".") or not path.is_file():
                 continue
             if path.suffix.lower() in PHOTO_SUFFIXES:
                 files.append((path, side))
+                labels.append(label)
             else:
                 ignored.append(path.name)
     # Python keeps other bytes as surrogates, which no list and no other program can hold.
     if odd := [ascii(p.name) for p, _ in files if str(p) != str(p).encode(errors="ignore").decode()]:
         raise AwError(f"names of photos in {root} are not UTF-8: {shortlist(odd)}; rename them")
-    if len(files) < MIN_PHOTOS:
+    if len(files) < least:
         raise AwError(_too_few(root, len(files), ignored))
     with ThreadPoolExecutor(jobs) as pool:
         digests = list(pool.map(lambda item: sha256_file(item[0]), files))
-    stems = _unique_stems(files)
+    stems = _unique_stems(files, labels)
     sources = tuple(
-        Source(path, path.relative_to(root).as_posix(), stem, side, digest)
-        for (path, side), stem, digest in zip(files, stems, digests)
+        Source(path, path.relative_to(root).as_posix(), stem, side, digest, label)
+        for (path, side), stem, digest, label in zip(files, stems, digests, labels, strict=True)
     )
     truth = root / "truth"
     return Capture(
-        root, sources, folders[0][1] is not None, truth if truth.is_dir() else None, tuple(sorted(ignored))
+        root,
+        sources,
+        any(side for _, side in folders),
+        truth if truth.is_dir() and len(roots) == 1 else None,
+        tuple(sorted(ignored)),
+        tuple(_folder_notes(roots, folders, labels, masks)),
     )
+
+
+def _check_roots(given: Sequence[Path | str]) -> list[Path]:
+    roots: list[Path] = []
+    for raw in given:
+        root = Path(raw).resolve()
+        if not root.is_dir():
+            what = "is a file; give the folder of photos (of a video, see 'aw capture')"
+            raise AwError(f"capture {raw} {what if root.exists() else 'does not exist'}")
+        if other := next((r for r in roots if r.is_relative_to(root) or root.is_relative_to(r)), None):
+            raise AwError(f"{raw} and {other} are or hold the same folder; give each once")
+        roots.append(root)
+    return roots
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -105,16 +141,69 @@ def identical(capture: Capture) -> list[list[str]]:
     return [names for names in groups.values() if len(names) > 1]
 
 
-def _photo_folders(root: Path) -> list[tuple[Path, Literal["train", "test"] | None]]:
-    train, test = root / "train", root / "test"
-    if train.is_dir() and test.is_dir():
-        return [(train, "train"), (test, "test")]
-    if train.is_dir() or test.is_dir():
-        there, other = ("train", "test") if train.is_dir() else ("test", "train")
-        raise AwError(f"{root} has {there}/ but no {other}/: add it, or give one flat folder of photos")
-    if not _has_photos(root) and _has_photos(root / "images"):
-        return [(root / "images", None)]
-    return [(root, None)]
+def _photo_folders(root: Path, masks: Path | None) -> list[tuple[Path, Side]]:
+    sides: tuple[Side, Side] = ("train", "test")
+    there = [side for side in sides if side and (root / side).is_dir()]
+    if len(there) == 1:
+        other = sides[there[0] == "train"]
+        raise AwError(f"{root} has {there[0]}/ but no {other}/: add it, or give one flat folder of photos")
+    bases: list[tuple[Path, Side]] = [(root / side, side) for side in sides if side and there]
+    found = [(f, side) for base, side in bases or [(root, None)] for f in _folders_in(base, masks)]
+    return found or [(root, None)]
+
+
+def _folders_in(base: Path, masks: Path | None) -> Iterator[Path]:
+    """The folder, if it holds photos; else those in images/; else those of all folders below."""
+    if _has_photos(base):
+        yield base
+        return
+    inner = [p for p in base.iterdir() if p.is_dir() and p.name[0] != "." and p.name not in NO_PHOTOS]
+    inner = [p for p in inner if p != masks]
+    named = [p for p in inner if p.name == "images" and any(_folders_in(p, masks))]
+    for folder in named or sorted(inner, key=lambda p: natural_key(p.name)):
+        yield from _folders_in(folder, masks)
+
+
+def videos_in(base: Path) -> Iterator[Path]:
+    """Videos of a folder and those in it, but none beside photos: of live photos, or their source."""
+    inner = sorted(base.iterdir(), key=lambda p: natural_key(p.name))
+    beside = _has_photos(base) or _has_photos(base / "images")
+    for path in () if beside else inner:
+        if path.is_file() and path.name[0] != "." and path.suffix.lower() in VIDEO_SUFFIXES:
+            yield path
+    for path in inner:
+        if path.is_dir() and path.name[0] != "." and path.name not in NO_PHOTOS:
+            yield from videos_in(path)
+
+
+def _labels(root: Path, folders: Sequence[tuple[Path, Side]]) -> list[str]:
+    """Of several folders the end of the path that tells them apart, joined by "_"; of one, nothing."""
+    paths = [
+        [p for p in folder.relative_to(root).parts if p not in ("images", side)] for folder, side in folders
+    ]
+    different = {tuple(path) for path in paths}
+    if len(different) == 1:
+        return [""] * len(paths)
+    for depth in range(1, max(map(len, paths)) + 1):
+        ends = {path: clean_stem("_".join(path[-depth:])).casefold() for path in different}
+        if len(set(ends.values())) == len(different):
+            break
+    return [clean_stem("_".join(path[-depth:])) for path in paths]
+
+
+def _folder_notes(
+    roots: Sequence[Path], folders: Sequence[tuple[Path, Side]], labels: Sequence[str], masks: Path | None
+) -> Iterator[str]:
+    counts = Counter(labels)
+    if len(counts) > 1:
+        yield f"photos of {len(counts)} folders: {shortlist([f'{k} ({v})' for k, v in counts.items()])}"
+    for root in roots:
+        if (root, None) in folders:
+            inner = (
+                p for p in sorted(root.iterdir()) if p.is_dir() and p.name not in NO_PHOTOS and p != masks
+            )
+            if left := [p.name for p in inner if p.name[0] != "." and any(_folders_in(p, masks))]:
+                yield f"{root} holds photos itself, so its folders {shortlist(left)} are left out"
 
 
 def _has_photos(folder: Path) -> bool:
@@ -124,18 +213,18 @@ def _has_photos(folder: Path) -> bool:
 def _too_few(root: Path, count: int, ignored: list[str]) -> str:
     known = ", ".join(s.lstrip(".") for s in PHOTO_SUFFIXES)
     found = f"; it holds {shortlist(ignored)}" if ignored else ""
-    nested = [p.name for p in sorted(root.iterdir()) if _has_photos(p)]
-    if count == 0 and nested:
-        return f"{root} holds no photos itself, but {shortlist(nested)} does: give that folder"
     if count == 0:
         return f"{root} holds no photos ({known}){found}"
     what = "one photo" if count == 1 else f"{count} photos"
     return f"{root} holds {what}; at least {MIN_PHOTOS} that overlap are needed, 20 or more are better"
 
 
-def _unique_stems(files: list[tuple[Path, Literal["train", "test"] | None]]) -> list[str]:
-    """Names in the scene, without spaces; equal names get the side, then the format, then a number."""
-    stems = [_clean(path.stem) for path, _ in files]
+def _unique_stems(files: list[tuple[Path, Side]], labels: Sequence[str]) -> list[str]:
+    """Names in the scene, without spaces: of several folders with the folder's first; equal names get the
+    side, then the format, then a number."""
+    stems = [
+        clean_stem("_".join(filter(None, (k, path.stem)))) for (path, _), k in zip(files, labels, strict=True)
+    ]
     for attempt in ("side", "suffix"):
         seen = Counter(s.casefold() for s in stems)
         for i, (path, side) in enumerate(files):
@@ -154,7 +243,7 @@ def _unique_stems(files: list[tuple[Path, Literal["train", "test"] | None]]) -> 
     return stems
 
 
-def _clean(stem: str) -> str:
+def clean_stem(stem: str) -> str:
     """The name without white space (COLMAP's text models split on it) and control characters, shortened."""
     text = unicodedata.normalize("NFC", stem)
     text = "".join("_" if c.isspace() or not c.isprintable() or c in '\\:*?"<>|' else c for c in text)
@@ -221,12 +310,21 @@ def read_test_list(path: Path, facts: list[ScreenedPhoto]) -> set[str]:
     except (OSError, UnicodeDecodeError) as error:
         raise AwError(f"cannot read the test list {path}: {error}") from error
     known: dict[str, str] = {}
+    meant: dict[str, set[str]] = {}
     for fact in facts:
         source = PurePosixPath(fact["source"])
-        for key in (str(source), source.name, source.stem, fact["stem"], fact["stem"] + ".png"):
+        for key in (str(source), fact["stem"], fact["stem"] + ".png", *fact.get("copies", ())):
             known.setdefault(key, fact["stem"])
-        for copy in fact.get("copies", ()):
-            known.setdefault(copy, fact["stem"])
+        for i in range(len(source.parts)):
+            end = PurePosixPath(*source.parts[i:])
+            for key in (str(end), str(end.with_suffix(""))):
+                meant.setdefault(key, set()).add(fact["stem"])
+    if twice := [n for n in names if n not in known and len(meant.get(n, ())) > 1]:
+        raise AwError(
+            f"{path}: {shortlist(map(repr, twice), 3)} is the name of several photos "
+            f"({shortlist(sorted(meant[twice[0]]), 3)}); write their folders too"
+        )
+    known = {key: next(iter(stems)) for key, stems in meant.items()} | known
     unknown = [n for n in names if n not in known]
     if unknown:
         what = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"

@@ -14,8 +14,8 @@ import numpy as np
 from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import read_alpha, read_mask, write_png
-from ambiguous_wild.io.photos import TRANSPARENT, upright
+from ambiguous_wild.io.images import orientation, read_alpha, read_mask, upright, write_png
+from ambiguous_wild.io.photos import TRANSPARENT
 from ambiguous_wild.io.scene_folder import find_masks as by_name
 
 LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
@@ -46,7 +46,7 @@ def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[s
         if path is None:
             unmasked.append(fact["source"])
             continue
-        height, width = read_mask(path).shape
+        height, width = upright(read_mask(path), orientation(path)).shape
         if (width, height) != (fact["width"], fact["height"]):
             misfits.append(f"{path.name} is {width}x{height} but its photo {fact['width']}x{fact['height']}")
         found[fact["stem"]] = path
@@ -83,7 +83,7 @@ def lay_out_masks(
         if path is None:
             mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
         else:
-            mask = read_mask(path)
+            mask = upright(read_mask(path), orientation(path))
         if fact["stem"] in alpha:
             mask = np.minimum(mask, alpha[fact["stem"]])
         if path is not None or fact["stem"] in alpha:

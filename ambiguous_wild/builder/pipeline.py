@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -44,7 +45,7 @@ class BuildResult:
 
 
 def build_scene(
-    raw: Path | str,
+    raw: Path | str | Sequence[Path | str],
     output: Path | str,
     settings: BuildSettings | None = None,
     *,
@@ -61,7 +62,8 @@ def build_scene(
     files. The output folder appears complete or not at all.
 
     Args:
-        raw: folder with photos, or with images/, or with train/ and test/; it is not changed.
+        raw: folder with photos, with images/, with train/ and test/, or with folders of photos; or several
+            folders, which become one scene. They are not changed.
         output: the scene folder.
         settings: see `BuildSettings`.
         masks: folder of keep masks (white = keep), used for features and copied to masks/train.
@@ -82,15 +84,17 @@ def build_scene(
     else:
         name = check_name("scene name (the folder's; --name sets another)", target.name)
     settings = replace(settings, name=name)
-    _check_paths(raw, target)
+    for one in [raw] if isinstance(raw, (str, Path)) else raw:
+        _check_paths(one, target)
     count = jobs or os.cpu_count() or 1
-    capture = collect(raw, count)
+    mask_folder = Path(masks).resolve() if masks is not None else None
+    capture = collect(raw, count, mask_folder)
     target = check_output(target)
     with build_lock(target):
         stages = Stages(
             capture,
             settings,
-            Path(masks).resolve() if masks is not None else None,
+            mask_folder,
             Path(test_list).resolve() if test_list is not None else None,
             count,
             Bar(progress),
@@ -104,6 +108,8 @@ def build_scene(
             return BuildResult(target, known, True, time.perf_counter() - started)
         earlier = work_root.exists()
         work = Workspace(work_root)
+        for note in capture.notes:
+            stages.bar.say(note)
         _run(stages, work, target, started, keep_work, earlier)
     info: SceneRecord = json.loads((target / "scene.json").read_text(encoding="utf-8"))
     reused = tuple(r.name for r in work.results if r.reused)

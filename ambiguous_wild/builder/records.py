@@ -82,7 +82,7 @@ class MaskResult(TypedDict):
 class FeatureResult(TypedDict):
     """Of the stage `features`."""
 
-    camera: str  # "single", "per-device" or "per-image"
+    camera: str  # "single", "per-device", "per-folder" or "per-image"
     features: dict[str, int]  # work name -> number
 
 
@@ -266,9 +266,13 @@ class LeftOut(TypedDict):
     why: str
 
 
-class FrameCounts(TypedDict, total=False):
+Kind = Literal["folder", "video", "camera", "several"]
+
+
+class FrameCounts(TypedDict):
     """Frames of a video."""
 
+    source: NotRequired[str]
     frames_read: int
     frames_announced: int | None  # by the header; None where it says nothing usable
 
@@ -277,8 +281,9 @@ class CaptureRecord(TypedDict):
     """capture.json of `aw capture`."""
 
     version: str
-    kind: Literal["folder", "video", "camera"]
+    kind: Kind
     source: str
+    videos: NotRequired[list[FrameCounts]]  # of several sources
     frames_read: NotRequired[int]
     frames_announced: NotRequired[int | None]
     photos: list[CapturedPhoto]

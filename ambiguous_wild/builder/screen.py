@@ -18,7 +18,7 @@ from typing import Generic, TypeVar, cast
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, Source, identical
+from ambiguous_wild.builder.collect import MIN_PHOTOS, VIDEO_SUFFIXES, Capture, Source, identical
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     ExifRecord,
@@ -28,13 +28,13 @@ from ambiguous_wild.builder.records import (
     SkippedPhoto,
 )
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
 from ambiguous_wild.io.photos import Photo, UnreadablePhoto, read_photo
 
 BLUR_SIDE = 1024  # px, longer side: the Laplacian grows with resolution, so blur is compared at one size
 BLUR_RATIO = 0.2  # of the capture's median; a photo below it counts as blurred
 NEAR_DUPLICATE = 0.995  # correlation of 32 x 32 thumbnails
 EXPOSURE_STOPS = 1.0
-VIDEOS = (".mov", ".mp4")
 _THUMBNAIL = 32
 More = TypeVar("More")
 
@@ -219,7 +219,14 @@ def drift_warnings(facts: Sequence[PhotoRecord]) -> list[str]:
             found.append(f"{camera} was zoomed: {min(focal):.1f} to {max(focal):.1f} mm")
     if len({(f["width"], f["height"]) for f in facts}) > 1:
         found.append(f"photos have {len({(f['width'], f['height']) for f in facts})} different sizes")
-    return found
+    return found + panorama_warnings(facts)
+
+
+def panorama_warnings(facts: Sequence[PhotoRecord]) -> list[str]:
+    """Photos of the shape of 360 degree photos, which say so in XMP unless a tool dropped it."""
+    wide = [f["source"] for f in facts if f["width"] == 2 * f["height"]]
+    name = f"{len(wide)} photos are 2:1, as 360 degree photos are ({shortlist(wide, 2)})"
+    return [f"{name}: {SPLIT_PANORAMAS}"] if wide else []
 
 
 def exposure_stops(exif: ExifRecord) -> float | None:
@@ -299,7 +306,8 @@ def _live_photo_warnings(capture: Capture) -> list[str]:
     videos = [
         name
         for name in capture.ignored
-        if PurePosixPath(name).suffix.lower() in VIDEOS and PurePosixPath(name).stem.casefold() in stems
+        if PurePosixPath(name).suffix.lower() in VIDEO_SUFFIXES
+        and PurePosixPath(name).stem.casefold() in stems
     ]
     return [f"{len(videos)} videos of live photos are left out: {shortlist(videos, 3)}"] if videos else []
 

@@ -13,7 +13,7 @@ from ambiguous_wild.builder.records import PhotoRecord
 from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, NEIGHBOURS
 from ambiguous_wild.core.errors import AwError
 
-CameraMode = Literal["auto", "single", "per-device", "per-image"]
+CameraMode = Literal["auto", "single", "per-device", "per-folder", "per-image"]
 Matcher = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Mapper = Literal["incremental", "global"]
 Effort = Literal["auto", "fast", "thorough"]

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NotRequired, TypedDict, cast
 
 from ambiguous_wild.builder.progress import Bar
@@ -45,7 +45,7 @@ class FeatureJob(TypedDict):
     photos: str  # folder
     names: list[str]
     camera: str
-    groups: list[list[str]]  # names that share a camera, where the camera is "per-device"
+    groups: list[list[str]]  # names that share a camera, where the camera is "per-device" or "per-folder"
     masks: str | None  # folder
     settings: dict[str, Any]  # `BuildSettings`
     plan: dict[str, Any]  # `SfmPlan`
@@ -118,17 +118,19 @@ class SfmCrash(AwError):
 
 
 def choose_camera(photos: Sequence[PhotoRecord], wanted: str) -> str:
-    """ "single", "per-device" or "per-image".
+    """ "single", "per-device", "per-folder" or "per-image".
 
-    "single" where size, camera model and focal length are the same in all photos. Photos of one size without
-    EXIF count as frames of one camera: internet photos differ in size. "per-device" where EXIF tells two or
-    more photos of one camera from the others, or one camera was held upright and across.
+    "single" where size, camera model and focal length are the same in all photos. Photos of one size and
+    folder without EXIF count as frames of one camera: internet photos differ in size. "per-device" where EXIF
+    or the folder tells two or more photos of one camera from the others, or one camera was held upright and
+    across.
     """
     if wanted != "auto":
         return wanted
-    if len({_device(p) for p in photos}) == 1:
+    groups = camera_groups(photos, wanted)
+    if len(groups) == 1:
         return "single"
-    return "per-device" if any(len(group) > 1 for group in camera_groups(photos)) else "per-image"
+    return "per-device" if any(len(group) > 1 for group in groups) else "per-image"
 
 
 def _device(photo: PhotoRecord) -> tuple[Any, ...]:
@@ -136,17 +138,30 @@ def _device(photo: PhotoRecord) -> tuple[Any, ...]:
     return (photo["width"], photo["height"], photo["camera"], exif.get("focal_mm"), exif.get("focal_35mm"))
 
 
-def camera_groups(photos: Sequence[PhotoRecord]) -> list[list[int]]:
-    """Indices of photos that share a camera by EXIF and size.
+def _folder(photo: PhotoRecord) -> tuple[str, ...]:
+    return tuple(p for p in PurePosixPath(photo["source"]).parent.parts if p != photo["side"])
 
-    A photo without make and focal length stands alone, unless all photos may be of one camera, turned or not.
+
+def camera_groups(photos: Sequence[PhotoRecord], camera: str = "per-device") -> list[list[int]]:
+    """Indices of photos that share a camera by EXIF and size; "per-folder": by folder and size.
+
+    Photos without make and focal length share one if all photos of their folder may be of one camera, turned
+    or not: EXIF does not tell the cameras of two folders (of a rig, of two videos) apart.
     """
-    turned = {(*sorted(device[:2]), *device[2:]) for device in map(_device, photos)}
+    turned: dict[tuple[str, ...], set[tuple[Any, ...]]] = {}
+    for photo in photos:
+        device = _device(photo)
+        turned.setdefault(_folder(photo), set()).add((*sorted(device[:2]), *device[2:]))
     groups: dict[tuple[Any, ...], list[int]] = {}
     for index, photo in enumerate(photos):
-        known = photo["camera"] and ("focal_mm" in photo["exif"] or "focal_35mm" in photo["exif"])
-        known = known or len(turned) == 1
-        groups.setdefault(_device(photo) if known else (index,), []).append(index)
+        device, folder = _device(photo), _folder(photo)
+        if camera == "per-folder":
+            key: tuple[Any, ...] = (device[:2], folder)
+        elif photo["camera"] and ("focal_mm" in photo["exif"] or "focal_35mm" in photo["exif"]):
+            key = device
+        else:
+            key = (device, folder) if len(turned[folder]) == 1 else (index,)
+        groups.setdefault(key, []).append(index)
     return list(groups.values())
 
 
@@ -179,8 +194,8 @@ def extract_features(
         "photos": str(photos),
         "names": [f["work_name"] for f in facts],
         "camera": camera,
-        "groups": [[facts[i]["work_name"] for i in g] for g in camera_groups(facts)]
-        if camera == "per-device"
+        "groups": [[facts[i]["work_name"] for i in g] for g in camera_groups(facts, camera)]
+        if camera in ("per-device", "per-folder")
         else [],
         "masks": str(masks) if masks else None,
         "settings": to_plain(settings),

@@ -36,7 +36,7 @@ from ambiguous_wild.builder.records import (
     UndistortResult,
 )
 from ambiguous_wild.builder.retrieval import MOTIONS
-from ambiguous_wild.builder.screen import screen, without_copies
+from ambiguous_wild.builder.screen import panorama_warnings, screen, without_copies
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan, plans
 from ambiguous_wild.builder.sfm import (
     DATABASE,
@@ -354,14 +354,15 @@ class Stages:
         # of equal ones the later, which is the more precise
         best = max(reversed(attempts), key=lambda attempt: attempt.placed)
 
+        used = ["masks were used (white = keep): try without them"] if masks is not None else []
+        used = mask_warnings(masks.facts if masks else None) or used
         check_registered(
             best.mapping.facts["model"],
             len(facts),
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
             best.matches.facts,
-            mask_warnings(masks.facts if masks else None)
-            or ["masks were used (white = keep): try without them"] * (masks is not None),
+            [*panorama_warnings(facts), *used],
         )
         return best
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -35,10 +35,10 @@ class Lens:
 
     camera: Any  # pycolmap.Camera
     pinhole: ModelCamera
-    map_xy: (
-        tuple[np.ndarray, np.ndarray] | None
-    )  # [H, W] float32 each: source of every pixel; None: no map needed
+    # [H, W] float32 each: source of every pixel; None: no map needed
+    map_xy: tuple[np.ndarray, np.ndarray] | None
     share: float = 1.0  # of the photo that the pinhole camera sees
+    shear: float = 0.0  # of the camera, see `ModelCamera`
 
     def remap(self, image: np.ndarray, *, nearest: bool) -> np.ndarray:
         """The image [H, W] or [H, W, 3] of the distorted camera as the pinhole camera sees it."""
@@ -53,6 +53,7 @@ class Lens:
         if not len(xys):
             return xys
         fx, fy, cx, cy = self.pinhole.pinhole()
+        xys = xys - self.shear * (xys[:, 1:] - self.camera.principal_point_y) * [1, 0]
         rays = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(xys)))
         return rays * [fx, fy] + [cx, cy]
 
@@ -72,13 +73,13 @@ def make_lens(camera: ModelCamera) -> Lens:
     fx, fy = lens.focal_length_x, lens.focal_length_y
     same = (fx, fy, lens.principal_point_x, lens.principal_point_y)
     plain = ModelCamera(camera.camera_id, "PINHOLE", camera.width, camera.height, same)
-    grid, source = _source_pixels(lens, plain)
+    grid, source = _source_pixels(lens, plain, camera.shear)
     if np.abs(source - grid).max() < NEGLIGIBLE_PX:
         return Lens(lens, plain, None)
     flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
     params = tuple(float(v) for v in flat.params)
     pinhole = ModelCamera(camera.camera_id, "PINHOLE", flat.width, flat.height, params)
-    _, source = _source_pixels(lens, pinhole)
+    _, source = _source_pixels(lens, pinhole, camera.shear)
     index = (source - 0.5).astype(np.float32)  # OpenCV counts from pixel centres
     x, y = np.concatenate([source[0], source[:, -1], source[-1, ::-1], source[::-1, 0]]).T
     share = float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2 / (camera.width * camera.height))
@@ -88,16 +89,17 @@ def make_lens(camera: ModelCamera) -> Lens:
             f"sees {100 * share:.3g} % of its photo: check the parameters, or split the photos"
         )
     maps = np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])
-    return Lens(lens, pinhole, maps, share)
+    return Lens(lens, pinhole, maps, share, camera.shear)
 
 
-def _source_pixels(lens: Any, pinhole: ModelCamera) -> tuple[np.ndarray, np.ndarray]:
+def _source_pixels(lens: Any, pinhole: ModelCamera, shear: float) -> tuple[np.ndarray, np.ndarray]:
     """Pixel centres of the pinhole camera, and where the lens sees them: [H, W, 2] px each."""
     fx, fy, cx, cy = pinhole.pinhole()
     grid = np.stack(np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5), axis=-1)
     rays = np.concatenate([(grid - [cx, cy]) / [fx, fy], np.ones((*grid.shape[:2], 1))], axis=-1)
-    source = np.asarray(lens.img_from_cam(rays.reshape(-1, 3)))
-    return grid, source.reshape(grid.shape)
+    source = np.asarray(lens.img_from_cam(rays.reshape(-1, 3))).reshape(grid.shape)
+    source[..., 0] += shear * (source[..., 1] - lens.principal_point_y)
+    return grid, source
 
 
 def undistort(
@@ -156,7 +158,8 @@ def undistort(
 
 def _truth(folder: Path, lens: Lens, fact: ScreenedPhoto, truth: Path) -> list[str]:
     """Undistort the truth of one photo: the mask by nearest pixel, the clean photo like the photo."""
-    original = fact["source"].rsplit("/", 1)[-1].rsplit(".", 1)[0]
+    parts = PurePosixPath(fact["source"]).with_suffix("").parts
+    original = "/".join(parts[parts[0] in ("train", "test", "images") :])
     found = []
     for part in TRUTH_PARTS:
         path = truth / part / f"{original}.png"

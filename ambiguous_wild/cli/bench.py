@@ -110,6 +110,12 @@ def parse_budget(text: str) -> float:
     help="full: measure whole test photos; half: fit colours on the left half, measure the right (NeRF-W).  "
     "[default: as scene.json says, else full]",
 )
+@click.option(
+    "--start",
+    type=PathName(dir_okay=False),
+    help="Start from this splat file (PLY, compressed PLY, SPZ, SOG) or point cloud (PLY) in the scene's "
+    "coordinates.  [default: the scene's points]",
+)
 @metric_file_option
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(

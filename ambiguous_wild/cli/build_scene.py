@@ -60,17 +60,17 @@ def _compiled() -> bool:
 
 
 @click.command("build-scene")
-@click.argument("raw", type=PathName())
+@click.argument("raw", type=PathName(), nargs=-1, required=True)
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
 @click.option(
     "--factor", type=int, help="Downsampling.  [default: the largest of 1, 2, 4, 8 that leaves 480 px]"
 )
 @click.option(
     "--camera",
-    type=click.Choice(["auto", "single", "per-device", "per-image"]),
+    type=click.Choice(["auto", "single", "per-device", "per-folder", "per-image"]),
     default="auto",
     show_default=True,
-    help="Which photos share one camera model; auto: decided by EXIF and photo size.",
+    help="Which photos share one camera model; auto: decided by EXIF, photo size and folder.",
 )
 @click.option(
     "--sfm",
@@ -118,7 +118,7 @@ def _compiled() -> bool:
 @click.option("--keep-work", is_flag=True, help="Keep the work folder with every stage and COLMAP's log.")
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
 def command(
-    raw: Path,
+    raw: tuple[Path, ...],
     output: Path,
     masks: Path | None,
     test_list: Path | None,
@@ -131,8 +131,9 @@ def command(
 ) -> None:
     """Build a scene from the photos in RAW: check, COLMAP, undistort, downsample, split.
 
-    RAW holds photos directly, in images/, or in train/ and test/ (clean photos for testing); it is not
-    changed. If the command is killed, the same command continues the build.
+    RAW holds photos directly, in images/, in train/ and test/ (clean photos for testing), or in folders of
+    any name (front/, back/); several RAW become one scene. They are not changed. If the command is killed,
+    the same command continues the build.
     """
     from ambiguous_wild.builder import report
     from ambiguous_wild.builder.pipeline import build_scene

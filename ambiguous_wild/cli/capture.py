@@ -20,14 +20,14 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
 
 
 @click.command("capture")
-@click.argument("source")
+@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True)
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder of photos to make.")
 @click.option(
     "--frames",
     type=click.IntRange(3, 5000),
     default=60,
     show_default=True,
-    help="Photos to take from a video or camera; a short video gives all its frames.",
+    help="Photos to take from each video or a camera; a short video gives all its frames.",
 )
 @click.option(
     "--every",
@@ -39,43 +39,48 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
 @threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def capture_command(
-    source: str, output: Path, frames: int, every: float, threads: int | None, as_json: bool
+    sources: tuple[str, ...], output: Path, frames: int, every: float, threads: int | None, as_json: bool
 ) -> None:
-    """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos (copies with
-    EXIF), or 'camera' ('camera:1' is the second one)."""
+    """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos, videos or folders
+    (copies with EXIF), several of these (a folder each), or 'camera' ('camera:1' is the second one)."""
     import os
 
     from ambiguous_wild.builder import capture_photos
     from ambiguous_wild.builder.progress import Bar
     from ambiguous_wild.core.errors import AwError
 
-    if not source.strip():
-        raise AwError("SOURCE is empty: give a video, a folder of photos, or 'camera'")
+    wanted = "give a video, a folder of photos, or 'camera'"
+    if not all(source.strip() for source in sources):
+        raise AwError(f"SOURCE is empty: {wanted}")
     bar = Bar(not as_json)
-    path = Path(source)
-    camera = re.fullmatch(r"camera(?::(\d{1,3}))?", source)
-    if path.is_dir():
-        facts = capture_photos.photos_from_folder(path, output, jobs=threads or os.cpu_count() or 1, bar=bar)
-    elif path.is_file():
-        facts = capture_photos.photos_from_video(path, output, frames=frames, bar=bar)
-    elif camera:
+    paths = [Path(source) for source in sources]
+    absent = next((source for source in sources if not Path(source).exists()), None)
+    if absent is None:
+        jobs = threads or os.cpu_count() or 1
+        facts = capture_photos.photos_from(paths, output, frames=frames, jobs=jobs, bar=bar)
+    elif len(sources) == 1 and (camera := re.fullmatch(r"camera(?::(\d{1,3}))?", absent)):
         facts = capture_photos.photos_from_camera(
             int(camera[1] or 0), output, frames=frames, every_s=every, bar=bar
         )
-    elif source.startswith("camera"):
-        raise AwError(f"unknown camera {source!r}: write 'camera' or 'camera:1'")
+    elif absent.startswith("camera"):
+        raise AwError(f"unknown camera {absent!r}: write 'camera' or 'camera:1', and nothing beside it")
     else:
-        raise AwError(f"{source} does not exist: give a video, a folder of photos, or 'camera'")
-    total = facts.get("frames_read")
-    if total is not None and total < frames:
-        click.echo(f"{source} has {total} frames: took all of them, fewer than --frames {frames}", err=True)
-    announced = facts.get("frames_announced")
-    if announced and facts["frames_read"] < BROKEN_BELOW * announced:
-        click.echo(
-            f"warning: {source} announces {announced} frames, {facts['frames_read']} could be read: "
-            "it may be cut short or damaged",
-            err=True,
-        )
+        raise AwError(f"{absent} does not exist: {wanted}")
+    videos = facts.get("videos", [])
+    if "frames_read" in facts:
+        counts = facts["frames_read"], facts["frames_announced"]
+        videos = [{"source": sources[0], "frames_read": counts[0], "frames_announced": counts[1]}]
+    for video in videos:
+        total, announced = video["frames_read"], video["frames_announced"]
+        if total < frames:
+            name = video["source"]
+            click.echo(f"{name} has {total} frames: took all of them, fewer than --frames {frames}", err=True)
+        if announced and total < BROKEN_BELOW * announced:
+            click.echo(
+                f"warning: {video['source']} announces {announced} frames, {total} could be read: it may be cut "
+                "short or damaged",
+                err=True,
+            )
     if as_json:
         click.echo(json.dumps({**facts, "capture": str(output)}, indent=2, ensure_ascii=False))
         return
@@ -90,11 +95,11 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 
 
 @click.command("screen")
-@click.argument("raw", type=PathName())
+@click.argument("raw", type=PathName(), nargs=-1, required=True)
 @click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
 @threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
-def screen_command(raw: Path, strict: bool, threads: int | None, as_json: bool) -> None:
+def screen_command(raw: tuple[Path, ...], strict: bool, threads: int | None, as_json: bool) -> None:
     """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
     near-duplicates, overlap, motion. Nothing is written."""
     import os

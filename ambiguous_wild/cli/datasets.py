@@ -17,7 +17,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 
 KINDS = (
     "on-the-go", "robustnerf", "photo-tourism", "drone", "dualsplat", "nerfbaselines", "nerfstudio",
-    "instant-ngp", "blender", "colmap",
+    "instant-ngp", "blender", "realityscan", "metashape", "polycam", "record3d", "colmap",
 )  # fmt: skip
 
 

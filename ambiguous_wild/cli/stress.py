@@ -54,7 +54,7 @@ def command(
     aw stress --only 4 --only needle
     aw stress --replay runs/scene/3dgs/seed0
 
-    Exits with code 1 if a case fails or a replay differs. docs/numerics.md explains each case.
+    Exits with code 1 if a case fails or a replay differs. docs/numerics.md explains the tolerances.
     """
     if run is not None:
         _replay(run)

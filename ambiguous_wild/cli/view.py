@@ -90,13 +90,15 @@ def view_command(
     port: int,
     paused: bool,
 ) -> None:
-    """Write a page that shows the models of RUNS (run folders, or folders of them), all of one scene.
+    """Write a page that shows the models of RUNS (run folders, folders of them, or splat files of any tool: PLY,
+    compressed PLY, SPZ, SOG), all of one scene.
 
     The page is one file that needs no server and no network. It shows models side by side or under a slider
     with the same camera, the cameras of the photos, masks over photos, and the PSNR of each test view.
 
     \b
     aw view runs -o view                       then open view/index.html
+    aw view stranger.ply --scene scene         without --scene: seen from a circle around it
     aw view --live scene --method 3dgs         watch a training at http://127.0.0.1:8080
     """
     from ambiguous_wild.methods.registry import load_plugin
@@ -162,7 +164,7 @@ def view_command(
 def video_command(
     runs: tuple[Path, ...], output: Path, path: str, plugins: tuple[Path, ...], **options: Any
 ) -> None:
-    """Film the models of RUNS (run folders, or folders of them) side by side along one camera path.
+    """Film the models of RUNS (run folders, folders of them, or splat files) side by side along one camera path.
 
     \b
     aw video runs -o video.mp4
@@ -203,17 +205,23 @@ class _Bar:
 
 
 FORMATS = ("compressed-ply", "spz", "sog", "gltf")
+UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
 @click.command(name="export")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "--format", "formats", multiple=True, type=click.Choice(FORMATS), default=FORMATS, show_default="all",
-    help="Repeatable.",
+    "--format", "formats", multiple=True, type=click.Choice((*FORMATS, "ply")), default=FORMATS,
+    show_default="all but ply", help="Repeatable.",
 )  # fmt: skip
 @click.option(
     "-o", "--output", type=PathName(file_okay=False),
-    help="Folder for the files, as LABEL.spz and so on.  [default: RUN/export]",
+    help="Folder for the files, as LABEL.spz and so on.  [default: export/ in the run, or beside the file]",
+)  # fmt: skip
+@click.option(
+    "--up", type=click.Choice(UPS),
+    help="Turn the files so that this axis points up as the photos do, with the floor at zero below the middle of "
+    "the scene; glTF: y, always.  [default: the scene's coordinates]",
 )  # fmt: skip
 @click.option("--overwrite", is_flag=True, help="Replace files of these names in the folder of -o.")
 @click.option(
@@ -227,6 +235,7 @@ def export_command(
     runs: tuple[Path, ...],
     formats: tuple[str, ...],
     output: Path | None,
+    up: str | None,
     overwrite: bool,
     loss: bool,
     scene_folder: Path | None,
@@ -234,7 +243,8 @@ def export_command(
     threads: int | None,
     as_json: bool,
 ) -> None:
-    """Write the models of RUNS (run folders, or folders of them) as compressed PLY, SPZ, SOG and glTF.
+    """Write the models of RUNS (run folders, folders of them, or splat files of any tool: PLY, compressed
+    PLY, SPZ, SOG) as compressed PLY, SPZ, SOG, glTF and PLY.
 
     Prints the size of each file and the loss from its rounding: PSNR against the renders of the model, and dB
     lost against the test photos. The plain point_cloud.ply stays.
@@ -242,6 +252,8 @@ def export_command(
     \b
     aw export runs
     aw export runs/courtyard/refinesplat/seed0 --format spz -o models
+    aw export runs --up z --format ply
+    aw export stranger.spz --format ply
     """
     from ambiguous_wild.methods.registry import load_plugin
     from ambiguous_wild.report.views import export_runs
@@ -251,7 +263,7 @@ def export_command(
 
     reports = export_runs(
         runs, formats, output, loss=loss, scene_folder=scene_folder, threads=threads, overwrite=overwrite,
-        say=say,
+        up=up, say=say,
     )  # fmt: skip
     if as_json:
         rows = [
@@ -272,7 +284,13 @@ def export_command(
 def _place(e: Exported) -> str:
     x, y, z = e.place.centre
     smaller = "" if e.place.scale == 1 else f"divide by {e.place.scale:g}, then "
-    return f"{smaller}add ({x:.15g}, {y:.15g}, {z:.15g})"
+    w, *axis = e.place.turn
+    back = (
+        ""
+        if w == 1
+        else f"turn by the quaternion ({', '.join(f'{v:.6g}' for v in (w, *(-v for v in axis)))}), "
+    )
+    return f"{smaller}{back}add ({x:.15g}, {y:.15g}, {z:.15g})"
 
 
 def _plain(value: object) -> object:
@@ -282,7 +300,7 @@ def _plain(value: object) -> object:
 
 
 def _line(e: Exported) -> str:
-    told = f"{e.format:<14} {e.bytes / 1e6:8.2f} MB  {100 * e.share:5.1f} % of the PLY"
+    told = f"{e.format:<14} {e.bytes / 1e6:8.2f} MB  {100 * e.share:5.1f} % of {e.source}"
     if e.psnr_to_model is not None and e.lost_db is not None:
         same = "renders the same" if math.isinf(e.psnr_to_model) else f"{e.psnr_to_model:.1f} dB to the model"
         told += f"  {same}, {e.lost_db:+.3f} dB lost"

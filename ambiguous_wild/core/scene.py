@@ -88,10 +88,18 @@ class Points:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a scene lies in its files' coordinates: inside, a position x is ``(x - centre) * scale``."""
+    """Where a scene lies in its files' coordinates: inside, a position x is ``R (x - centre) * scale``."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0  # a power of two, so that positions lose no bit
+    turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # R as w, x, y, z; of exports alone
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """R, [3, 3]."""
+        w, x, y, z = np.array(self.turn) / np.linalg.norm(self.turn)
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return np.eye(3) + 2.0 * (w * cross + cross @ cross)
 
     def inside(self, camera: Camera) -> Camera:
         """A camera of the files' coordinates, moved along."""
@@ -99,6 +107,7 @@ class Place:
             return camera
         pose = camera.cam_from_world.copy()
         pose[:3, 3] = (pose[:3, :3] @ self.centre + pose[:3, 3]) * self.scale
+        pose[:3, :3] = pose[:3, :3] @ self.rotation.T
         return replace(camera, cam_from_world=pose)
 
 

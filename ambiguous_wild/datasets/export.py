@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -186,24 +187,27 @@ def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
 
     Readers of this layout reduce the photos themselves, so they are full size where the scene has them.
     """
+    bases = Counter(PurePosixPath(v.name).stem for v in scene.views)
+
+    def flat(view: View) -> str:
+        """The base name, with its folders where another photo has the same."""
+        name = PurePosixPath(_stored(view))
+        return name.name if bases[name.stem] == 1 else "_".join(name.parts)
+
     factor = int(scene.info["loaded_factor"])
     if factor > 1 and (scene.root / "images").is_dir():
         for view in scene.views:
-            name = PurePosixPath(_stored(view)).name
-            place(view.image_path, folder / f"images_{factor}" / name)
+            place(view.image_path, folder / f"images_{factor}" / flat(view))
         scene = load_scene(scene.root, factor=1, verify=False, raw=True)
-    bases = [PurePosixPath(v.name).stem for v in scene.views]
-    if len(set(bases)) < len(bases):
-        raise AwError(
-            f"{scene.root}: two photos have one base name, which On-the-go's layout cannot tell apart"
-        )
-    views = sorted(scene.views, key=lambda v: PurePosixPath(_stored(v)).name)
+    if len({flat(v) for v in scene.views}) < len(scene.views):
+        raise AwError(f"{scene.root}: two photos have one name, which On-the-go's layout cannot tell apart")
+    views = sorted(scene.views, key=flat)
     lenses = {
         (v.camera.width, v.camera.height, v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy) for v in views
     }
     frames = []
     for view in views:
-        name = f"images/{PurePosixPath(_stored(view)).name}"
+        name = f"images/{flat(view)}"
         place(view.image_path, folder / name)
         own = {} if len(lenses) == 1 else _intrinsics(view)
         frames.append({"file_path": name, **own, "transform_matrix": _camera_to_world(view)})

@@ -17,9 +17,20 @@ from ambiguous_wild.builder.undistort import MOST_LOST, Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
 from ambiguous_wild.io.colmap_records import ONE_FOCAL, Model, ModelCamera, ModelImage
-from ambiguous_wild.io.images import MAX_PIXELS, header_size, read_alpha, read_mask, read_png_rgb, write_png
+from ambiguous_wild.io.images import (
+    MAX_PIXELS,
+    header_size,
+    orientation,
+    read_alpha,
+    read_mask,
+    read_png_rgb,
+    upright,
+    write_png,
+)
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
+ENOUGH_POINTS = 20  # in a photo, to see by their colours which way it was turned
+TURNED = 0.7  # of the difference of colours: points of a photo that was turned differ by less
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 
@@ -33,6 +44,7 @@ class PhotoPlan:
     small: Path | None  # a downsampled copy that is linked
     only_small: bool  # the dataset ships downsampled photos alone
     convert: bool  # its pixels change, so a PNG is written
+    turn: int = 1  # EXIF orientation that the model's photo was turned by; COLMAP does not turn photos
 
 
 @dataclass(frozen=True)
@@ -100,12 +112,13 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
             wrong.append(
                 f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
             )
-        elif not _same_shape(size, (camera.width, camera.height)):
-            turned = ", turned as by EXIF" if _same_shape(size[::-1], (camera.width, camera.height)) else ""
+        elif (turn := _turn(scene.model, image, source, size)) is None:
+            turned = ", turned" if _same_shape(size[::-1], (camera.width, camera.height)) else ""
             told = f"its camera {camera.width}x{camera.height}{turned}"
             wrong.append(f"{image.name} ({size[0]}x{size[1]}, {told})")
         else:
-            plans.append(_plan(scene, image, source, camera, size, only_small))
+            size = size[::-1] if turn > 4 else size
+            plans.append(_plan(scene, image, source, camera, size, only_small, turn))
     _refuse_same_stems(scene)
     total = len(scene.split)
     if absent:
@@ -120,6 +133,33 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
             "photos that the model was built from"
         )
     return plans
+
+
+def _turn(model: Model, image: ModelImage, source: Path, size: tuple[int, int]) -> int | None:
+    """The photo's EXIF orientation where the model was made of the upright photo, else 1; None: neither fits.
+
+    The shape of the camera tells, and where it is the same both ways, the colours of the points.
+    """
+    tag, camera = orientation(source), model.cameras[image.camera_id]
+    shape = (camera.width, camera.height)
+    fits = _same_shape(size, shape), tag > 1 and _same_shape(size[::-1] if tag > 4 else size, shape)
+    if not all(fits):
+        return 1 if fits[0] else tag if fits[1] else None
+    lens = lens_of(resized(camera, *size))
+    # Projected, as not every model has observations.
+    xyz = model.points.xyz @ image.cam_from_world()[:3, :3].T + image.tvec
+    front = xyz[:, 2] > 0
+    xyz, colours = xyz[front], model.points.rgb[front].astype(float)
+    fx, fy, cx, cy = lens.pinhole.pinhole()
+    x, y = (xyz[:, :2] / xyz[:, 2:] * (fx, fy) + (cx, cy)).T
+    shown = (x >= 0) & (x < lens.pinhole.width) & (y >= 0) & (y < lens.pinhole.height)
+    if shown.sum() < ENOUGH_POINTS:
+        return 1
+    at = y[shown].astype(int), x[shown].astype(int)
+    stored = read_png_rgb(source)
+    flat = (lens.remap(pixels, nearest=False)[at] for pixels in (stored, upright(stored, tag)))
+    as_is, turned = (float(np.abs(pixels - colours[shown]).mean()) for pixels in flat)
+    return tag if turned < TURNED * as_is else 1
 
 
 def _refuse_same_stems(scene: ForeignScene) -> None:
@@ -140,10 +180,13 @@ def _plan(
     camera: ModelCamera,
     size: tuple[int, int],
     only_small: bool,
+    turn: int,
 ) -> PhotoPlan:
     lens = lens_of(resized(camera, *size)) if camera.model not in PINHOLES else None
     wide = scene.max_width is not None and size[0] > scene.max_width
-    convert = (lens is not None and lens.map_xy is not None) or wide or scene.background is not None
+    convert = (
+        (lens is not None and lens.map_xy is not None) or wide or scene.background is not None or turn > 1
+    )
     small = None
     if scene.factor > 1 and not convert and not only_small:
         small = find_photo(scene.root / f"images_{scene.factor}", image.name)
@@ -155,7 +198,7 @@ def _plan(
                 f"copy of it; remove images_{scene.factor} to make it anew"
             )
     at_size = camera if not (convert or only_small) else resized(camera, *size)
-    return PhotoPlan(image, source, at_size, small, only_small, convert)
+    return PhotoPlan(image, source, at_size, small, only_small, convert, turn)
 
 
 @lru_cache(maxsize=4)  # a map of a photo of 12 megapixels takes 98 MB
@@ -223,11 +266,13 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
     if lens.map_xy is not None:
         lost = f" without {100 * (1 - lens.share):.0f} % of the photo" if lens.share < MOST_LOST else ""
         notes.insert(0, f"undistorted{lost}")
+    if plan.turn > 1:
+        notes.insert(0, f"turned upright (EXIF orientation {plan.turn})")
     if scene.background is not None:
         notes.insert(0, "put before a background of {}, {}, {}".format(*scene.background))
     small = folder / f"images_{factor}" / name
     if not (full / name).is_file() or (factor > 1 and not small.is_file()):
-        pixels = lens.remap(_read(plan.source, scene.background), nearest=False)
+        pixels = lens.remap(upright(_read(plan.source, scene.background), plan.turn), nearest=False)
         if wide:
             pixels = downsample_photo(pixels, target.width, target.height)
         write_png(full / name, pixels)
@@ -299,9 +344,11 @@ def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, folder
     target = folder / "masks" / side / f"{without_suffix(placed.image.name)}.png"
     if target.is_file() or (mask is None and alpha is None):
         return alpha is not None
+    alpha = upright(alpha, plan.turn) if alpha is not None else None
     pixels = read_mask(mask) if mask is not None else np.asarray(alpha)
     height, width = pixels.shape
     size = header_size(plan.source) or (plan.camera.width, plan.camera.height)
+    size = size[::-1] if plan.turn > 4 else size
     final = (placed.camera.width, placed.camera.height)
     if scene.factor > 1 and not plan.only_small:
         final = downsampled_size(*final, scene.factor)

@@ -170,7 +170,7 @@ def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings
     model = foreign.model
     files = [p.source for p in plans] + [p.small for p in plans if p.small] + list(foreign.masks.values())
     states = [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files if f.exists()]
-    cameras = [[c.model, c.width, c.height, *c.params] for c in model.cameras.values()]
+    cameras = [[c.model, c.width, c.height, *c.params, c.shear] for c in model.cameras.values()]
     poses = [[i.name, *i.qvec.tolist(), *i.tvec.tolist()] for i in model.images.values()]
     split = sorted(foreign.split.items())
     kept = dataclasses.asdict(settings) | {"factor": foreign.factor, "name": name, "kind": foreign.kind}

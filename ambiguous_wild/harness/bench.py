@@ -157,6 +157,7 @@ def bench(
     engine: Engine | None = None,
     factor: int | None = None,
     protocol: Protocol | None = None,
+    start: Words | None = None,
     overwrite: Overwrite = "missing",
     cache: Words | None = None,
     pictures: bool = True,
@@ -185,8 +186,8 @@ def bench(
         jobs: number of cells that run at a time on this machine; None = what `engine` says.
         engine: where cells run; None = this machine.
         factor: N of the folder images_N to train on; None = the one that the scene was built for.
-        protocol: "full" measures whole test photos, "half" the right half (NeRF-W); None = what the scene's
-            scene.json says, else "full".
+        protocol: "full" or "half" (right halves are measured, NeRF-W); None = scene.json's, else "full".
+        start: a splat file or a point cloud (PLY) to start from; None = the scene's points.
         overwrite: "missing" keeps finished runs and resumes stopped ones, "changed" also trains again
             where a method's file has changed, "always" starts anew, "never" leaves folders that exist.
         cache: folder for features and instance masks; None = OUTPUT/.cache.
@@ -256,6 +257,7 @@ def bench(
                 effects=wanted,
                 plan=given_plan,
                 protocol=protocol,
+                start=None if start is None else Path(start),
                 probing=probing,
             )
             for wanted in dict.fromkeys(choices)
@@ -270,7 +272,8 @@ def bench(
         for cell in {cell.method.name: cell for cell in to_run}.values():
             check_program(cell)
         to_train = [cell for cell in to_run if cell.method.program is None]
-        try_recipes(to_train)
+        for line in try_recipes(to_train):
+            say(line)
         for cell in {cell.scene_id: cell for cell in to_run}.values():
             try_own(cell.scene)
         check_output(out / "run")  # before half a minute of compiling

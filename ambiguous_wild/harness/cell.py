@@ -37,6 +37,7 @@ from ambiguous_wild.harness.result_file import (
     RunResult,
     UnusualConfig,
 )
+from ambiguous_wild.harness.start import StartFile
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.motion_points import FILE as MOTION
 from ambiguous_wild.methods.graft import Graft
@@ -92,6 +93,7 @@ def _cpu_name() -> str:
 IGNORED: dict[str, tuple[str, ...]] = {
     "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
     "scene": ("path",),
+    "start": ("path",),
 }
 # Files that record how a scene was made, versions included. Nothing is trained or scored on them: the same
 # photos simulated by a later version are the same scene.
@@ -109,8 +111,8 @@ def config_identity(config: RunConfig | Mapping[str, Any]) -> str:
         TypeError: a value in it has no form in JSON.
     """
     settings: Options = {k: v for k, v in config.items() if k != "config_hash"}
-    for part, keys in IGNORED.items():
-        settings[part] = {k: v for k, v in settings[part].items() if k not in keys}
+    for part in IGNORED.keys() & settings.keys():
+        settings[part] = {k: v for k, v in settings[part].items() if k not in IGNORED[part]}
     return config_hash(settings)
 
 
@@ -200,6 +202,7 @@ class Cell:
     device: str = "cpu"
     chosen: Chosen = field(default_factory=Chosen)  # optional effects, and the reasons for them
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
+    start: StartFile | None = None  # what it starts from instead of the scene's points
     group: str = ""  # folder below the output, where one output takes several lengths or effects
 
     @property
@@ -211,6 +214,8 @@ class Cell:
             unusual["effects"] = list(self.chosen.effects)
         if self.protocol != "full":
             unusual["protocol"] = self.protocol
+        if self.start is not None:
+            unusual["start"] = {"sha256": self.start.sha256, "path": str(self.start.path)}
         return {
             **unusual,
             "method": self.method.name,
@@ -258,6 +263,8 @@ class Cell:
         all_facts: RunFacts = {**(facts or {}), "length": asked_length(self.train)}
         if mixed := mixed_tests(self.scene):
             all_facts["test_photos"] = mixed
+        if self.start is not None:
+            all_facts["start"] = f"{self.start.path.name} ({self.start.sha256[:8]})"
         return {
             "schema": SCHEMA,
             "method": self.method.name,
@@ -332,6 +339,7 @@ def reproduce(cell: Cell) -> str:
     words += ["--resolution", train.resolution, "--effects", ",".join(cell.chosen.effects) or "none"]
     factor = cell.scene.info.get("loaded_factor")
     words += ["--factor", str(factor)] if factor else []
+    words += ["--start", str(cell.start.path)] if cell.start is not None else []
     words += ["--max-gaussians", str(train.max_gaussians)] if train.max_gaussians is not None else []
     words += ["--protocol", cell.protocol] if cell.protocol != scene_protocol(cell.scene) else []
     for setting in _settings(method, name, cell.options):

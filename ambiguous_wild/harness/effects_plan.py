@@ -252,7 +252,7 @@ Answer = Literal["on", "off", "unknown"]
 SCHEMA = 1
 
 # Thresholds, set on tracks with and without the injected effect (tests/harness/test_planning.py) and on the
-# captures of docs/effects.md, which lists how near the measured values are.
+# captures of docs/notes/effects.md, which lists how near the measured values are.
 EXPOSURE = 0.05
 APPEARANCE = 0.043
 # A highlight is not linear in the direction. Its remainder, up to 1.7 times its linear part in the tests,
@@ -262,11 +262,11 @@ SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
 # cameras around an object have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1;
-# for the last a dense start of 30 photos was better (docs/effects.md)
+# for the last a dense start of 30 photos was better (docs/notes/effects.md)
 OUTWARD = 2.0
-# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/effects.md)
+# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/notes/effects.md)
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24
-# simulated courtyards, rooms and yards have 0.01 to 0.05, real captures 0.09 to 0.66 (docs/effects.md)
+# simulated courtyards, rooms and yards have 0.01 to 0.05, real captures 0.09 to 0.66 (docs/notes/effects.md)
 UNCOVERED = 0.07
 
 
@@ -324,7 +324,7 @@ class Plan:
         """Return the names of effects to switch on, for `--effects`; with `among`, only those in it.
 
         A lower SH degree is never among them: it saves almost no time and costs a third to half a decibel,
-        on matt scenes too (docs/effects.md).
+        on matt scenes too (docs/notes/effects.md).
         """
         names = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
         return tuple(name for name in names if among is None or name in tuple(among))

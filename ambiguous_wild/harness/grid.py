@@ -33,6 +33,7 @@ from ambiguous_wild.harness.run import (
     refuse_strange_folder,
     run_cell,
 )
+from ambiguous_wild.harness.start import start_file, start_line, started
 from ambiguous_wild.harness.timing import LEAST, MOST, expected_s, slowness
 from ambiguous_wild.harness.training import Tick
 from ambiguous_wild.io.files import check_output
@@ -40,24 +41,34 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.effects import ALL
 from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.parts import Parts
 
 
-def try_recipes(cells: Sequence[Cell]) -> None:
+def try_recipes(cells: Sequence[Cell]) -> list[str]:
     """Build the parts of every method once, so that a faulty last method is found before the first trains.
+
+    Returns:
+        A line for each method and scene on the file that they start from (`--start`).
 
     Raises:
         AwError: a recipe refuses an option, or its weights are missing. Other errors are left to the runs.
     """
     from ambiguous_wild.splat.effects import with_effects
 
-    different = {(cell.method.name, repr(cell.options), cell.chosen.effects): cell for cell in cells}
+    different = {
+        (cell.method.name, repr(cell.options), cell.chosen.effects, cell.scene_id): cell for cell in cells
+    }
+    lines = []
     for cell in different.values():
         try:
-            with_effects(cell.method.build(cell.options), cell.chosen.effects)
+            parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
+            if cell.start is not None:
+                lines.append(start_line(cell.start, cell.method.name, parts, cell.train, cell.scene))
         except AwError as error:
             raise AwError(f"{cell.method.name}: {error}") from error
         except (Exception, SystemExit):
             continue  # a plug-in's bug: its runs fail with their traceback, the others are trained
+    return list(dict.fromkeys(lines))
 
 
 def check_grafts(cells: Sequence[Cell]) -> list[str]:
@@ -89,6 +100,7 @@ def plan_cells(
     effects: str = "none",
     plan: Plan | None = None,
     protocol: Protocol | None = None,
+    start: Path | None = None,
     probing: Probing | None = None,
 ) -> list[Cell]:
     """Plan every method on every scene with every seed, after a check of all names and options.
@@ -104,10 +116,11 @@ def plan_cells(
         effects: "none", "all", "auto" or names of effects; the same for all methods that can take them.
         plan: plan of the only scene, if it was made before; None = made where one is needed.
         protocol: "full" measures whole test photos, "half" the right half; None = what scene.json says.
+        start: a splat file or point cloud to start from; None = the scene's points.
         probing: how plans are made from probes; None = the limits decide alone.
 
     Raises:
-        AwError: unknown method, option or scene; two scenes of the same name.
+        AwError: unknown method, option or scene; a start that no camera sees; two scenes of the same name.
     """
     named = _by_name(methods)
     by_method = _settings_by_method(settings, list(named.values()))
@@ -130,6 +143,14 @@ def plan_cells(
             f"two scenes are called {', '.join(sorted(twice))}: their runs would share a folder; "
             "rename one in its scene.json or bench them into different -o"
         )
+    file = None if start is None else start_file(start)
+    if file and (programs := [name for name, entry in named.items() if not takes_effects(entry)]):
+        raise AwError(
+            f"--start {start}: the external program {', '.join(programs)} cannot start from a file; bench it "
+            "without --start"
+        )
+    for scene in loaded:
+        started(Parts(), file, scene)
     cells = []
     for scene in loaded:
         identity = scene_identity(scene)
@@ -139,7 +160,7 @@ def plan_cells(
             for seed in dict.fromkeys(seeds):
                 config = dataclasses.replace(train, seed=seed)
                 cells.append(
-                    Cell(entry, options, scene, identity, config, device, chosen[entry.name], measured)
+                    Cell(entry, options, scene, identity, config, device, chosen[entry.name], measured, file)
                 )
     return cells
 

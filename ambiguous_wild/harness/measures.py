@@ -135,7 +135,8 @@ COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model
 # An unknown metric is shown like its family: psnr_distractor like PSNR.
 FAMILIES = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_alex"}
 
-_own: dict[str, Metric] = {}  # registered, or known only from the record in a result: without a function
+# registered, or known only from the record in a result: then without a function
+own_metrics: dict[str, Metric] = {}
 
 
 @cache
@@ -148,17 +149,17 @@ def _installed() -> dict[str, Metric]:
 def metrics() -> dict[str, Metric]:
     """Return every metric that can be computed, by key: built in, registered, installed as entry points."""
     for key, metric in _installed().items():
-        if key not in _own or not _own[key].function:
+        if key not in own_metrics or not own_metrics[key].function:
             register(metric)
-    return {k: m for k, m in (MEASURES | _own).items() if isinstance(m, Metric) and m.function}
+    return {k: m for k, m in (MEASURES | own_metrics).items() if isinstance(m, Metric) and m.function}
 
 
 def measure(key: str) -> Measure:
     """Return the column of that key; an unknown key is shown like its family."""
-    if key not in MEASURES and key not in _own:
+    if key not in MEASURES and key not in own_metrics:
         metrics()  # an installed package may have it
-    if key in MEASURES or key in _own:
-        return MEASURES.get(key) or _own[key]
+    if key in MEASURES or key in own_metrics:
+        return MEASURES.get(key) or own_metrics[key]
     family = FAMILIES.get(key.partition("_")[0])
     return replace(MEASURES[family], key=key, label=key) if family else Measure(key, key, None)
 
@@ -183,7 +184,7 @@ def register(metric: Metric) -> Metric:
     ):
         if not right:
             raise AwError(f"metric {metric.key!r}: {field} is {value!r}: write {form}")
-    _own[metric.key] = replace(metric, label=f"{metric.label} {metric.unit}".strip(), unit="")
+    own_metrics[metric.key] = replace(metric, label=f"{metric.label} {metric.unit}".strip(), unit="")
     return metric
 
 
@@ -228,7 +229,7 @@ def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
 def remember(in_result: Mapping[str, MetricRecord]) -> None:
     """Register the columns of a result's own metrics from their records, without functions."""
     for key in in_result.keys() - MEASURES:
-        _own.setdefault(key, Metric(key, function="", **in_result[key]))
+        own_metrics.setdefault(key, Metric(key, function="", **in_result[key]))
 
 
 class ImageRow(TypedDict, total=False):

@@ -19,8 +19,9 @@ from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
-from ambiguous_wild.viewing.model import Model, RenderSettings
+from ambiguous_wild.viewing.model import Model, RenderSettings, file_model
 from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
+from ambiguous_wild.viewing.video import scene_around
 
 MASKS = "masks"
 
@@ -49,17 +50,26 @@ class SceneModels:
 def read_models(
     paths: Sequence[Path], *, scene: str | None = None, scene_folder: Path | None = None
 ) -> SceneModels:
-    """Read the models of the runs below some folders, and the scene they were trained on.
+    """Read the models of the runs below some folders and of splat files, and their scene.
 
     Args:
-        paths: run folders, or folders of runs.
+        paths: run folders, folders of runs, or splat files.
         scene: name of the scene to show, if the runs are of several.
-        scene_folder: where the scene lies; None = where the runs say.
+        scene_folder: where the scene lies; None = where the runs say. For splat files alone, None gives a
+            scene without photos.
 
     Raises:
         AwError: no run, no model in any, runs of several scenes, or a scene that has been moved.
     """
-    trained, notes = find_models(paths)
+    files, notes = read_files(paths)
+    folders = [path for path in paths if not path.is_file()]
+    if files and not folders:
+        opened = scene_around(files[0]) if scene_folder is None else load_scene(scene_folder)
+        if scene_folder is None:
+            notes.append(f"no --scene: the cameras are on a circle around {files[0].ply.name}, y down")
+        return SceneModels(opened, tuple(model.within(opened.place) for model in files), tuple(notes))
+    trained, more = find_models(folders if files else paths)
+    notes += more
     names = sorted({t.scene for t in trained})
     if scene is not None:
         trained = [t for t in trained if t.scene == scene]
@@ -74,7 +84,20 @@ def read_models(
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
     opened = open_scene(trained[0].run, scene_folder)
     notes += [mixed] if (mixed := mixed_tests(opened)) else []
-    return SceneModels(opened, tuple(t.model for t in trained), tuple(notes))
+    models = (*(t.model for t in trained), *(model.within(opened.place) for model in files))
+    return SceneModels(opened, models, tuple(notes))
+
+
+def read_files(paths: Sequence[Path]) -> tuple[list[Model], list[str]]:
+    """Read the models of the splat files among the paths, with unique labels, and notes on them.
+
+    Raises:
+        AwError: a file is no splat file.
+    """
+    read = [file_model(path) for path in dict.fromkeys(paths) if path.is_file()]
+    count = Counter(model.label for model, _ in read)
+    models = [replace(m, label=str(m.ply)) if count[m.label] > 1 else m for m, _ in read]
+    return models, [note for _, note in read if note]
 
 
 def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
@@ -90,7 +113,8 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
     for root in paths:
         if not root.is_dir():
             raise AwError(
-                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, or a run in it"
+                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, a run in it, or a "
+                "splat file"
             )
         for run in dict.fromkeys(run_folders(root)):
             if any(t.run.samefile(run) for t in trained):

@@ -207,7 +207,7 @@ def _find_regions(scene: Scene) -> Regions:
 
 def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
     """Return the exact mask of a photo, [H, W] bool, True on distractors; None if the capture has none."""
-    path = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png").name
+    path = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png")
     if not path.exists():
         return None
     mask = read_gray(path) >= 128

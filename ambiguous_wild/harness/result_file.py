@@ -185,6 +185,7 @@ class UnusualConfig(TypedDict, total=False):
 
     effects: list[str]
     protocol: str
+    start: dict[str, str]  # sha256 and path of the file of --start
 
 
 class RunConfig(UnusualConfig):

@@ -21,7 +21,7 @@ from ambiguous_wild.splat.effects import check_effects
 LEAST_PHOTOS = 4  # fewer give no useful standard error
 LEAST_DB = 0.05  # an effect that gains less is not worth its time
 # Probes grow no Gaussians and understate what masks give: static captures -0.02 to +0.01 dB, captures with
-# distractors from 0.05 dB (docs/effects.md)
+# distractors from 0.05 dB (docs/notes/effects.md)
 LEAST_DB_MASKS = 0.02
 
 

@@ -206,7 +206,7 @@ class _Worker:
         # Not forked: the threads of torch and Numba do not survive that.
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs,))
+        self.process = context.Process(target=serve, args=(theirs,))
         # set before the start: spawn imports the caller's main module first, and CUDA reads it only once
         before = os.environ.get(VISIBLE)
         if gpu is not None:
@@ -247,7 +247,7 @@ class _Worker:
         return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
 
-def _serve(connection: Connection) -> None:
+def serve(connection: Connection) -> None:
     """Run the jobs of the pipe in a worker process until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this one
     threading.Thread(target=_follow_parent, daemon=True).start()

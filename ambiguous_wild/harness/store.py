@@ -36,7 +36,7 @@ CONFIG = "config.yaml"
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
     "timing_kernel", "hardware", "effects", "length", "features",
-    "test_photos",
+    "test_photos", "start",
 )  # fmt: skip
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
@@ -264,6 +264,7 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "length": str(result["facts"].get("length") or _length(read_config(run))),
             "test_photos": str(result["facts"].get("test_photos", "")),
             "features": _features(result["options"]),
+            "start": str(result["facts"].get("start", "the scene's points")),
         }
         | {"folder": str(run), "images": len(result["per_image"])}
         | cost

@@ -24,6 +24,7 @@ from ambiguous_wild.harness import evaluate, pictures
 from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
 from ambiguous_wild.harness.meter import Meter
 from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult, TimeRecord
+from ambiguous_wild.harness.start import started
 from ambiguous_wild.io.files import atomic_dir, write_json
 from ambiguous_wild.io.images import read_keep_map, write_png
 from ambiguous_wild.io.ply import write_splat_ply
@@ -43,8 +44,6 @@ _NO_MEMORY = ("CUDA out of memory", "CUDA error: out of memory")
 def reset_peak(device: str = "cpu") -> None:
     """Start new peaks of memory: of the process where the system can (Linux), and of a GPU."""
     if device.startswith("cuda"):
-        import torch
-
         torch.cuda.reset_peak_memory_stats(device)
     try:
         (_PROC / "clear_refs").write_text("5")
@@ -57,8 +56,6 @@ def peak_memory(device: str = "cpu") -> Cost:
     rss = peak_rss_mb()
     peaks: Cost = {"peak_rss_mb": rss} if math.isfinite(rss) else {}
     if device.startswith("cuda"):
-        import torch
-
         peaks["peak_cuda_mb"] = torch.cuda.max_memory_allocated(device) / 1e6
     return peaks
 
@@ -84,8 +81,6 @@ def peak_rss_mb() -> float:
 
 def is_out_of_gpu_memory(error: BaseException) -> bool:
     """Return whether a GPU had no memory left; gsplat's kernels raise a plain RuntimeError then."""
-    import torch
-
     if isinstance(error, torch.OutOfMemoryError):
         return True
     return isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
@@ -290,7 +285,9 @@ def _make_trainer(
     folder.mkdir(parents=True, exist_ok=True)
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
-    parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
+    parts = started(
+        with_effects(cell.method.build(cell.options), cell.chosen.effects), cell.start, cell.scene
+    )
     if first is not None:
         parts = replace(parts, mask=FixedMasks(first.keeps))
 

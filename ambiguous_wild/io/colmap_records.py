@@ -48,6 +48,7 @@ class ModelCamera:
     width: int  # px
     height: int  # px
     params: tuple[float, ...]  # px and distortion, in COLMAP's order
+    shear: float = 0.0  # px that x moves right per px below cy, after the lens; Metashape's b2, not COLMAP's
 
     def pinhole(self) -> tuple[float, float, float, float]:
         """(fx, fy, cx, cy) in px.

@@ -92,7 +92,10 @@ def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
     text = "\n".join(lines)
     found = re.fullmatch(
         r"ply\nformat binary_little_endian 1.0\nelement chunk (\d{1,9})\n"
-        + "".join(f"property float {name}\n" for name in _BOUNDS)
+        + "".join(f"property float {name}\n" for name in _BOUNDS[:12])
+        + "("
+        + "".join(f"property float {name}\n" for name in _BOUNDS[12:])
+        + ")?"
         + r"element vertex (\d{1,9})\n"
         + "\n".join(f"property uint {name}" for name in _PACKED)
         + r"(?:\nelement sh \d{1,9}((?:\nproperty uchar f_rest_\d+)*))?",
@@ -100,13 +103,18 @@ def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
     )
     if found is None:
         raise AwError(f"{path} is no compressed PLY as 'aw export' and splat-transform write it")
-    n, rest = int(found[2]), (found[3] or "").count("\n") // 3
+    n, rest = int(found[3]), (found[4] or "").count("\n") // 3
+    if rest not in (0, 3, 8, 15):
+        raise AwError(f"{path} has {3 * rest} f_rest columns; degree 0 to 3 have 0, 9, 24 or 45")
     chunks, start = -(-n // _CHUNK), end + len(b"end_header\n")
-    size = chunks * len(_BOUNDS) * 4 + n * (16 + 3 * rest)
+    ends = 6 if found[2] else 4  # SuperSplat's first files have no bounds of colours
+    size = chunks * 12 * ends + n * (16 + 3 * rest)
     if int(found[1]) != chunks or len(data) - start < size:
         raise AwError(f"{path} is cut short: {size} bytes announced, {len(data) - start} present")
-    bounds = np.frombuffer(data, "<f4", chunks * len(_BOUNDS), start).reshape(chunks, 6, 3)
+    bounds = np.frombuffer(data, "<f4", chunks * 3 * ends, start).reshape(chunks, ends, 3)
     start += bounds.nbytes
+    if ends == 4:
+        bounds = np.concatenate([bounds, np.zeros((chunks, 1, 3)), np.ones((chunks, 1, 3))], axis=1)
     packed = np.frombuffer(data, "<u4", 4 * n, start).reshape(n, 4).astype(np.int64)
     codes = np.frombuffer(data, np.uint8, 3 * rest * n, start + 16 * n).reshape(n, 3, rest)
     of = np.arange(n) // _CHUNK

@@ -15,7 +15,17 @@ import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.files import atomic_path
-from ambiguous_wild.io.splat_arrays import SH_C0, Arrays, finite, logit, read_bytes, rounded, sigmoid
+from ambiguous_wild.io.splat_arrays import (
+    SH_C0,
+    Arrays,
+    finite,
+    logit,
+    place_facts,
+    place_from,
+    read_bytes,
+    rounded,
+    sigmoid,
+)
 
 EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
@@ -84,8 +94,11 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -
     }
     x, y, z = place.centre
     node = {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
+    if place.turn != UNMOVED.turn:  # the caller turned it: its y is up
+        node = {"mesh": 0}
+    told = {"extras": place_facts(place)} if place != UNMOVED else {}
     head = {
-        "asset": {"version": "2.0", "generator": "ambiguous_wild"},
+        "asset": {"version": "2.0", "generator": "ambiguous_wild", **told},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -111,6 +124,13 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -
         f.write(struct.pack("<II", len(text), _JSON) + text)
         f.write(struct.pack("<II", len(body), _BIN) + body)
     return n
+
+
+def gltf_place(path: Path | str) -> Place:
+    """Where the scene of a file that `read_gltf` has read lies."""
+    data = read_bytes(path, _MOST_BYTES)
+    (length,) = struct.unpack_from("<I", data, 12)
+    return place_from(json.loads(data[20 : 20 + length])["asset"].get("extras"))
 
 
 def read_gltf(path: Path | str) -> dict[str, np.ndarray]:

@@ -211,6 +211,27 @@ def header_size(source: Path | str | bytes) -> tuple[int, int] | None:
         return None
 
 
+def orientation(path: Path | str) -> int:
+    """EXIF orientation of a photo, 1 to 8; 1 = as stored, also where nothing or nonsense is stated."""
+    try:
+        with pillow().open(path, formats=_FORMATS) as image:
+            value = image.getexif().get(0x0112, 1)
+    except Exception:  # as in `header_size`
+        return 1
+    return value if value in range(1, 9) else 1
+
+
+def upright(image: np.ndarray, orientation: int) -> np.ndarray:
+    """Apply EXIF orientation 1..8 (EXIF 2.32, tag 274)."""
+    if orientation in (5, 6, 7, 8):
+        image = image.transpose(1, 0, 2)
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    return image
+
+
 @functools.cache
 def pillow() -> Any:
     """Pillow's Image, without its own limit of pixels: `MAX_PIXELS` is ours, checked before decoding."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, install_command
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
-from ambiguous_wild.io.images import MAX_PIXELS, pillow
+from ambiguous_wild.io.images import MAX_PIXELS, pillow, upright
 
 PHOTO_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif", ".dng",
@@ -308,17 +308,6 @@ def _three_channels(
     if channels != 3:
         raise UnreadablePhoto(path, f"{channels} channels ({', '.join(names)}) are not a photo; export RGB")
     return pixels, ["CMYK converted to RGB without its profile"] if space == "CMYK" else []
-
-
-def upright(image: np.ndarray, orientation: int) -> np.ndarray:
-    """Apply EXIF orientation 1..8 (EXIF 2.32, tag 274)."""
-    if orientation in (5, 6, 7, 8):
-        image = image.transpose(1, 0, 2)
-    if orientation in (2, 3, 6, 7):
-        image = image[:, ::-1]
-    if orientation in (3, 4, 7, 8):
-        image = image[::-1]
-    return image
 
 
 def _one_line(text: object) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -19,6 +19,7 @@ _TYPES = {
     "ushort": "<u2", "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
     "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
 }  # fmt: skip
+_FORMS = ("binary_little_endian", "binary_big_endian", "ascii")
 _COLOURS = ("red", "green", "blue")
 _SPELLINGS = (_COLOURS, tuple(f"diffuse_{c}" for c in _COLOURS), tuple("rgb"), ("Red", "Green", "Blue"))
 _SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (3,)}
@@ -89,8 +90,10 @@ def rescaled(gaussians: Mapping[str, np.ndarray], factor: float) -> Mapping[str,
 
 def place_comments(place: Place) -> list[str]:
     """Header lines of a PLY that tell where its scene lies."""
-    x, y, z = place.centre
-    told = [f"comment offset {x!r} {y!r} {z!r}", f"comment training_scale {place.scale!r}"]
+    values = {"offset": place.centre, "training_scale": (place.scale,), "rotation": place.turn}
+    if place.turn == UNMOVED.turn:
+        del values["rotation"]
+    told = [f"comment {name} {' '.join(map(repr, numbers))}" for name, numbers in values.items()]
     return [] if place == UNMOVED else told
 
 
@@ -101,16 +104,30 @@ def read_place(path: Path | str) -> Place:
         AwError: its numbers are none.
     """
     with open(path, "rb") as f:
-        words = re.findall(rb"^comment (?:offset|training_scale) (.+)$", f.read(_MAX_HEADER), re.MULTILINE)
-    if len(words) != 2:
+        head = f.read(_MAX_HEADER).partition(b"end_header")[0]
+    words = dict(re.findall(rb"^comment (offset|training_scale|rotation) (.+)$", head, re.MULTILINE))
+    if not {b"offset", b"training_scale"} <= words.keys():
         return UNMOVED
     try:
-        x, y, z, scale = map(float, b" ".join(words).split())
+        offset, (scale,), turn = (
+            [float(v) for v in words.get(name, b"1 0 0 0").split()]
+            for name in (b"offset", b"training_scale", b"rotation")
+        )
+        return checked_place(offset, scale, turn)
     except ValueError:
-        scale = np.nan
-    if not (scale > 0 and np.isfinite([x, y, z, scale]).all()):
-        raise AwError(f"{path}: its comments offset and training_scale are damaged; train again")
-    return Place((x, y, z), scale)
+        raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
+
+
+def checked_place(offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn) -> Place:
+    """The place that a file tells of.
+
+    Raises:
+        ValueError: the numbers are none.
+    """
+    (x, y, z), (a, b, c, d) = offset, turn
+    if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(turn)):
+        raise ValueError("a place that is none")
+    return Place((float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d)))
 
 
 def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
@@ -124,7 +141,7 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
         AwError: no splat PLY, cut short, missing columns, or harmonics of no degree from 0 to 3.
     """
     path = Path(path)
-    table = _vertices(path, ("binary_little_endian",))
+    table = _vertices(path)
     count = len(table)
     present = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in present)
@@ -132,7 +149,9 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
         raise AwError(f"{path} has {rest} f_rest columns; degree 0 to 3 have 0, 9, 24 or 45")
     missing = [c for c in _columns(rest // 3) if c not in present and c not in ("nx", "ny", "nz")]
     if missing:
-        raise AwError(f"{path} is no splat PLY: it lacks {', '.join(missing[:6])}")
+        points = {"x", "y", "z"} <= present and "opacity" not in present
+        hint = "; to train from its points: aw bench --start" if points else ""
+        raise AwError(f"{path} is no splat PLY: it lacks {', '.join(missing[:6])}{hint}")
 
     def columns(names: list[str]) -> np.ndarray:
         return np.stack([table[name].astype(np.float32) for name in names], axis=1)
@@ -152,13 +171,27 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     return dict(rescaled(found, read_place(path).scale))
 
 
+def has_splats(path: Path) -> bool:
+    """Whether a file may be one of splats, and no PLY of plain points.
+
+    Raises:
+        AwError: it cannot be read.
+    """
+    try:
+        with open(path, "rb") as f:
+            head = f.read(_MAX_HEADER).partition(b"end_header")[0]
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    return not head.startswith(b"ply") or b" opacity" in head or b"element chunk" in head
+
+
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [M, 3] float64 and colours [M, 3] uint8 of a point cloud, ASCII or binary little-endian.
+    """Positions [M, 3] float64 and colours [M, 3] uint8 of a point cloud.
 
     Raises:
         AwError: unreadable, damaged, or without x, y, z.
     """
-    table = _vertices(path, ("ascii", "binary_little_endian"))
+    table = _vertices(path)
     names = table.dtype.names or ()
     if not all(axis in names for axis in "xyz"):
         raise AwError(f"{path} has no x, y and z")
@@ -201,21 +234,21 @@ def splat_count(path: Path | str) -> int:
     path = Path(path)
     try:
         with open(path, "rb") as f:
-            return _header(path, f.read(_MAX_HEADER), ("binary_little_endian",))[0]
+            return _header(path, f.read(_MAX_HEADER))[0]
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
 
 
-def _vertices(path: Path, forms: tuple[str, ...]) -> np.ndarray:
+def _vertices(path: Path) -> np.ndarray:
     """The first element's rows, [M] with a field a property.
 
     Raises:
-        AwError: no PLY file of these forms, or cut short.
+        AwError: no PLY file, or cut short.
     """
     try:
         size = path.stat().st_size
         with open(path, "rb") as f:
-            count, dtype, start, form = _header(path, f.read(_MAX_HEADER), forms)
+            count, dtype, start, form = _header(path, f.read(_MAX_HEADER))
             f.seek(start)
             if form == "ascii":
                 return _ascii_rows(path, f, count, dtype)
@@ -246,7 +279,7 @@ def _ascii_rows(path: Path, lines: IO[bytes], count: int, dtype: np.dtype) -> np
     return table
 
 
-def _header(path: Path, head: bytes, forms: tuple[str, ...]) -> tuple[int, np.dtype, int, str]:
+def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int, str]:
     """Number of vertices, their dtype, the offset of the data, and its form."""
     if not head.startswith(b"ply"):
         raise AwError(f"{path} is no PLY file: it does not start with 'ply'")
@@ -273,11 +306,12 @@ def _header(path: Path, head: bytes, forms: tuple[str, ...]) -> tuple[int, np.dt
             fields.append((words[2], _TYPES[words[1]]))
         elif not (words[0] == "property" and element == "later"):
             raise AwError(f"{path}: cannot use header line {line[:60]!r}")
-    if form not in forms:
-        raise AwError(f"{path} is {form[:30]}, not {' or '.join(forms)}; export it in that form")
+    if form not in _FORMS:
+        raise AwError(f"{path} is of format {form[:30]!r}, not {', '.join(_FORMS)}; export it again")
     if count < 0 or not fields:
         raise AwError(f"{path}: its header names no vertices")
     names = [name for name, _ in fields]
     if len(set(names)) != len(names):
         raise AwError(f"{path}: its header names a vertex property twice")
-    return count, np.dtype(fields), newline + 1, form
+    row = np.dtype(fields)
+    return count, row.newbyteorder(">") if form == "binary_big_endian" else row, newline + 1, form

@@ -25,6 +25,7 @@ from ambiguous_wild.io.splat_arrays import (
     largest_first,
     logit,
     place_facts,
+    place_from,
     read_bytes,
     rounded,
     sigmoid,
@@ -114,6 +115,12 @@ def read_sog(path: Path | str) -> dict[str, np.ndarray]:
             return _decode(archive, meta)
     except (zipfile.BadZipFile, KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise AwError(f"{path} is no SOG of version 2, or damaged: {error}") from None
+
+
+def sog_place(path: Path | str) -> Place:
+    """Where the scene of a file that `read_sog` has read lies."""
+    with zipfile.ZipFile(path) as archive:
+        return place_from(json.loads(_member(archive, "meta.json")).get("asset"))
 
 
 def _decode(archive: zipfile.ZipFile, meta: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.io.ply import checked_place
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
@@ -21,7 +22,7 @@ def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
     norm 1."""
     sound = np.ones(len(gaussians["means"]), bool)
     for name in _NAMES:
-        sound &= np.isfinite(gaussians[name]).reshape(len(sound), -1).all(axis=1)
+        sound &= np.isfinite(gaussians[name]).all(axis=tuple(range(1, gaussians[name].ndim)))
     norm = np.linalg.norm(gaussians["quats"].astype(np.float64), axis=1)
     sound &= norm > 0
     kept = {name: np.asarray(gaussians[name], np.float32)[sound] for name in _NAMES}
@@ -106,4 +107,13 @@ def read_bytes(path: Path | str, most: int) -> bytes:
 
 def place_facts(place: Place) -> dict[str, Any]:
     """What a file tells of its scene's place: the user's coordinates are its positions / scale + offset."""
-    return {} if place == UNMOVED else {"offset": list(place.centre), "scale": place.scale}
+    turned = {} if place.turn == UNMOVED.turn else {"rotation": list(place.turn)}
+    return {} if place == UNMOVED else {"offset": list(place.centre), "scale": place.scale, **turned}
+
+
+def place_from(facts: Any) -> Place:
+    """The place of what `place_facts` gave; of anything else where it is."""
+    try:
+        return checked_place(facts["offset"], facts["scale"], facts.get("rotation", UNMOVED.turn))
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return UNMOVED

@@ -1,4 +1,4 @@
-"""Niantic's SPZ, version 3: 24-bit positions, 8-bit everything else, one gzip stream.
+"""Niantic's SPZ: writes version 3, reads 2 to 4: 24-bit positions, 8-bit everything else, one gzip stream.
 
 Layout and quantisation as in Niantic's reference (load-spz.cc). The file's axes are x right, y up, z back
 (RUB); a splat PLY's are x right, y down, z forward, so y and z change sign on the way.
@@ -10,11 +10,13 @@ import gzip
 import json
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
@@ -24,6 +26,7 @@ from ambiguous_wild.io.splat_arrays import (
     largest_first,
     logit,
     place_facts,
+    place_from,
     read_bytes,
     rounded,
     sigmoid,
@@ -31,6 +34,7 @@ from ambiguous_wild.io.splat_arrays import (
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
+_FOURTH = b"NGSP"  # the first bytes of version 4; others are zipped
 _VERSION, _ANTIALIASED = 3, 1
 _FINEST = 18  # fractional bits: 4 micrometres where a unit is a metre
 _COLOUR = 0.15  # codes cover coefficients of +-3.3
@@ -88,26 +92,43 @@ def spz_bytes(gaussians: Arrays, *, antialias: bool = False) -> tuple[bytes, int
 
 
 def read_spz(path: Path | str) -> dict[str, np.ndarray]:
-    """Raw parameters of an SPZ file of version 3, float32, in a PLY's axes.
+    """Raw parameters of an SPZ file of version 2 to 4, float32, in a PLY's axes.
 
     Raises:
-        AwError: no SPZ, another version, or damaged.
+        AwError: no SPZ, another version, damaged, or version 4 without the package zstandard.
     """
     return spz_arrays(read_bytes(path, _MOST_BYTES), path)
+
+
+def spz_facts(packed: bytes) -> tuple[bool, Place]:
+    """Whether the model of `spz_arrays` is drawn with Mip-Splatting's filter, and where its scene lies."""
+    zipped = packed[:4] != _FOURTH
+    head = zlib.decompressobj(wbits=31).decompress(packed, _HEADER.size) if zipped else packed
+    told = packed[10 : packed.find(b"\0", 10)] if zipped and packed[3] == 0x10 else b"0"
+    try:
+        return bool(head[14] & _ANTIALIASED), place_from(json.loads(told))
+    except (ValueError, RecursionError):  # a comment of somebody else
+        return bool(head[14] & _ANTIALIASED), UNMOVED
 
 
 def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
     """As `read_spz`, of a file's bytes; errors name `path`."""
     inflater = zlib.decompressobj(wbits=31)
+    zipped = packed[:4] != _FOURTH
     try:
-        head = inflater.decompress(packed, _HEADER.size)
-        magic, version, n, degree, bits, _, _ = _HEADER.unpack(head)
-        if magic != _MAGIC or version != _VERSION or degree > 3 or bits > 24:
-            raise AwError(f"{path} is no SPZ of version {_VERSION}, which 'aw export' writes")
+        head = inflater.decompress(packed, _HEADER.size) if zipped else packed[: _HEADER.size]
+        magic, version, n, degree, bits, _, streams = _HEADER.unpack(head)
+        if magic != _MAGIC or version not in ((2, 3) if zipped else (4,)) or degree > 3 or bits > 24:
+            raise AwError(f"{path} is no SPZ of version 2, 3 or 4 with harmonics of degree 0 to 3")
         rest = _REST[degree]
-        size = n * (9 + 1 + 3 + 3 + 4 + 3 * rest)
+        turned = 3 if version == 2 else 4
+        widths = (9, 1, 3, 3, turned, 3 * rest)
+        size = n * sum(widths)
         # no more than announced is unpacked, whatever the stream holds
-        data = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
+        if zipped:
+            data = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
+        else:
+            data = _unpacked(packed, streams, [n * width for width in widths], path)
     except (zlib.error, struct.error) as error:
         raise AwError(f"{path} is no SPZ, or damaged: {error}") from None
     if len(data) < size:
@@ -123,15 +144,46 @@ def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
     low[:, :, 1:] = take(9).reshape(n, 3, 3)
     fixed = low.reshape(n, 12).view("<i4") >> 8  # the sign is that of the highest byte
     alpha, colour, scale = take(1)[:, 0], take(3), take(3)
-    quats, harmonics = take(4), take(3 * rest).reshape(n, rest, 3)
+    quats, harmonics = take(turned), take(3 * rest).reshape(n, rest, 3)
     return {
         "means": (fixed / float(1 << bits) * FLIP).astype(np.float32),
-        "quats": _unpack_quats(quats.copy().view("<u4")[:, 0].astype(np.int64)),
+        "quats": _unpack_quats(quats.copy().view("<u4")[:, 0].astype(np.int64))
+        if turned == 4
+        else _second_quats(quats),
         "log_scales": (scale / 16.0 - 10.0).astype(np.float32),
         "opacity_logits": logit(alpha / 255.0),
         "sh0": ((colour / 255.0 - 0.5) / _COLOUR).astype(np.float32),
         "sh_rest": ((harmonics - 128.0) / 128.0 * SH_FLIP[:rest, None]).astype(np.float32),
     }
+
+
+def _unpacked(packed: bytes, streams: int, sizes: Sequence[int], path: Path | str) -> bytes:
+    """The attributes of version 4, one after another: a table of sizes, then a Zstandard frame each."""
+    try:
+        import zstandard  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:
+        need = "needs the package zstandard"
+        raise AwError(f"{path} is SPZ of version 4, which {need}: {install_command('view')}") from None
+    table = struct.unpack_from("<I", packed, 16)[0]
+    at, parts = table + 16 * streams, []
+    for number, size in enumerate(sizes[:streams]):
+        length, whole = struct.unpack_from("<QQ", packed, table + 16 * number)
+        if whole != size:
+            raise AwError(f"{path} is damaged: a part of {whole} bytes, not {size}")
+        try:
+            with zstandard.ZstdDecompressor().stream_reader(packed[at : at + length]) as reader:
+                parts.append(reader.read(size))
+        except zstandard.ZstdError as error:
+            raise AwError(f"{path} is damaged: {error}") from None
+        at += length
+    return b"".join(parts)
+
+
+def _second_quats(codes: np.ndarray) -> np.ndarray:
+    """Of version 2: x, y, z with 8 bits, w positive."""
+    xyz = codes / 127.5 - 1.0
+    w = np.sqrt(np.clip(1.0 - (xyz**2).sum(axis=1), 0.0, None))
+    return np.column_stack([w, xyz * FLIP]).astype(np.float32)
 
 
 def _pack_quats(quats: np.ndarray) -> np.ndarray:

@@ -105,7 +105,7 @@ class MethodEntry:
         made = resolve(self.recipe)(options)
         if not isinstance(made, Parts):
             what = "None" if made is None else type(made).__name__
-            raise AwError(f"{self.name} returned {what}, it must return Parts (see docs/add-a-method.md)")
+            raise AwError(f"{self.name} returned {what}, it must return Parts (see docs/extend.md)")
         return made
 
 

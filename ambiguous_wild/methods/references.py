@@ -147,7 +147,7 @@ def without_recipe(path: Path) -> AwError:
         return AwError(f"no file {path}: write FILE.py:RECIPE, or a name of 'aw methods'")
     names = _recipes(import_file(path))
     if not names:
-        return AwError(f"{path} has no recipe: write a function that returns Parts (docs/add-a-method.md)")
+        return AwError(f"{path} has no recipe: write a function that returns Parts (docs/extend.md)")
     return AwError(
         f"{path} is a file: add the name of a recipe in it: {', '.join(f'{path}:{n}' for n in names)}"
     )

@@ -2,7 +2,7 @@
 
 A method of one's own is found in four ways: `register(...)`, the entry-point group
 `ambiguous_wild.methods`, a file given as `--plugin my_method.py`, or a reference to a recipe in a file,
-`--method my_method.py:my_recipe` (see docs/add-a-method.md).
+`--method my_method.py:my_recipe` (see docs/extend.md).
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ __all__ = [
 
 ENTRY_POINTS = "ambiguous_wild.methods"
 
-_registered: dict[str, MethodEntry] = {}
+registered: dict[str, MethodEntry] = {}  # in this process, by name
 
 
 def register(entry: MethodEntry) -> MethodEntry:
     """Add a method; a later one of the same name replaces the earlier."""
     if not entry.name or any(c in entry.name for c in "/\\\0") or entry.name.startswith("."):
         raise AwError(f"method name {entry.name!r} cannot name a folder: leave out '/' and a leading '.'")
-    _registered[entry.name] = entry
+    registered[entry.name] = entry
     return entry
 
 
@@ -48,7 +48,7 @@ def all_methods() -> dict[str, MethodEntry]:
     methods = {entry.name: entry for entry in BUILTIN}
     for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
         methods.setdefault(point.name, point.load())
-    return methods | _registered
+    return methods | registered
 
 
 def get_method(name: str) -> MethodEntry:
@@ -105,12 +105,12 @@ def load_plugin(path: Path | str) -> list[str]:
     Raises:
         AwError: no such file, or it registers nothing.
     """
-    path, before = Path(path), dict(_registered)
+    path, before = Path(path), dict(registered)
     import_file(path)
     digest = sha256_file(path)
-    added = [key for key, entry in _registered.items() if before.get(key) is not entry]
+    added = [key for key, entry in registered.items() if before.get(key) is not entry]
     if not added:
         raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")
     for key in added:
-        _registered[key] = dataclasses.replace(_registered[key], source_hash=digest)
+        registered[key] = dataclasses.replace(registered[key], source_hash=digest)
     return added

@@ -84,7 +84,7 @@ VARIANTS: dict[str, tuple[_Backbone, bool]] = {
 
 def available() -> dict[str, str | None]:
     """For every variant None if its files exist, else which files are missing. Reads no file."""
-    return {name: _reason(backbone) for name, (backbone, _) in VARIANTS.items()}
+    return {name: why_unavailable(backbone) for name, (backbone, _) in VARIANTS.items()}
 
 
 def too_small(name: str, height: int, width: int) -> str | None:
@@ -118,19 +118,19 @@ def load(name: str) -> Metric:
     if name not in VARIANTS:
         raise unknown("LPIPS variant", name, VARIANTS)
     backbone, centred = VARIANTS[name]
-    reason = _reason(backbone)
+    reason = why_unavailable(backbone)
     if reason is not None:
         raise AwError(reason)
     paths = [find_file(*pair) for pair in _files(backbone)]
     stamps = tuple((str(p), p.stat().st_mtime_ns) for p in paths if p is not None)
-    stack, heads = _network(backbone, stamps)
+    stack, heads = network_of(backbone, stamps)
 
     def measure(a: np.ndarray, b: np.ndarray) -> float:
         left, right = checked_pair(a, b)
         small = too_small(name, *left.shape[:2])
         if small is not None:
             raise AwError(small)
-        return _distance(backbone, stack, heads, left, right, centred)
+        return distance(backbone, stack, heads, left, right, centred)
 
     return measure
 
@@ -142,7 +142,7 @@ def _lpips(name: str, render: np.ndarray, photo: np.ndarray) -> float:
 lpips_alex, lpips_vgg, lpips_vgg_01 = (partial(_lpips, name) for name in VARIANTS)
 
 
-def _distance(
+def distance(
     backbone: _Backbone,
     stack: nn.Sequential,
     heads: list[Tensor],
@@ -180,7 +180,9 @@ def _features(backbone: _Backbone, stack: nn.Sequential, image: np.ndarray, cent
 
 
 @lru_cache(maxsize=4)
-def _network(backbone: _Backbone, stamps: tuple[tuple[str, int], ...]) -> tuple[nn.Sequential, list[Tensor]]:
+def network_of(
+    backbone: _Backbone, stamps: tuple[tuple[str, int], ...]
+) -> tuple[nn.Sequential, list[Tensor]]:
     """The layers and the heads [C, 1, 1]; `stamps` are the files and their times, so that a replaced
     file is read again."""
     trunk, head = (Path(path) for path, _ in stamps)
@@ -226,7 +228,7 @@ def _files(backbone: _Backbone) -> tuple[tuple[str, tuple[str, str]], tuple[str,
     return (backbone.name, backbone.files), (backbone.head_name, backbone.head_files)
 
 
-def _reason(backbone: _Backbone) -> str | None:
+def why_unavailable(backbone: _Backbone) -> str | None:
     """None if both files exist, else the command that downloads them."""
     need = [name for name, files in _files(backbone) if find_file(name, files) is None]
     if not need:

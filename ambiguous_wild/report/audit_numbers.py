@@ -26,7 +26,7 @@ OPTIONAL = ("table", "setting", "dataset", "variant", "mark", "printed")
 UNKNOWN = "unknown"
 MEAN, ALL = "mean", "all"  # in place of a scene: the mean over scenes; in place of a dataset: over datasets
 LARGEST = 50_000_000  # bytes
-REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables, see docs/audit.md
+REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables, see docs/tables.md
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def read_tables(paths: Sequence[Path]) -> list[Number]:
     for path in paths:
         inside = sorted(path.glob("*.csv")) if path.is_dir() else [path]
         if not inside:
-            raise AwError(f"no *.csv in {path}: give tables as docs/audit.md describes them")
+            raise AwError(f"no *.csv in {path}: give tables as docs/tables.md describes them")
         files += inside
     numbers = [n for path in dict.fromkeys(files) for n in _read(path)]
     if not numbers:

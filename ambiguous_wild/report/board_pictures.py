@@ -208,7 +208,7 @@ def _keep_masks(board: Path, run: Verified, count: int, index: dict[_Place, Row]
         photo = _jpeg(view.image_path)
         written += _write(board, _Place(e.dataset, e.scene, name, kind=TRAIN), photo, "", math.nan, index)
         size = (view.camera.width, view.camera.height)
-        exact = scene.root / "truth" / "distractor" / Path(name).with_suffix(".png").name
+        exact = scene.root / "truth" / "distractor" / Path(name).with_suffix(".png")
         if exact.is_file():
             drawn = _overlay(read_gray(exact) >= 128, size, EXACT_RGBA)
             written += _write(board, _Place(e.dataset, e.scene, name, kind=EXACT), drawn, "", math.nan, index)

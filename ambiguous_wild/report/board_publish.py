@@ -197,17 +197,8 @@ def _number(value: float) -> float | str | None:
 SOURCE = "reported"
 SOURCES = "sources.json"
 REPORTED_COLUMNS = (
-    "source",
-    "method",
-    "setting",
-    "dataset",
-    "scene",
-    "metric",
-    "variant",
-    "value",
-    "printed",
-    "table",
-)
+    "source", "method", "setting", "dataset", "scene", "metric", "variant", "value", "printed", "table",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -338,7 +329,7 @@ def publish(
         raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
     if reported_from is not None and not reported_from.is_dir():
         raise AwError(
-            f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/audit.md"
+            f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/tables.md"
         )
     source = reported_from
     if reported and source is None:

@@ -37,6 +37,8 @@ def setting(config: RunConfig) -> str:
         words.append("effects " + "+".join(map(str, config["effects"])))
     if config.get("protocol", "full") != "full":
         words.append(f"{config['protocol']} images")
+    if isinstance(start := config.get("start"), dict):
+        words.append(f"start {str(start.get('sha256'))[:8]}")
     if train.get("resolution", "auto") != "auto":
         words.append(f"resolution {train['resolution']}")
     if train.get("max_gaussians") is not None:
@@ -94,6 +96,7 @@ def command(config: RunConfig, before: Sequence[str] = ()) -> str:
     ):
         if value != usual:
             words += [flag, value]
+    words += ["--start", "START.ply"] if config.get("start") else []
     words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
     for key, value in _changed(config).items():
         words += ["--set", f"{key}={value}"]

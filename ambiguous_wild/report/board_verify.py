@@ -192,7 +192,7 @@ def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
     if not (re.fullmatch(r"[0-9a-f]{64}", source) or (named and not source)):
         raise AwError(
             f"{run}: the code of method {method[:60]!a} is unknown: it is not in this package, and "
-            "config.yaml has no hash of it; run it as a file, see docs/add-a-method.md"
+            "config.yaml has no hash of it; run it as a file, see docs/extend.md"
         )
 
 

@@ -189,6 +189,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         "train": {k: v for k, v in train.items() if k not in (*BOOKKEEPING, *SETTINGS)},
         "device": config.get("device", cost.get("device")),
         "protocol": config.get("protocol", "full"),
+        "start": _mapping(config.get("start")).get("sha256"),
         "code": [config.get("source"), result["version"]],
         "images": sorted(images),
     }

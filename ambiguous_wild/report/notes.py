@@ -48,6 +48,7 @@ CONDITIONS = {
     "length": "lengths",
     "fit": "protocols",
     "features": "features",
+    "start": "starts",
 }
 
 

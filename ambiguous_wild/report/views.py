@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.harness.bench import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
-from ambiguous_wild.harness.models import find_models, open_scene, read_models
+from ambiguous_wild.harness.models import find_models, open_scene, read_files, read_models
 from ambiguous_wild.io.files import check_output, refuse_files_there
 from ambiguous_wild.io.page_parts import narrowed
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import FORMATS, Exported, export
+from ambiguous_wild.viewing.model import FORMATS, NO_PHOTO, Exported, export, space_of
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -45,48 +46,70 @@ def export_runs(
     scene_folder: Path | None = None,
     threads: int | None = None,
     overwrite: bool = False,
+    up: str | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[tuple[str, list[Exported]]]:
-    """Write the models of runs in other formats.
+    """Write the models of runs, and splat files, in other formats.
 
     Args:
-        paths: run folders, or folders of runs.
+        paths: run folders, folders of runs, or splat files.
         formats: names in `viewing.model.FORMATS`.
-        output: folder for all files, named after the models' labels; None = RUN/export.
+        output: folder for all files, named after the models' labels; None = RUN/export, or beside a file.
         loss: render the test views to measure the loss by rounding; without scene or test views only sizes
             are reported.
         scene_folder: where the scene lies; None = where the runs say.
         threads: threads of the kernels; None = all cores.
         overwrite: replace files of these names in `output`; those in RUN/export are always replaced.
+        up: axis of the files that points up, see `viewing.model.export`; None = the scene's coordinates.
         say: gets a line about each run that is left out.
 
     Returns:
         (label of the model, its files), in the order of the runs' paths.
 
     Raises:
-        AwError: no run with a model, a folder that cannot be written, or files of these names in `output`.
+        AwError: no run with a model, a file that is none, a folder that cannot be written, or files of these
+            names in `output`.
     """
-    trained, notes = find_models(paths)
-    for note in notes:
+    files, notes = read_files(paths)
+    runs = [path for path in paths if not path.is_file()]
+    trained, more = find_models(runs) if runs else ([], [])
+    for note in (*notes, *more):
         say(note)
-    names = _file_names([t.scene for t in trained], [t.model.label for t in trained])
-    for t in trained:
-        check_output((t.run / FOLDER if output is None else output) / "file")
-    if output is not None and not overwrite:
-        wanted = [FORMATS[form][0] for form in formats if form in FORMATS]
-        refuse_files_there(output, (name + ending for name in names for ending in wanted), "--overwrite")
+    models = [*(t.model for t in trained), *files]
+    homes = [t.run for t in trained] + [model.ply.parent for model in files]
+    scenes = [t.scene for t in trained] + [trained[0].scene if trained else ""] * len(files)
+    stems = [re.sub(r"(\.compressed)?\.\w+$", "", model.label) for model in files]
+    names = _file_names(scenes, [t.model.label for t in trained] + stems)
+    folders = [home / FOLDER if output is None else output for home in homes]
+    for folder in folders:
+        check_output(folder / "file")
+    if not overwrite:  # files in RUN/export are replaced anyway
+        for folder, name in list(zip(folders, names))[len(trained) if output is None else 0 :]:
+            wanted = [name + FORMATS[form][0] for form in formats if form in FORMATS]
+            refuse_files_there(folder, wanted, "--overwrite")
     if loss:
         prepare_cpu(threads, say)
     reports = []
-    for t, name in zip(trained, names):
-        views: tuple[View, ...] = ()
-        if loss:
-            try:
-                views = open_scene(t.run, scene_folder).test
-            except AwError as error:
-                say(f"{t.model.label}: the loss is not measured: {error}")
-        folder, stem = (t.run / FOLDER, "point_cloud") if output is None else (output, name)
-        reports.append((t.model.label, export(t.model, folder, formats, views, name=stem)))
+    for number, (model, folder, name) in enumerate(zip(models, folders, names)):
+        run = homes[number] if number < len(trained) else None
+        scene: Scene | None = None
+        try:
+            if run is not None and (loss or up is not None):
+                scene = open_scene(run, scene_folder)
+            elif run is None and scene_folder is not None:
+                scene = load_scene(scene_folder)
+                model = model.within(scene.place)
+        except AwError as error:
+            if up is not None or run is None:
+                raise
+            say(f"{model.label}: the loss is not measured: {error}")
+        if up is not None and scene is None:
+            raise AwError(f"{model.ply}: --up needs the cameras of its scene: name its folder with --scene")
+        space = None if up is None or scene is None else space_of(scene)
+        views = scene.test if scene is not None and loss else ()
+        stem = "point_cloud" if output is None and run is not None else name
+        done = export(model, folder, formats, views, name=stem, space=space, up=up)
+        reports.append((model.label, done))
     return reports
 
 
@@ -192,10 +215,10 @@ def _cameras(scene: Scene, path: str | Path, frames: int, width: int | None) -> 
     lens = (scene.test or scene.views)[0].camera
     wide = lens.width if width is None else width
     size = (wide, max(2, round(lens.height * wide / lens.width)))
+    if path == "orbit" or (path == "test" and scene.views[0].image_path == NO_PHOTO):
+        return orbit(scene, frames, size)
     if path == "test":
         return through_views(scene, frames, size)
-    if path == "orbit":
-        return orbit(scene, frames, size)
     return from_file(Path(path), scene, frames, size)
 
 

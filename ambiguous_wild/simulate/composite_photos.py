@@ -134,7 +134,7 @@ def composite_photos(
             f"photo, more than {_MOST_COVER:g}; lower --coverage or raise --presence"
         )
     shapes = [] if cutouts is None else read_cutouts(cutouts)
-    paths = _list_photos(root)
+    paths, base = _list_photos(root), _base(root)
     is_test = [i % _TEST_EVERY == _TEST_EVERY // 2 for i in range(len(paths))]
     train = [path for path, test in zip(paths, is_test, strict=True) if not test]
     choice_seed, *seeds = np.random.SeedSequence(config.seed).spawn(1 + len(paths))
@@ -145,7 +145,8 @@ def composite_photos(
         for part in ("train", "test"):
             (folder / part).mkdir()
         for path, test, seed in zip(progress(paths), is_test, seeds, strict=True):
-            (clean, exif), name = _read(path), f"{path.stem}.jpg"
+            (clean, exif), own = _read(path), path.relative_to(base).with_suffix(".png")
+            name = own.with_suffix(".jpg").as_posix()
             if test:
                 _write_jpeg(folder / "test" / name, clean, exif)
                 continue
@@ -158,10 +159,11 @@ def composite_photos(
                 over, pieces = _layer(drawn, clean.shape, cover, rng)
                 changed, mask = composed(clean, over), truth(over)
             _write_jpeg(folder / "train" / name, changed, exif)
-            write_png(folder / "truth" / "clean" / f"{path.stem}.png", clean)
-            write_png(folder / "truth" / "distractor" / f"{path.stem}.png", mask)
+            write_png(folder / "truth" / "clean" / own, clean)
+            write_png(folder / "truth" / "distractor" / own, mask)
             share, sha256 = round(float((mask > 0).mean()), 6), sha256_file(path)
-            photos[name] = PastedPhoto(source=path.name, sha256=sha256, occlusion=share, distractors=pieces)
+            source_ = path.relative_to(base).as_posix()
+            photos[name] = PastedPhoto(source=source_, sha256=sha256, occlusion=share, distractors=pieces)
         shares = [p["occlusion"] for p in photos.values()]
         facts: PastedRecord = {
             "schema": 1,
@@ -177,23 +179,34 @@ def composite_photos(
     return facts
 
 
-def _list_photos(root: Path) -> list[Path]:
-    def of(folder: Path) -> list[Path]:
-        return sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
+def _base(root: Path) -> Path:
+    """images/ where that holds the photos."""
+    direct = any(p.suffix.lower() in PHOTO_SUFFIXES for p in root.iterdir())
+    return root / "images" if not direct and (root / "images").is_dir() else root
 
-    paths = of(root)
-    if not paths and (root / "images").is_dir():
-        paths = of(root / "images")
+
+def _list_photos(root: Path) -> list[Path]:
+    """Those of the folder itself, else of all folders in it."""
+    base = _base(root)
+    for found in (base.iterdir(), base.rglob("*")):
+        paths = sorted(p for p in found if p.suffix.lower() in PHOTO_SUFFIXES)
+        paths = [p for p in paths if not any(_hidden(part) for part in p.relative_to(base).parts)]
+        if paths:
+            break
     if len(paths) < _TEST_EVERY:
         raise AwError(
             f"{root} is no scene and holds {len(paths)} photos itself, at least {_TEST_EVERY} are needed for "
             "train and test; give a folder with more photos in it, or a scene of 'aw build-scene'"
         )
-    stems = [p.stem.casefold() for p in paths]
+    stems = [str(p.with_suffix("")).casefold() for p in paths]
     twice = [p.name for p, stem in zip(paths, stems, strict=True) if stems.count(stem) > 1]
     if twice:
         raise AwError(f"{root}: photos have the same name: {shortlist(twice)}; rename or remove one of each")
     return paths
+
+
+def _hidden(part: str) -> bool:
+    return part.startswith(".") or part in ("masks", "truth")
 
 
 def _read(path: Path) -> tuple[np.ndarray, Exif]:
@@ -228,6 +241,7 @@ def _write_jpeg(path: Path, pixels: np.ndarray, exif: Exif) -> None:
     fields.update({tag: round(value) for tag, value in whole.items() if value is not None})
     if exif.taken_at is not None:
         fields[0x9003] = exif.taken_at
+    path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, quality=95, subsampling=0, exif=tags)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import Scene, SceneInfo, View
 from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
@@ -156,15 +156,9 @@ def check_folders(root: Path, target: Path) -> None:
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise AwError where photos share a name, or the scene has distractors already."""
-    stems = [Path(v.name).stem for v in scene.views]
-    twice = sorted({s for s in stems if stems.count(s) > 1})
-    if twice:
-        raise AwError(
-            f"{scene.root}: two folders have photos of the same name: {shortlist(twice)}; rename them"
-        )
+    """Raise AwError where the scene has distractors already."""
     for view in scene.train:
-        mask = scene.root / "truth" / "distractor" / f"{Path(view.name).stem}.png"
+        mask = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png")
         if mask.is_file() and read_gray(mask).any():
             raise AwError(
                 f"{scene.root} has distractors already ({mask.name} is not empty); choose a scene without any"
@@ -224,11 +218,9 @@ def _write_photos(
                 jobs.append(writers.submit(write_png, out, changed))
                 if path == view.image_path:
                     mask = truth(resized(over, width, height))
-                    stem = Path(view.name).stem
-                    jobs.append(writers.submit(write_png, folder / "truth" / "clean" / f"{stem}.png", photo))
-                    jobs.append(
-                        writers.submit(write_png, folder / "truth" / "distractor" / f"{stem}.png", mask)
-                    )
+                    own = Path(view.name).with_suffix(".png")
+                    for part, pixels in (("clean", photo), ("distractor", mask)):
+                        jobs.append(writers.submit(write_png, folder / "truth" / part / own, pixels))
                     photos[view.name] = _photo_facts(plan, placements[view.name], mask)
             for job in jobs:
                 job.result()

@@ -121,6 +121,12 @@ class Gaussians:
         """The rows given by a bool mask [N] or an index tensor, copied and up to date."""
         return self._each(lambda name, tensor: tensor[rows].contiguous())
 
+    def of_degree(self, degree: int) -> Gaussians:
+        """These with harmonics up to this degree: higher ones are dropped, missing ones are 0."""
+        rest = (degree + 1) ** 2 - 1
+        padding = (0, 0, 0, rest - self.sh_rest.shape[1])  # negative: cuts
+        return replace(self, sh_rest=torch.nn.functional.pad(self.sh_rest, padding).contiguous())
+
     def cat(self, other: Gaussians) -> Gaussians:
         """These rows followed by the other's.
 

@@ -8,6 +8,7 @@ frequencies and no residual, so distractors do not mislead it.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -113,6 +114,18 @@ class TrainConfig:
             raise AwError(f"--iterations {self.iterations} is not from 1 to 100 000 000")
 
 
+def room(
+    config: TrainConfig, schedule: Schedule, sizes: Sequence[tuple[int, int]], most: int, start: int = 0
+) -> int:
+    """Gaussians that a run may have, on photos of these sizes (height, width); `most` is the method's own."""
+    if config.max_gaussians is not None:
+        return config.max_gaussians
+    if config.budget_s is None and config.iterations >= schedule.short_below:
+        return most
+    pixels = float(np.median([height * width for height, width in sizes]))
+    return min(most, max(start, int(schedule.per_pixel_short * pixels)))
+
+
 class Pace:
     """Every schedule of one run, from its settings and how far it is: nothing of it is saved."""
 
@@ -192,12 +205,8 @@ class Pace:
         Simulated courtyard at 240x135, 3000 iterations: 14 000, 20 000, 32 000 and 64 000 Gaussians gave
         RefineSplat 30.3, 31.1, 31.3 and 30.7 dB at 9.5, 11.3, 13.6 and 19.6 ms an iteration.
         """
-        if self.config.max_gaussians is not None:
-            return self.config.max_gaussians
-        if not self.short:
-            return most
-        pixels = float(np.median([photo.shape[0] * photo.shape[1] for photo in data.photos]))
-        return min(most, max(self.start, int(self.schedule.per_pixel_short * pixels)))
+        sizes = [(photo.shape[0], photo.shape[1]) for photo in data.photos]
+        return room(self.config, self.schedule, sizes, most, self.start)
 
     def _levels(self, data: TrainData) -> tuple[Level, ...]:
         wanted: str = self.config.resolution

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
@@ -142,6 +143,9 @@ class Parts:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_opacity: float = 0.1
     start_scale: float = 1.0  # times 3DGS's
+    # what training starts from instead: Gaussians, or points [M, 3] and colours [M, 3] uint8, where the user
+    # gives them
+    given: Gaussians | tuple[np.ndarray, np.ndarray] | None = None
     # the first Gaussians; None = one at every point of the sparse model and of `more_points`
     start: Callable[[TrainData], Gaussians] | None = None
     more_points: tuple[MorePoints, ...] = ()  # further points to start from; each gets the room that is left
@@ -169,14 +173,14 @@ class Parts:
         Raises:
             AwError: fewer than 4 points.
         """
-        if self.start is not None:
+        if isinstance(self.given, Gaussians):
+            rows = torch.from_numpy(thinned(len(self.given), most))
+            return self.given.select(rows).of_degree(self.sh_degree).to(data.device)
+        if self.start is not None and self.given is None:
             return self.start(data)
-        xyz, rgb = data.scene.points.xyz, data.scene.points.rgb
-        if most and len(xyz) > most:
-            # an even choice: the points of a scan have no tracks that tell which of them matter
-            rng = np.random.default_rng(0)
-            kept = np.sort(rng.choice(len(xyz), max(int(START_SHARE * most), LEAST_POINTS), replace=False))
-            xyz, rgb = xyz[kept], rgb[kept]
+        xyz, rgb = self.given or (data.scene.points.xyz, data.scene.points.rgb)
+        kept = thinned(len(xyz), most)
+        xyz, rgb = xyz[kept], rgb[kept]
         for points in self.more_points if len(xyz) >= LEAST_POINTS else ():  # else refused below
             room = int(START_SHARE * most) - len(xyz)
             if room > 0:
@@ -186,3 +190,12 @@ class Parts:
             xyz, rgb, sh_degree=self.sh_degree, opacity=self.start_opacity, device=data.device
         )
         return replace(found, log_scales=found.log_scales + math.log(self.start_scale))
+
+
+def thinned(count: int, most: int) -> np.ndarray:
+    """Rows of so many points that a run starts from, if it may have `most` Gaussians; 0 = all."""
+    if not most or count <= most:
+        return np.arange(count)
+    # an even choice: the points of a scan have no tracks that tell which of them matter
+    chosen = np.random.default_rng(0).choice(count, max(int(START_SHARE * most), LEAST_POINTS), replace=False)
+    return np.sort(chosen)

@@ -194,7 +194,7 @@ class Trainer(Run):
         if keep is not None and not isinstance(keep, Tensor):
             raise AwError(
                 f"keep(step) of the method's mask policy gave a {type(keep).__name__}; it must give a torch "
-                "tensor [H, W], or None (docs/add-a-method.md)"
+                "tensor [H, W], or None (docs/extend.md)"
             )
         if self.sentinel is None and keep is not None:  # on the CPU, where reading costs nothing
             low, high = keep.min().item(), keep.max().item()

@@ -49,7 +49,7 @@ class Measured:
 class Case:
     """One row of the table."""
 
-    row: int  # of docs/numerics.md
+    row: int  # number of a group of cases and tests
     name: str
     measure: Callable[[str], Measured]  # argument: the device
     devices: tuple[str, ...]  # that the case applies to

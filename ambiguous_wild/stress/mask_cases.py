@@ -155,7 +155,7 @@ def literal(device: str) -> Measured:
         "global mask: the variance swallows it": not bool(global_mask(raw, spread="var").any()),
     }
     return failed_checks(
-        {k: bool(v) for k, v in checks.items()}, "each fails as described in docs/refinesplat.md"
+        {k: bool(v) for k, v in checks.items()}, "each fails as described in docs/fidelity.md"
     )
 
 

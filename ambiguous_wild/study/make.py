@@ -120,7 +120,7 @@ def render_pairs(
 def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[PairQuestion]:
     if len(folders) < 2:
         return []
-    renders = {m: {p.stem: p for p in sorted((f / "renders/test").glob("*.png"))} for m, f in folders.items()}
+    renders = {m: _renders(f / "renders/test") for m, f in folders.items()}
     common = set.intersection(*(set(r) for r in renders.values()))
     if not common:
         without = [m for m, r in renders.items() if not r]
@@ -137,6 +137,11 @@ def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[P
         for a, b in combinations(sorted(folders), 2)
         for stem in sorted(common)
     ]
+
+
+def _renders(folder: Path) -> dict[str, Path]:
+    """Renders by the names of their views, which may lie in folders."""
+    return {_stem(p.relative_to(folder).as_posix()): p for p in sorted(folder.rglob("*.png"))}
 
 
 def _test_photos(run: Path) -> dict[str, Path]:

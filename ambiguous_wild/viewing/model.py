@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ from ambiguous_wild.core.scene import together
 from ambiguous_wild.io import compressed_ply, gltf, sog, spz
 from ambiguous_wild.io.files import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
-from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
+from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count, write_splat_ply
+from ambiguous_wild.io.splat_arrays import finite
+from ambiguous_wild.io.splat_files import Splats, read_splats
 from ambiguous_wild.metrics.image import psnr
 
 
@@ -56,6 +58,7 @@ def _median_depth(pose: np.ndarray, points: np.ndarray) -> float:
 
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
+NO_PHOTO = Path()  # of a view of a scene that is made for a model alone
 
 
 @dataclass(frozen=True)
@@ -78,19 +81,86 @@ class Model:
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
     masks: Path | None = None  # folder of keep maps of train views, white = keep
     reference: bool = False  # it saw exact masks or clean photos, so it is no rival
+    splats: Splats | None = field(
+        default=None, repr=False, compare=False
+    )  # of any splat file, as `ply` names it
 
     def read(self) -> dict[str, np.ndarray]:
-        """The Gaussians.
+        """The Gaussians, in the coordinates of `place`.
 
         Raises:
             AwError: no splat PLY.
         """
-        return read_splat_ply(self.ply)
+        return read_splat_ply(self.ply) if self.splats is None else self.splats.gaussians
+
+    @property
+    def place(self) -> Place:
+        """Of the coordinates that `read` gives."""
+        return read_place(self.ply) if self.splats is None else self.splats.place
 
     @property
     def count(self) -> int:
-        """Number of Gaussians, from the file's header."""
-        return splat_count(self.ply)
+        """Number of Gaussians."""
+        return splat_count(self.ply) if self.splats is None else len(self.splats.gaussians["means"])
+
+    def within(self, place: Place) -> Model:
+        """The model of a splat file in a scene's inner coordinates; a run's is in them already."""
+        if self.splats is None:
+            return self
+        arrays = moved(self.splats.gaussians, self.splats.place, place)
+        return replace(self, splats=replace(self.splats, gaussians=dict(arrays), place=place))
+
+
+def file_model(path: Path) -> tuple[Model, str]:
+    """The model of a splat file of any tool, drawn as plain 3DGS; and a note, or "".
+
+    Raises:
+        AwError: see `read_splats`.
+    """
+    splats = read_splats(path)
+    left = f"{path}: {splats.left_out:,} Gaussians with values that are not finite left out"
+    model = Model(path.name, path, RenderSettings(antialias=splats.antialias), splats=splats)
+    return model, left if splats.left_out else ""
+
+
+def moved(gaussians: Arrays, of: Place, to: Place) -> Arrays:
+    """Gaussians in the coordinates of one place in those of another; the same ones where these are equal."""
+    if of == to:
+        return gaussians
+    factor, shift = to.scale / of.scale, to.rotation @ np.subtract(of.centre, to.centre) * to.scale
+    turn = to.rotation @ of.rotation.T
+    found = {**gaussians, "means": (factor * gaussians["means"] @ turn.T + shift).astype(np.float32)}
+    found["log_scales"] = (gaussians["log_scales"] + np.log(factor)).astype(np.float32)
+    if of.turn != to.turn:
+        found["quats"] = _turned_quats(gaussians["quats"], turn)
+        found["sh_rest"] = _turned_harmonics(gaussians["sh_rest"], turn)
+    return found
+
+
+def _turned_quats(quats: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return (quats.astype(np.float64) @ left.T).astype(np.float32)
+
+
+def _turned_harmonics(rest: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Coefficients [N, K, 3] of the same colours in turned directions: each degree is mixed within itself."""
+    from ambiguous_wild.splat.cpu.project import basis
+
+    degree = round((rest.shape[1] + 1) ** 0.5) - 1
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    there, here = np.empty((2, rest.shape[1], len(directions)))
+    for values, seen in ((there, directions), (here, directions @ turn)):
+        getattr(basis, "py_func", basis)(*seen.T, degree, values)  # of all directions at once
+    found = rest.astype(np.float64)
+    for k in range(1, degree + 1):
+        of = slice(k * k - 1, (k + 1) ** 2 - 1)
+        mixing = np.linalg.lstsq(there[of].T, here[of].T, rcond=None)[0]
+        found[:, of] = np.einsum("jk,nkc->njc", mixing, found[:, of])
+    return found.astype(np.float32)
 
 
 class Renderer:
@@ -136,7 +206,36 @@ class Renderer:
         return to_uint8(drawn.image.numpy())
 
 
+AXES = {
+    sign + axis: (-1.0 if sign else 1.0) * row for sign in ("", "-") for axis, row in zip("xyz", np.eye(3))
+}
+_FLOOR = 0.02  # of the Gaussians around the middle lie lower
+
+
+def upright(model: Model, space: Space, axis: str) -> Place:
+    """The place in which an axis of `AXES` points up, the floor is at zero, and the scene's middle above it.
+
+    Args:
+        model: in the coordinates that `space` is in.
+        space: of its scene.
+        axis: of the file.
+    """
+    from scipy.spatial.transform import Rotation
+
+    gaussians, place = model.read(), model.place
+    near = np.linalg.norm(gaussians["means"] - space.middle, axis=1) < 1.5 * space.distance
+    near &= gaussians["opacity_logits"] > 0
+    heights = gaussians["means"][near] @ space.up
+    floor = float(np.quantile(heights, _FLOOR)) if len(heights) else 0.0
+    foot = space.middle + (floor - space.middle @ space.up) * space.up
+    x, y, z = (place.rotation.T @ foot / place.scale + place.centre).tolist()
+    turn, _ = Rotation.align_vectors([AXES[axis]], [place.rotation.T @ space.up])
+    a, b, c, d = turn.as_quat().tolist()
+    return Place((x, y, z), place.scale, (d, a, b, c))
+
+
 FORMATS: Mapping[str, tuple[str, Callable[[Path], dict[str, np.ndarray]]]] = {
+    "ply": (".ply", read_splat_ply),
     "compressed-ply": (".compressed.ply", compressed_ply.read_compressed_ply),
     "spz": (".spz", spz.read_spz),
     "sog": (".sog", sog.read_sog),
@@ -156,7 +255,8 @@ class Exported:
     psnr_to_model: float | None  # its renders against the model's, dB; inf = the same pictures
     psnr: float | None  # its renders against the photos, dB
     lost_db: float | None  # the model's PSNR against the photos minus that
-    place: Place = UNMOVED  # user's coordinates are the file's / scale + centre; glTF holds them itself
+    place: Place = UNMOVED  # of the file's coordinates; glTF that is not turned holds the user's itself
+    source: str = "the PLY"  # what `share` compares with
 
 
 def export(
@@ -166,6 +266,8 @@ def export(
     views: Sequence[View] = (),
     *,
     name: str = "point_cloud",
+    space: Space | None = None,
+    up: str | None = None,
 ) -> list[Exported]:
     """Write the formats into a folder, each atomically, read them back and measure them.
 
@@ -178,6 +280,9 @@ def export(
         formats: of `FORMATS`.
         views: to render for the loss, usually the test views; none = only sizes.
         name: of the files, without ending.
+        space: of the scene, where `up` is given.
+        up: axis of `AXES` that points up in the files (y in glTF, always), with the floor at zero; None =
+            the scene's coordinates.
 
     Raises:
         AwError: unknown format, a model that cannot be read, or nothing in it that is finite.
@@ -185,23 +290,28 @@ def export(
     for wanted in formats:
         if wanted not in FORMATS:
             raise unknown("format", wanted, FORMATS)
-    gaussians, place = model.read(), read_place(model.ply)
+    gaussians: Arrays = model.read()
+    place = model.place
     plain = model.ply.stat().st_size
     photos = [read_png_rgb(view.image_path) for view in views]
     before = _renders(gaussians, model.look, views)
     found = []
     for wanted in dict.fromkeys(formats):
+        if up is not None and space is not None:
+            place = upright(model, space, "y" if wanted == "gltf" else up)
+            gaussians = moved(model.read(), model.place, place)
         ending, read = FORMATS[wanted]
         path = folder / f"{name}{ending}"
         sweep_killed(path)
         units = place.scale
         if wanted == "spz" or (wanted == "sog" and units < 1):
             units = 1.0
-        left = Place(place.centre, place.scale / units)
+        left = replace(place, scale=place.scale / units)
         count = _write(wanted, path, rescaled(gaussians, 1 / units), model.look, left)
         if not count:
             raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
-        after = _renders(rescaled(read(path), units), model.look, views)
+        there = moved(rescaled(read(path), units), place, model.place)
+        after = _renders(there, model.look, views)
         old, new = _mean(before, photos), _mean(after, photos)
         size = path.stat().st_size
         found.append(
@@ -214,7 +324,8 @@ def export(
                 psnr_to_model=_mean(after, before),
                 psnr=new,
                 lost_db=None if old is None or new is None else old - new,
-                place=UNMOVED if wanted == "gltf" else left,
+                place=UNMOVED if wanted == "gltf" and up is None else left,
+                source="the PLY" if model.ply.suffix == ".ply" else model.ply.name,
             )
         )
     return found
@@ -223,6 +334,11 @@ def export(
 def _write(wanted: str, path: Path, gaussians: Arrays, look: RenderSettings, place: Place) -> int:
     if wanted == "spz":
         return spz.write_spz(path, gaussians, antialias=look.antialias, place=place)
+    if wanted == "ply":
+        kept = finite(gaussians)
+        if len(kept["means"]):
+            write_splat_ply(path, kept, place)
+        return len(kept["means"])
     write = {
         "compressed-ply": compressed_ply.write_compressed_ply,
         "sog": sog.write_sog,

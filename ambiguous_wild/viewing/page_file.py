@@ -19,7 +19,7 @@ from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrow
 from ambiguous_wild.io.splat_arrays import finite, sigmoid
 from ambiguous_wild.io.spz import spz_arrays, spz_bytes
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.viewing.model import Model, Renderer, space_of
+from ambiguous_wild.viewing.model import NO_PHOTO, Model, Renderer, space_of
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
@@ -127,6 +127,11 @@ def page_text(
     for line in told:
         say(line)
     space = space_of(scene)
+    if views[0].image_path == NO_PHOTO:
+        drawn = Renderer(models[0].read(), models[0].look)
+        uris = [data_uri("jpeg", jpeg_bytes(narrowed(drawn(v.camera), WIDTHS[1]), _QUALITY)) for v in views]
+    else:
+        uris = photo_uris(views, MOST_PHOTO_BYTES)
     data = {
         "up": space.up.tolist(),
         "middle": space.middle.tolist(),
@@ -134,10 +139,7 @@ def page_text(
         "frustum": 0.08 * space.extent,
         "centre": scene.place.centre,  # of saved paths, in the coordinates of the scene's files
         "scale": scene.place.scale,
-        "views": [
-            _view_facts(v, uri, points)
-            for v, uri, points in zip(views, photo_uris(views, MOST_PHOTO_BYTES), _points(scene, views))
-        ],
+        "views": [_view_facts(v, uri, points) for v, uri, points in zip(views, uris, _points(scene, views))],
         "models": facts,
         "notes": told,
     }
@@ -197,7 +199,7 @@ def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, Any]:
     camera = view.camera
     return {
         "name": view.name,
-        "split": view.split,
+        "split": view.split if view.image_path != NO_PHOTO else "",
         "width": camera.width,
         "height": camera.height,
         "fx": camera.fx,

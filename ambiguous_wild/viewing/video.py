@@ -5,19 +5,23 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Camera, Scene
-from ambiguous_wild.core.scene import together
+from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core.scene import centred, together
 from ambiguous_wild.io.files import atomic_path
-from ambiguous_wild.viewing.model import Model, Renderer, space_of
+from ambiguous_wild.viewing.model import NO_PHOTO, Model, Renderer, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
 _MOST_BYTES = 64 * 1024 * 1024
 _TILT_DEG = 15.0  # of an orbit's cameras above the middle
+_WIDTH, _HEIGHT, _VIEWS = 960, 540, 8  # px and number of cameras where there is no scene
+_AWAY = 3.0  # times the median distance of the Gaussians from their middle
+_MOST_POINTS = 20_000
 
 
 def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
@@ -43,15 +47,45 @@ def orbit(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
     size_of = np.linalg.norm(away)
     x = away / size_of if size_of > 1e-9 else np.cross(space.up, [1.0, 0.3, 0.2])
     x = x / np.linalg.norm(x)
-    y = np.cross(space.up, x)
-    tilt = math.radians(_TILT_DEG)
-    cameras = []
-    for k in range(frames):
-        turn = 2 * math.pi * k / frames
+    return [
+        fitted(first, size, _looking(center, space.middle, space.up))
+        for center in _circle(space.middle, space.up, x, space.distance, frames)
+    ]
+
+
+def _circle(
+    middle: np.ndarray, up: np.ndarray, x: np.ndarray, distance: float, count: int
+) -> Iterator[np.ndarray]:
+    """Positions above a middle, from the one in the direction of `x` on."""
+    y, tilt = np.cross(up, x), math.radians(_TILT_DEG)
+    for k in range(count):
+        turn = 2 * math.pi * k / count
         flat = math.cos(turn) * x + math.sin(turn) * y
-        center = space.middle + space.distance * (math.cos(tilt) * flat + math.sin(tilt) * space.up)
-        cameras.append(fitted(first, size, _looking(center, space.middle, space.up)))
-    return cameras
+        yield middle + distance * (math.cos(tilt) * flat + math.sin(tilt) * up)
+
+
+def scene_around(model: Model) -> Scene:
+    """A scene without photos for the model of a splat file: cameras that look at its robust middle.
+
+    Up is the axis of the file that is nearest to -y, which COLMAP's first photo often has up.
+    """
+    place = model.place
+    xyz = model.read()["means"].astype(np.float64)
+    xyz = xyz[:: -(-len(xyz) // _MOST_POINTS)] @ place.rotation / place.scale + place.centre
+    middle = np.median(xyz, axis=0)
+    size = float(np.median(np.linalg.norm(xyz - middle, axis=1))) or 1.0
+    axes = np.concatenate([place.rotation, -place.rotation])
+    up = axes[(-axes[:, 1]).argmax()]
+    first = np.cross(up, axes[(np.abs(axes @ up)).argmin()])
+    lens = Camera(_WIDTH, _HEIGHT, _WIDTH, _WIDTH, _WIDTH / 2, _HEIGHT / 2, np.eye(4))
+    views = []
+    for k, center in enumerate(_circle(middle, up, first, _AWAY * size, _VIEWS)):
+        camera = replace(lens, cam_from_world=_looking(center, middle, up))
+        views.append(View(f"render_{k}.png", NO_PHOTO, camera, "test" if k == 0 else "train"))
+    nothing = np.zeros(0)
+    points = Points(xyz, np.zeros(xyz.shape, np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, np.int64),
+                    nothing.astype(np.int32), nothing.reshape(0, 2).astype(np.float32))  # fmt: skip
+    return centred(Scene(model.ply.parent, model.label, tuple(views), points))
 
 
 def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:

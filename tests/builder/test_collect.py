@@ -3,7 +3,7 @@ import os
 
 import pytest
 
-from ambiguous_wild.builder.collect import collect, identical, natural_key
+from ambiguous_wild.builder.collect import collect, identical, natural_key, read_test_list
 from ambiguous_wild.core import AwError
 
 
@@ -75,10 +75,49 @@ def test_too_few(tmp_path, names, message):
         collect(tmp_path / "raw")
 
 
-def test_the_folder_that_does_hold_them_is_named(tmp_path):
-    put(tmp_path / "DCIM", "a.jpg", "b.jpg", "c.jpg")
-    with pytest.raises(AwError, match="DCIM does: give that folder"):
-        collect(tmp_path)
+@pytest.mark.parametrize(
+    ("files", "raw", "expected"),
+    [
+        (["DCIM/a.jpg", "DCIM/b.jpg", "DCIM/c.jpg"], ".", ["a", "b", "c"]),
+        (["front/0.jpg", "front/1.jpg", "back/0.jpg", "masks/back/0.png"], ".",
+         ["back_0", "front_0", "front_1"]),
+        (["images/l/0.jpg", "images/r/0.jpg", "images/r/1.jpg"], ".", ["l_0", "r_0", "r_1"]),
+        (["1/l/0.jpg", "1/r/0.jpg", "2/l/0.jpg"], ".", ["1_l_0", "1_r_0", "2_l_0"]),
+        (["1/images/0.jpg", "2/images/0.jpg", "2/images/1.jpg"], ".", ["1_0", "2_0", "2_1"]),
+        (["a/0.jpg", "a/1.jpg", "b/0.jpg", "c/0.jpg"], ["b", "a"], ["b_0", "a_0", "a_1"]),
+        (["x/raw/0.jpg", "x/raw/1.jpg", "y/raw/0.jpg"],
+         ["x/raw", "y/raw"], ["x_raw_0", "x_raw_1", "y_raw_0"]),
+        (["train/l/0.jpg", "train/r/0.jpg", "test/l/0.jpg"], ".", ["train_l_0", "r_0", "test_l_0"]),
+    ],
+)  # fmt: skip
+def test_several_folders_are_one_capture_and_equal_names_stay_apart(tmp_path, files, raw, expected):
+    for name in files:
+        put((tmp_path / name).parent, (tmp_path / name).name)
+    capture = collect(tmp_path if raw == "." else [tmp_path / r for r in raw])
+    assert stems(capture) == expected
+    assert len({s.path for s in capture.sources}) == len(expected)
+    assert all((capture.root / s.relative) == s.path for s in capture.sources)
+
+
+def test_folders_that_are_left_out_are_named_and_none_is_read_twice(tmp_path):
+    put(tmp_path, "a.jpg", "b.jpg", "c.jpg")
+    put(tmp_path / "rejected", "d.jpg")
+    assert "its folders rejected are left out" in collect(tmp_path).notes[0]
+    with pytest.raises(AwError, match="give each once"):
+        collect([tmp_path, tmp_path / "rejected"])
+
+
+def test_a_test_list_names_the_folder_where_two_photos_have_one_name(tmp_path):
+    put(tmp_path / "front", "0.jpg", "1.jpg")
+    put(tmp_path / "back", "0.jpg")
+    facts = [{"source": s.relative, "stem": s.stem} for s in collect(tmp_path).sources]
+    listed = tmp_path / "list.txt"
+    for name, expected in (("front/0.jpg", "front_0"), ("back/0", "back_0"), ("1.jpg", "front_1")):
+        listed.write_text(name)
+        assert read_test_list(listed, facts) == {expected}
+    listed.write_text("0.jpg")
+    with pytest.raises(AwError, match=r"'0\.jpg' is the name of several photos \(back_0, front_0\)"):
+        read_test_list(listed, facts)
 
 
 def test_one_side_alone_and_no_folder(tmp_path):

@@ -3,6 +3,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from ambiguous_wild.builder.checks import focal_length
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.screen import drift_warnings, exposure_stops, screen, sharpness, thumbnail
@@ -135,6 +136,12 @@ def test_drift_is_reported_with_its_number():
     text = " | ".join(drift_warnings(loud))
     for part in ("1 photos are blurred", "9.jpg", "2.0 stops", "white balance", "5.0 to 9.0 mm"):
         assert part in text
+
+
+def test_photos_of_the_shape_of_panoramas_are_named():
+    wide = [{**fact(i), "width": 16} for i in range(2)] + [fact(2)]
+    for found in (drift_warnings(wide)[-1], focal_length(wide).finding):
+        assert "2 photos are 2:1, as 360 degree photos are (0.jpg, 1.jpg): split" in found
 
 
 def test_exposure_is_in_stops():

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from PIL import Image
 
 from ambiguous_wild.builder.collect import read_test_list, split_photos
 from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_warnings
@@ -85,6 +86,17 @@ def test_masks_are_found_under_both_names(tmp_path):
     assert read_gray(tmp_path / "out" / "masks" / "p0.jpg.png").min() == 255  # 200 counts as white
 
 
+def test_a_mask_is_turned_by_its_own_exif_as_viewers_show_it(tmp_path):
+    keep = np.full((8, 12), 255, np.uint8)
+    keep[:, :4] = 0
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    (tmp_path / "m").mkdir()
+    Image.fromarray(keep).rotate(180).save(tmp_path / "m" / "p0.png", exif=exif)
+    lay_out_masks(tmp_path, find_masks(tmp_path / "m", facts(1), "error"), facts(1), {})
+    assert np.array_equal(read_gray(tmp_path / "masks" / "p0.jpg.png"), keep)
+
+
 def test_missing_masks_are_named_or_the_photo_is_kept_whole(tmp_path):
     write_png(tmp_path / "m" / "p0.png", np.zeros((8, 12), np.uint8))
     with pytest.raises(AwError, match=r"2 of 3 photos have no mask: images/p1\.jpg, images/p2\.jpg"):
@@ -138,6 +150,18 @@ def test_photos_without_exif_never_share_a_camera_with_others():
     internet[3].update(camera="C", exif={"focal_mm": 5.0})
     assert choose_camera(internet, "auto") == "per-device"
     assert camera_groups(internet) == [[0], [1, 3], [2]]
+
+
+def test_folders_have_cameras_of_their_own_unless_exif_says_that_they_are_one():
+    rig = facts(6)
+    for i, fact in enumerate(rig):
+        fact["source"] = f"{'front' if i % 2 else 'back'}/{i // 2}.jpg"
+    assert choose_camera(rig, "auto") == "single"
+    assert camera_groups(rig, "per-folder") == [[0, 2, 4], [1, 3, 5]]
+    for fact in rig:
+        fact.update(camera=None, exif={})
+    assert choose_camera(rig, "auto") == "per-device"
+    assert camera_groups(rig) == [[0, 2, 4], [1, 3, 5]]
 
 
 def photos_of(count, side=1000):

@@ -13,16 +13,18 @@ import pytest
 from click.testing import CliRunner
 
 from ambiguous_wild.builder import capture_photos
+from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.cli.capture import capture_command as command
 from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import texture, write_capture
 
 FRAMES, SHARP_EVERY = 48, 8
+CODECS = {".avi": "MJPG", ".mp4": "mp4v"}
 
 
 def write_video(path: Path, frames: int = FRAMES) -> Path:
     """A pan over a texture; frames 4, 12, 20, ... are sharp, the others are not."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 24.0, (160, 120))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODECS[path.suffix]), 24.0, (160, 120))
     assert writer.isOpened()
     for i in range(frames):
         frame = np.ascontiguousarray(texture(1)[100:220, 2 * i : 2 * i + 160])
@@ -31,6 +33,23 @@ def write_video(path: Path, frames: int = FRAMES) -> Path:
         writer.write(frame)
     writer.release()
     return path
+
+
+def patched(data: bytes, kind: bytes, payload: bytes, *, add: bool = False) -> bytes:
+    """An MP4 file whose boxes of one kind hold `payload`, or get it added at their end."""
+    out, at = b"", 0
+    while at + 8 <= len(data):
+        size, name = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        inner = data[at + 8 : at + size]
+        if name == kind:
+            inner = inner + payload if add else payload
+        elif name in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+            inner = patched(inner, kind, payload, add=add)
+        elif name == b"stsd":  # version, number of entries
+            inner = inner[:8] + patched(inner[8:], kind, payload, add=add)
+        out += (8 + len(inner)).to_bytes(4, "big") + name + inner
+        at += size
+    return out
 
 
 def error(*words: object) -> str:
@@ -49,15 +68,9 @@ def test_frames_are_the_sharp_ones_and_evenly_spaced(tmp_path: Path) -> None:
     assert [p["frame"] for p in facts["photos"]] == list(range(4, FRAMES, SHARP_EVERY))
     assert facts["photos"][1]["time_s"] == pytest.approx(12 / 24)
     record = json.loads((out / "capture.json").read_text())
-    assert list(record) == [
-        "version",
-        "kind",
-        "source",
-        "frames_read",
-        "frames_announced",
-        "photos",
-        "left_out",
-    ]
+    assert {*record} == {
+        *("version", "kind", "source", "frames_read", "frames_announced", "photos", "left_out")
+    }
     assert list(record["photos"][0]) == ["photo", "frame", "time_s", "sharpness"]
     assert sorted(p.name for p in out.iterdir()) == [
         "capture.json",
@@ -78,9 +91,11 @@ def test_a_short_video_gives_all_it_has(tmp_path: Path) -> None:
 def test_stretches_of_equals_keep_their_distance() -> None:
     flat = np.full((16, 16, 3), 7, np.uint8)
     frames = ((i, i / 10, flat) for i in range(40))
-    got = [f.index for f in capture_photos.sharpest(frames, [0, 10, 20, 30, 40])]
+    got = [f.index for f in capture_photos.sharpest(frames, [0, 1, 2, 3, 4])]
     assert len(got) == 4 and np.diff(got).min() >= 5
-    one_each = [f.index for f in capture_photos.sharpest(((i, 0.0, flat) for i in range(4)), [0, 1, 2, 3, 4])]
+    one_each = [
+        f.index for f in capture_photos.sharpest(((i, float(i), flat) for i in range(4)), [0, 1, 2, 3, 4])
+    ]
     assert one_each == [0, 1, 2, 3]
 
 
@@ -114,7 +129,7 @@ def test_bad_sources_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
     assert "unknown camera" in error("camera:front", "-o", out)
     assert "there is no camera 99" in error("camera:99", "-o", out)
     video = write_video(tmp_path / "v.avi", 2)
-    assert "has 2 frames, a scene needs 3" in error(video, "-o", out)
+    assert "v.avi can be used, 3 are needed" in error(video, "-o", out)
     pattern = tmp_path / "%02d.avi"
     video.rename(pattern)
     assert "'%' in its name" in error(pattern, "-o", out, "--frames", 3)
@@ -177,3 +192,63 @@ def test_a_video_that_was_cut_short_is_told(tmp_path: Path) -> None:
     assert done.exit_code == 0 and f"announces {FRAMES} frames" in done.stderr
     whole_words = [str(tmp_path / "v.avi"), "-o", str(tmp_path / "b"), "--frames", "3"]
     assert "warning" not in CliRunner().invoke(command, whole_words, catch_exceptions=False).stderr
+
+
+def test_frames_of_a_variable_rate_are_picked_by_their_time(tmp_path: Path) -> None:
+    """24 frames at 24 a second, then 24 at 4 a second: 1 s and 6 s."""
+    data = write_video(tmp_path / "v.mp4").read_bytes()
+    stts = data.index(b"stts") + 8
+    delta = int.from_bytes(data[stts + 8 : stts + 12], "big")
+    runs = b"".join(v.to_bytes(4, "big") for v in (0, 2, 24, delta, 24, 6 * delta))
+    (tmp_path / "v.mp4").write_bytes(patched(data, b"stts", runs).replace(b"edts", b"free"))
+    facts = capture_photos.photos_from([tmp_path / "v.mp4"], tmp_path / "raw", frames=7)
+    times = [p["time_s"] for p in facts["photos"]]
+    assert sum(p["frame"] < 24 for p in facts["photos"]) == 1  # one second of seven; by their count, 3.5
+    assert max(np.diff(times)) < 1.51 and times[-1] > 6
+
+
+@pytest.mark.parametrize(("curve", "name"), [(18, "HLG"), (16, "PQ"), (1, None)])
+def test_hdr_video_is_refused_by_name(tmp_path: Path, curve: int, name: str | None) -> None:
+    colr = b"\0\0\0\x13colrnclx" + bytes([0, 9, 0, curve, 0, 9, 0])
+    data = write_video(tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "v.mp4").write_bytes(patched(data, b"mp4v", colr, add=True))
+    assert capture_photos.hdr_curve(tmp_path / "v.mp4") == name
+    head = b"\x1aE\xdf\xa3" + b"." * 40 + b"\x55\xba\x81" + bytes([curve]) + b"\x1fC\xb6u"
+    (tmp_path / "v.mkv").write_bytes(head + b"\x55\xba\x81\x12" * (name is None))
+    assert capture_photos.hdr_curve(tmp_path / "v.mkv") == name
+    if name:
+        assert f"is HDR video ({name})" in error(tmp_path / "v.mp4", "-o", tmp_path / "raw")
+        assert not (tmp_path / "raw").exists()
+
+
+def test_several_folders_and_videos_go_to_a_folder_each(tmp_path: Path) -> None:
+    for folder in ("front", "back"):
+        write_capture(tmp_path / "in" / folder, 2)
+    for photo in (tmp_path / "in/back").iterdir():
+        cv2.imwrite(str(photo), cv2.imread(str(photo))[:, ::-1])
+    write_video(tmp_path / "in/walk.avi", 5)
+    write_video(tmp_path / "in/front/live.avi", 5)  # beside photos
+    write_capture(tmp_path / "cat/images", 2)
+    write_video(tmp_path / "cat/train.avi", 5)  # what the photos were taken from
+    (tmp_path / "other").mkdir()
+    write_video(tmp_path / "other/walk.mp4", 40)
+    for number, sources in enumerate(
+        (["in", "other/walk.mp4"], ["in/back", "in/front", "in/walk.avi", "other"])
+    ):
+        out = tmp_path / f"raw{number}"
+        words = [*(str(tmp_path / s) for s in sources), "-o", str(out), "--frames", "4"]
+        done = CliRunner().invoke(command, words, catch_exceptions=False)
+        assert "live.avi (a video beside photos" in done.stdout
+        names = sorted(p.relative_to(out).as_posix() for p in out.rglob("*.jpg"))
+        frames = [f"{w}/frame_{k:05d}.jpg" for w in ("walk", "walk_2") for k in range(1, 5)]
+        assert names == ["back/p00.jpg", "back/p01.jpg", "front/p00.jpg", "front/p01.jpg", *frames]
+        facts = json.loads((out / "capture.json").read_text())
+        assert sorted(p["photo"] for p in facts["photos"]) == names
+        assert [v["frames_read"] for v in facts["videos"]] == [5, 40]
+        stems = [s.stem for s in collect(out).sources]
+        assert len(set(stems)) == 12 and stems[-1] == "walk_2_frame_00004"
+    CliRunner().invoke(
+        command, [*(str(tmp_path / "cat" / s) for s in ("images", "train.avi")), "-o", str(tmp_path / "raw")]
+    )
+    assert len(collect(tmp_path / "raw").sources) == 7  # names that mean something are not given to sources
+    assert "holds 2 photos" in error(tmp_path / "cat", "-o", tmp_path / "none")

@@ -15,7 +15,7 @@ from ambiguous_wild.methods import registry
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
 
 def test_every_method_is_listed_with_what_it_needs() -> None:

@@ -42,3 +42,12 @@ def test_json_holds_the_same_and_strict_refuses(raw: Path) -> None:
 def test_no_capture_is_one_line(tmp_path: Path) -> None:
     raised = CliRunner().invoke(command, [str(tmp_path / "absent")]).exception
     assert isinstance(raised, AwError) and "does not exist" in str(raised)
+
+
+def test_several_folders_are_checked_as_one_capture(raw: Path, tmp_path: Path) -> None:
+    write_capture(tmp_path / "other", 4, prefix="q")
+    done = CliRunner().invoke(command, [str(raw), str(tmp_path / "other"), "--json"], catch_exceptions=False)
+    facts = json.loads(done.stdout)
+    # the ends of both arcs are the same photo
+    assert facts["photos"] + len(facts["skipped"]) == 10 and facts["photos"] == 7
+    assert {s["source"].split("/")[-2] for s in facts["skipped"]} == {"raw", "other"}

@@ -18,6 +18,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from tests.command_line import aw
 from tests.datasets import layouts
 from tests.datasets.test_import import same_cameras
+from tests.io.model_maker import write_scene
 
 NERFBASELINES = "AW_NERFBASELINES"  # the program, as in tests/harness/test_nerfbaselines.py
 
@@ -59,6 +60,20 @@ def test_on_the_go_keeps_full_size_and_split(scene, tmp_path):
     (tmp_path / "poses").mkdir()
     data = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert data["fl_x"] == pytest.approx(layouts.FX) and data["w"] == layouts.WIDTH
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_equal_names_in_several_folders_stay_apart(form, tmp_path):
+    names = [f"{side}/{i}.png" for side in ("back", "front") for i in range(4)]
+    write_scene(tmp_path / "rig", names, points=60)
+    native = load_scene(tmp_path / "rig")
+    export_scene(native.root, form, tmp_path / "out")
+    back = load_scene(import_scene(tmp_path / "out", tmp_path / "back", ImportSettings(factor=1)).scene)
+    assert [v.split for v in back.views] == [v.split for v in native.views]
+    for a, b in zip(back.views, native.views, strict=True):
+        assert a.name == (b.name.replace("/", "_") if form == "on-the-go" else b.name)
+        assert np.array_equal(read_png_rgb(a.image_path), read_png_rgb(b.image_path))
+    same_cameras(back.views, native.views)
 
 
 def test_colmap_itself_reads_it(scene, tmp_path):

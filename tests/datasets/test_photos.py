@@ -7,13 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.readers import recognise
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.io.colmap_records import points_without_tracks
-from ambiguous_wild.io.images import read_mask, write_png
+from ambiguous_wild.io.images import read_mask, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_keep
 from ambiguous_wild.splat.pace import TrainConfig
@@ -231,3 +232,30 @@ def test_masks_outside_the_dataset_are_nobody_s(tmp_path):
     (tmp_path / "masks").mkdir()
     write_png(tmp_path / "masks" / layouts.TRAIN[0], np.zeros((layouts.HEIGHT, layouts.WIDTH), np.uint8))
     assert not any(v.keep_path for v in load_scene(import_scene(root, tmp_path / "scene").scene).train)
+
+
+@pytest.mark.parametrize(("tag", "as_shown"), [(3, True), (3, False), (6, True)])
+def test_photos_are_turned_by_exif_where_the_model_saw_them_so(tag, as_shown, tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    model = layouts.make_model()
+    seen = {}  # photos in which every point has its colour
+    for image in model.images.values():
+        seen[image.name] = photo = np.full((layouts.HEIGHT, layouts.WIDTH, 3), 90, np.uint8)
+        for (x, y), number in zip(image.xys.clip(0).astype(int), image.point_ids):
+            photo[y : y + 2, x : x + 2] = model.points.rgb[number - 1]
+        pixels = Image.fromarray(photo)
+        if as_shown:
+            pixels = pixels.transpose({3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90}[tag])
+        exif = Image.Exif()
+        exif[0x0112] = tag
+        pixels.save(root / "images" / image.name, exif=exif)
+    keep = np.full((layouts.HEIGHT, layouts.WIDTH), 255, np.uint8)
+    keep[:9, :20] = 0
+    write_png(root / "masks" / layouts.TRAIN[0], keep)
+    done = import_scene(root, tmp_path / "scene")
+    scene = load_scene(done.scene)
+    for view in scene.views:
+        assert np.array_equal(read_png_rgb(view.image_path), seen[view.name])
+        notes = done.info["photos"][view.name]["notes"]
+        assert (f"turned upright (EXIF orientation {tag})" in notes) == as_shown
+    assert np.array_equal(load_keep(scene.train[0]) > 0, keep > 0)

@@ -1,4 +1,4 @@
-"""The recipes in examples/ and docs/add-a-method.md: the same text, short, and each does what it is for."""
+"""The recipes in examples/ and docs/extend.md: the same text, short, and each does what it is for."""
 
 import json
 import re
@@ -31,12 +31,12 @@ RECIPES = {
 def test_a_recipe_is_short_and_stands_in_the_docs(name):
     text = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
     assert len(text.splitlines()) < 60
-    page = (ROOT / "docs" / "add-a-method.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
     assert f"examples/{name}.py:{RECIPES[name]}" in page or f"examples/{name}.py" in page
 
 
 def test_the_mask_policy_on_the_page_is_the_example():
-    page = (ROOT / "docs" / "add-a-method.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
     code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
     example = (ROOT / "examples" / "02_mask_policy.py").read_text(encoding="utf-8")
     assert code is not None and code[1] == example[example.index("from dataclasses") :]

@@ -43,7 +43,7 @@ GROUPS = (
 
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     register(
         MethodEntry(
             "mine",

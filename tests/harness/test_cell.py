@@ -163,7 +163,7 @@ options: {strength: 1}
 def test_a_method_given_by_reference_is_found_again_from_anywhere(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, setting: str
 ) -> None:
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     monkeypatch.setenv("AW_NERFBASELINES", "true")
     folder = tmp_path / "my@work"
     folder.mkdir()
@@ -172,7 +172,7 @@ def test_a_method_given_by_reference_is_found_again_from_anywhere(
     monkeypatch.chdir(tmp_path)
     (cell,) = plan_cells([method], [scene], [0], TrainConfig(iterations=9), settings=[setting])
     text = reproduce(cell)
-    monkeypatch.setattr(registry, "_registered", {})  # another process
+    monkeypatch.setattr(registry, "registered", {})  # another process
     monkeypatch.chdir("/")
     assert typed(text).identity == cell.identity
     assert "--plugin" not in text
@@ -181,7 +181,7 @@ def test_a_method_given_by_reference_is_found_again_from_anywhere(
 def test_a_graft_names_the_plugin_of_its_host(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     plugin = tmp_path / "mine.py"
     plugin.write_text(f"{RECIPE}\nregister(MethodEntry('mine', 'of my own', build, config=Config))\n")
     load_plugin(plugin)
@@ -203,7 +203,7 @@ def test_a_variant_of_an_ablation_is_its_method_with_other_settings(scene: Path)
 def test_budgets_and_plugins_are_part_of_the_command(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     plugin = tmp_path / "mine.py"
     plugin.write_text(
         "from ambiguous_wild.methods import MethodEntry, register\n"

@@ -43,7 +43,7 @@ shutil.copy(photos[seed + 1], output / "1.png")
 
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def local(scene, frail, tmp_path_factory):
     output = tmp_path_factory.mktemp("local")
     done = aw_bench(output, scene, frail[0])
     assert done.exit_code == 0, done.output
-    registry._registered.clear()
+    registry.registered.clear()
     return results(output)
 
 
@@ -141,7 +141,7 @@ def test_a_cell_that_kills_every_process_is_a_failure(cell, tmp_path):
 
 def test_a_job_makes_the_same_cell_without_the_files_of_its_method(cell, frail):
     cell, job = cell
-    registry._registered.clear()
+    registry.registered.clear()
     elsewhere = [replace(s, path=f"/nowhere/{Path(s.path).name}") for s in job.sources]
     again = jobs.make_cell(replace(job, sources=tuple(elsewhere)))
     assert again.identity == cell.identity
@@ -155,7 +155,7 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     assert "another state of ambiguous_wild" in jobs.run_job(replace(job, code="x")).error
     assert "would be another run" in jobs.run_job(replace(job, scene=str(other))).error
     changed = [replace(s, content=s.content + b"\nenvironment: {A: b}\n") for s in job.sources]
-    registry._registered.clear()
+    registry.registered.clear()
     assert "would be another run" in jobs.run_job(replace(job, sources=tuple(changed))).error
     with pytest.raises(AwError, match=r"does not see .*--transfer store"):
         jobs.check_storage(replace(job, token=str(tmp_path / "absent")), wait_s=0.0)

@@ -42,7 +42,7 @@ BASE = {
 
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
 
 def describe(folder, **changes):
@@ -124,7 +124,7 @@ def test_options_and_variables_reach_the_program_and_are_part_of_the_run(scene, 
 
 def test_what_changes_the_result_changes_the_identity_and_nothing_else_does(scene, tmp_path):
     def identity(**changes):
-        registry._registered.clear()
+        registry.registered.clear()
         return plan_cells([describe(tmp_path, **changes)], [scene], [0], SHORT)[0].identity
 
     assert identity() == identity(summary="words", timeout_h=3.0)
@@ -148,7 +148,7 @@ def test_a_run_that_stopped_goes_on_with_what_is_done(scene, tmp_path):
     folder = tmp_path / "runs/scene/nearest/seed3"
     assert (folder / "failed.json").exists()
     # The same run, its render mended from outside: training is not repeated.
-    registry._registered.clear()
+    registry.registered.clear()
     (cell,) = plan_cells([describe(tmp_path)], [scene], [3], SHORT)
     config = yaml.safe_load((folder / "config.yaml").read_text())
     (folder / "config.yaml").write_text(yaml.safe_dump(config | {"config_hash": cell.identity}))
@@ -162,10 +162,10 @@ def test_a_description_that_never_trained_may_be_mended(scene, tmp_path):
     assert (
         run(describe(tmp_path, prefix=["no-such-program"]), scene, tmp_path / "runs")[1].outcome == "failed"
     )
-    registry._registered.clear()
+    registry.registered.clear()
     cell, report = run(describe(tmp_path), scene, tmp_path / "runs")
     assert report.outcome == "trained", report.error
-    registry._registered.clear()
+    registry.registered.clear()
     with pytest.raises(AwError, match="another configuration"):  # now there is something to lose
         run(describe(tmp_path, renders=BASE["renders"].replace("*", "7")), scene, tmp_path / "runs")
     assert read_result(report.folder / "metrics.json")["config_hash"] == cell.identity
@@ -274,7 +274,7 @@ def test_a_description_with_a_mistake_is_one_clear_line(tmp_path, changes, messa
 
 def test_files_for_the_scene_stay_in_the_copy(scene, tmp_path):
     for name in ("../out.txt", "images/new.txt", "/tmp/out.txt"):
-        registry._registered.clear()
+        registry.registered.clear()
         _, report = run(describe(tmp_path, scene_files={name: "x"}), scene, tmp_path / name.replace("/", "_"))
         assert "lies outside the copy" in report.error
     assert not (scene / "images" / "new.txt").exists()

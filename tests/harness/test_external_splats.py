@@ -31,7 +31,7 @@ shutil.copyfile(splats, output / "splats.ply")
 
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
 
 @pytest.fixture(scope="module")

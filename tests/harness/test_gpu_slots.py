@@ -66,7 +66,7 @@ def run(jobs, count, gpus):
 
 def test_every_process_sees_one_gpu_and_the_one_after_a_death_the_same(monkeypatch, tmp_path):
     monkeypatch.setenv(VISIBLE, "0,1")
-    monkeypatch.setattr(session, "_serve", serve)
+    monkeypatch.setattr(session, "serve", serve)
     deadly = tmp_path / "deadly"
     deadly.touch()
     saw = run([Told("0", dies=str(deadly)), *(Told(str(i)) for i in range(1, 5))], 3, ["7", "GPU-b"])
@@ -76,7 +76,7 @@ def test_every_process_sees_one_gpu_and_the_one_after_a_death_the_same(monkeypat
 
 def test_on_the_cpu_nothing_is_set(monkeypatch):
     monkeypatch.delenv(VISIBLE, raising=False)
-    monkeypatch.setattr(session, "_serve", serve)
+    monkeypatch.setattr(session, "serve", serve)
     assert {gpu for gpu, _ in map(str.split, run([Told("a")], 2, []))} == {"None"}
 
 

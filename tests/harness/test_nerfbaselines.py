@@ -58,7 +58,7 @@ elif words[0] == "evaluate":
 
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ CONTRAST = Metric("contrast", "contrast", "higher", function=lambda render: rend
 
 @pytest.fixture(autouse=True)
 def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(measures, "_own", {})
+    monkeypatch.setattr(measures, "own_metrics", {})
     measures._installed.cache_clear()
     yield
     measures._installed.cache_clear()

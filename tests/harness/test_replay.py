@@ -25,7 +25,7 @@ class Poison(MaskPolicy):
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     register(MethodEntry("poison", "a NaN at iteration 9", lambda options: Parts(mask=Poison())))
     scene = write_tiny_scene(tmp_path / "scene")
 

@@ -68,7 +68,7 @@ def test_what_was_missing_is_measured_from_the_pictures(tmp_path: Path, scene: P
 def test_without_weights_nothing_is_written(
     tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lpips, "_reason", lambda backbone: "weights missing")
+    monkeypatch.setattr(lpips, "why_unavailable", lambda backbone: "weights missing")
     run = write_run(tmp_path / "runs", scene)
     rescore([run])  # the regions of the scene are added
     text = (run / "metrics.json").read_bytes()
@@ -192,9 +192,9 @@ def measured_lpips(sizes: list[tuple[int, int]], half: bool = False) -> tuple[li
 
 
 def test_photos_too_small_for_a_network_leave_it_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lpips, "_reason", lambda backbone: None)
-    monkeypatch.setattr(lpips, "_network", lambda backbone, stamps: (None, None))
-    monkeypatch.setattr(lpips, "_distance", lambda *given: 0.5)
+    monkeypatch.setattr(lpips, "why_unavailable", lambda backbone: None)
+    monkeypatch.setattr(lpips, "network_of", lambda backbone, stamps: (None, None))
+    monkeypatch.setattr(lpips, "distance", lambda *given: 0.5)
     rows, missing = measured_lpips([(40, 40), (12, 20)])
     assert [set(row) for row in rows] == [{"name"}, {"name"}] and set(missing) == set(lpips.VARIANTS)
     assert all(lpips.TOO_SMALL in why and "20x12 px" in why for why in missing.values())

@@ -44,7 +44,7 @@ def explode(options):
 
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     register(MethodEntry("truth", "exact masks", lambda options: Parts(mask=TruthMask())))
     register(MethodEntry("broken", "fails", explode))
 

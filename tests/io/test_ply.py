@@ -48,7 +48,8 @@ def test_the_layout_is_the_one_viewers_expect(tmp_path):
     assert second == tuple(np.float32(v) for v in expected)
 
 
-def test_columns_in_another_order_and_type_are_understood(tmp_path):
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_columns_in_another_order_type_and_form_are_understood(tmp_path, form):
     before = model(3, 0)
     columns = {"opacity": before["opacity_logits"]}
     for prefix, name in (("rot_", "quats"), ("scale_", "log_scales"), ("f_dc_", "sh0")):
@@ -57,10 +58,13 @@ def test_columns_in_another_order_and_type_are_understood(tmp_path):
     table = np.zeros(3, [("flag", "u1"), *((name, "<f8") for name in columns)])
     for name, values in columns.items():
         table[name] = values
-    header = "ply\r\nformat binary_little_endian 1.0\r\ncomment made elsewhere\r\nelement vertex 3\r\n"
+    header = f"ply\r\nformat {form} 1.0\r\ncomment made elsewhere\r\nelement vertex 3\r\n"
     header += "property uchar flag\r\n" + "".join(f"property double {name}\r\n" for name in columns)
     path = tmp_path / "other.ply"
-    path.write_bytes(header.encode() + b"end_header\r\n" + table.tobytes())
+    body = table.astype(table.dtype.newbyteorder(">" if "big" in form else "<")).tobytes()
+    if form == "ascii":
+        body = "".join(" ".join(map(repr, row)) + "\r\n" for row in table.tolist()).encode()
+    path.write_bytes(header.encode() + b"end_header\r\n" + body)
     after = read_splat_ply(path)
     for name, array in before.items():
         np.testing.assert_array_equal(after[name], array)
@@ -76,7 +80,11 @@ def test_junk_is_refused_by_name(tmp_path):
         "cut short": whole[:-1],
         "cut short:": whole.replace(b"vertex 5", b"vertex 999999999999"),
         "element vertex": whole.replace(b"vertex 5", b"vertex -5"),
-        "not binary_little_endian": whole.replace(b"binary_little_endian", b"ascii"),
+        "of format 'utf8', not binary_little_endian": whole.replace(b"binary_little_endian", b"utf8"),
+        "cut short or damaged": whole.replace(b"binary_little_endian", b"ascii"),
+        "aw bench --start": b"ply\nformat ascii 1.0\nelement vertex 1\n"
+        + b"".join(b"property float %c\n" % a for a in b"xyz")
+        + b"end_header\n0 0 0\n",
         "lacks": whole.replace(b"float opacity", b"float weight"),
         "cannot use vertex property": whole.replace(b"property float x", b"property list uchar int x"),
         "twice": whole.replace(b"property float y", b"property float x"),

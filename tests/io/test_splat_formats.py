@@ -19,10 +19,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import AwError, Place
 from ambiguous_wild.io import compressed_ply, gltf, sog, spz
 from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
-from ambiguous_wild.io.splat_arrays import finite
+from ambiguous_wild.io.splat_arrays import SH_C0, finite
+from ambiguous_wild.io.splat_files import read_splats
 
 THEIRS = Path(__file__).parent / "data" / "splats"
 Arrays = dict[str, np.ndarray]
@@ -92,6 +93,80 @@ def check_near(found: Arrays, given: Arrays, limits: tuple[float, ...]) -> None:
 def test_what_another_program_wrote_is_read(ending: str) -> None:
     given = read_splat_ply(THEIRS / "model.ply")
     check_near(READ[ending](THEIRS / f"model.{ending}"), given, LOOSE[ending])
+
+
+def spz_of_version(version: int, given: Arrays) -> bytes:
+    """Our SPZ in the layout of another version, as Niantic's reference (load-spz.cc) has it."""
+    raw = gzip.decompress(spz.spz_bytes(given, antialias=True)[0])
+    n, rest = len(given["means"]), given["sh_rest"].shape[1]
+    head, parts, at = raw[:16], [], 16
+    for width in (9, 1, 3, 3, 4, 3 * rest):
+        parts.append(raw[at : at + n * width])
+        at += n * width
+    if version == 2:
+        w, x, y, z = spz.spz_arrays(gzip.compress(raw), "m")["quats"].T
+        xyz = np.column_stack([x, -y, -z]) * np.where(w < 0, -1, 1)[:, None]
+        parts[4] = np.rint(xyz * 127.5 + 127.5).astype(np.uint8).tobytes()
+        return gzip.compress(head[:4] + struct.pack("<I", 2) + head[8:] + b"".join(parts))
+    zstandard = pytest.importorskip("zstandard")
+    packed = [zstandard.ZstdCompressor().compress(part) for part in parts]
+    note = b"extension"  # lies before the table
+    head = head[:4] + struct.pack("<I", 4) + head[8:15] + bytes([6]) + struct.pack("<I", 32 + len(note))
+    sizes = b"".join(struct.pack("<QQ", len(p), len(q)) for p, q in zip(packed, parts))
+    return head + bytes(12) + note + sizes + b"".join(packed)
+
+
+@pytest.mark.parametrize("rest", [0, 15])
+@pytest.mark.parametrize("version", [2, 4])
+def test_other_versions_of_spz_are_read(tmp_path: Path, version: int, rest: int) -> None:
+    given, path = model(rest=rest), tmp_path / "model.spz"
+    path.write_bytes(spz_of_version(version, given))
+    splats = read_splats(path)
+    limits = list(OURS["spz"])
+    limits[1] = 6e-3 if version == 2 else limits[1]  # w follows from 8 bits of x, y, z
+    check_near(splats.gaussians, given, tuple(limits))
+    assert splats.antialias and splats.place == Place()
+    for cut in (20, 40, path.stat().st_size // 2):
+        (tmp_path / "cut.spz").write_bytes(path.read_bytes()[:cut])
+        with pytest.raises(AwError, match="cut"):
+            read_splats(tmp_path / "cut.spz")
+
+
+def test_a_compressed_ply_without_bounds_of_colours_is_read(tmp_path: Path) -> None:
+    given, path = model(300, 0), tmp_path / "old.ply"
+    given["sh0"] = np.clip(given["sh0"], -1.7, 1.7)
+    given["sh0"][:2] = [[-0.5 / SH_C0] * 3, [0.5 / SH_C0] * 3]
+    given["means"] = given["means"][np.argsort(given["means"][:, 0])]
+    compressed_ply.write_compressed_ply(path, {k: v[:256] for k, v in given.items()})
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    names = [f"property float {end}_{c}\n".encode() for end in ("min", "max") for c in "rgb"]
+    for name in names:
+        head = head.replace(name, b"")
+    path.write_bytes(head + b"end_header\n" + body[:48] + body[72:])  # one chunk
+    check_near(read_splats(path).gaussians, {k: v[:256] for k, v in given.items()}, LOOSE["compressed.ply"])
+
+
+@pytest.mark.parametrize("ending", ["ply", *WRITE])
+def test_any_format_is_told_by_its_bytes_and_has_its_place(tmp_path: Path, ending: str) -> None:
+    given, path = model(90), tmp_path / "renamed.bin"
+    given["means"][3] = np.nan
+    place = Place((5e5, -4e6, 3.0), 0.25, (0.5, 0.5, -0.5, 0.5))
+    write = {"ply": lambda *a, **k: write_splat_ply(*a, **k)} | WRITE
+    write[ending](path, given, place=place)
+    splats = read_splats(path)
+    assert splats.place == place and not splats.antialias and len(splats.gaussians["means"]) == 89
+    assert splats.left_out == (ending == "ply")  # the others hold none
+
+
+@pytest.mark.parametrize("data", [b"", b"ply", b"PK\3\4", b"NGSP", b"glTF", b"\x1f\x8b", b"solid"])
+def test_a_file_of_another_kind_is_one_line(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "m").write_bytes(data + b" nothing")
+    with pytest.raises(AwError, match=r"/m[: ]") as error:
+        read_splats(tmp_path / "m")
+    assert "\n" not in str(error.value)
+    write_splat_ply(tmp_path / "none.ply", model(0))
+    with pytest.raises(AwError, match="no Gaussian"):
+        read_splats(tmp_path / "none.ply")
 
 
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])

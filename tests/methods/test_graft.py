@@ -116,7 +116,7 @@ def test_settings_reach_host_and_donors_by_their_names(scene):
 
 
 def test_a_donors_plugin_is_part_of_the_identity(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     hashes = []
     for source in ("a", "b"):
         register(MethodEntry("mine", "", "ambiguous_wild.methods.threedgs:build", source_hash=source))
@@ -131,7 +131,7 @@ def test_a_donors_plugin_is_part_of_the_identity(monkeypatch):
 @pytest.fixture
 def toned(monkeypatch):
     """A method whose recipe brings an effect of its own, an affine exposure per photo."""
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
     class Toned(RobustSplatMask):
         def cotangent(self, step, keep):
@@ -178,7 +178,7 @@ def test_the_effects_of_a_donor_are_taken_where_they_are_asked_for(toned, recwar
 
 
 def test_effects_that_are_taken_change_what_they_need_of_the_renderer(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     register(MethodEntry("filtered", "", lambda options: with_effects(Parts(), ["antialias"])))
     assert not parts_of("3dgs").antialias
     parts = parts_of("3dgs@effects=filtered")
@@ -317,7 +317,7 @@ def test_other_programs_neither_take_nor_give_parts(name):
 
 
 def test_other_programs_are_known_by_their_names_too(monkeypatch, tmp_path):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
     get_method("external:opensplat")
     with pytest.raises(AwError, match="opensplat is trained by another program, which takes no parts"):
         get_method("opensplat@density=uad")

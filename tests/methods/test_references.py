@@ -43,7 +43,7 @@ number = 3
 
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
 
 @pytest.fixture

@@ -44,10 +44,11 @@ def passers(shift: int = 9) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return photos, masks
 
 
-def looks(photos, config=None, cloud=None):
+def looks(photos, config=None, cloud=None, moving=None):
     cameras = [camera(view) for view in range(VIEWS)]
     surfaces = static_surfaces(cameras, points() if cloud is None else cloud)
-    return first_look(cameras, photos, surfaces, config or JUDGE_ALL)
+    moves = None if moving is None else [np.full(surface.shape, moving, np.float32) for surface in surfaces]
+    return first_look(cameras, photos, surfaces, config or JUDGE_ALL, moves)
 
 
 def keeps(photos, config=None, cloud=None):
@@ -184,6 +185,12 @@ def test_only_in_a_crowd_the_answers_weigh_as_in_a_crowd():
     config = dataclasses.replace(JUDGE_ALL, weight=1.5, crowd_weight=4.0)
     assert {look.weight for look in looks(passers()[0], config)} == {1.5}
     assert {look.weight for look in looks(crowd()[0], config)} == {4.0}
+
+
+def test_features_that_move_count_but_in_a_crowd():
+    for photos, counts in ((passers()[0], True), (crowd()[0], False)):
+        without, still = looks(photos), looks(photos, moving=0.45)
+        assert any(not np.array_equal(a.passing, b.passing) for a, b in zip(without, still)) == counts
 
 
 def test_later_masks_cover_a_few_times_what_the_first_look_masks():

@@ -9,7 +9,7 @@ from ambiguous_wild.methods import MethodEntry, all_methods, get_method, load_pl
 
 @pytest.fixture(autouse=True)
 def _forget_registrations(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "registered", {})
 
 
 def test_builtin_methods_build_with_their_defaults():

@@ -64,4 +64,4 @@ def test_the_commands_and_options_of_every_page_exist() -> None:
             asked = {word.split("=")[0] for word in words if re.match(r"--?[a-z]", word)}
             assert asked <= known, f"{page.name}: aw {text}"
             tried += 1
-    assert tried > 200
+    assert tried > 150

@@ -129,6 +129,22 @@ def test_photos_may_lie_in_images(photos: Path, made: Path, tmp_path: Path) -> N
     assert hashes(tmp_path / "out") == hashes(made)
 
 
+def test_equal_names_in_several_folders_stay_apart(photos: Path, tmp_path: Path) -> None:
+    for i, name in enumerate(NAMES):
+        target = tmp_path / "rig" / ("left" if i < 6 else "right") / f"{i - 6 * (i >= 6)}.jpg"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(photos / f"{name}.jpg", target)
+    facts = composite_photos(tmp_path / "rig", tmp_path / "raw", CONFIG)
+    capture = collect(tmp_path / "raw")
+    assert sorted(s.stem for s in capture.sources if s.side == "test") == ["left_3", "right_3"]
+    assert len({s.stem for s in capture.sources}) == len(NAMES)
+    for name in facts["photos"]:
+        own = Path(name).with_suffix(".png")
+        clean = read_png_rgb(tmp_path / "raw/truth/clean" / own)
+        assert np.array_equal(clean, read_photo(tmp_path / "rig" / name)[1])
+        assert (tmp_path / "raw/truth/distractor" / own).is_file()
+
+
 def test_the_builder_reads_the_capture(made: Path) -> None:
     capture = collect(made)
     assert capture.has_sides and capture.truth == made.resolve() / "truth"

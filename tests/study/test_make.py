@@ -165,6 +165,22 @@ def test_an_old_page_is_not_replaced_unasked(made: tuple[Path, Path], tmp_path: 
     assert out.read_text() != before
 
 
+def test_views_of_several_folders_with_equal_names_are_all_asked_about(
+    made: tuple[Path, Path], tmp_path: Path
+) -> None:
+    scene, runs = made
+    moved = dict(zip(TEST, ("back/0.png", "front/0.png"), strict=True))
+    for old, new in moved.items():
+        for path in [*scene.rglob(old), *runs.rglob(old)]:
+            (path.parent / new).parent.mkdir()
+            path.rename(path.parent / new)
+        for text in (scene / "test_list.txt", scene / "sparse/0/images.txt"):
+            text.write_text(text.read_text().replace(old, new))
+    make(runs, "-o", tmp_path / "s.html")
+    key = json.loads((tmp_path / "s.key.json").read_text())
+    assert sorted(e["view"] for e in key["questions"].values()) == ["back/0"] * 3 + ["front/0"] * 3
+
+
 def test_data_cannot_leave_its_script_element() -> None:
     page = page_html(
         {"title": "</script><script>alert(1)</script>", "study": "x", "questions": [], "images": {}}

@@ -182,7 +182,7 @@ def index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 @pytest.fixture
 def without_pip(index: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What pip would download: these tests are about what follows."""
-    monkeypatch.setattr(fetch, "_pip_download", lambda package, folder, what: index / package.archive)
+    monkeypatch.setattr(fetch, "pip_download", lambda package, folder, what: index / package.archive)
 
 
 @pytest.fixture

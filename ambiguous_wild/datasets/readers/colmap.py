@@ -113,17 +113,21 @@ def has_lists(root: Path) -> bool:
     return any((root / name).is_file() for name in LISTS.values())
 
 
+def sides(names: Iterable[str], root: Path) -> tuple[dict[str, Split], dict[Split, list[str]], list[str]]:
+    """Sides by the folder's lists, else every 8th; listed names that are no photos; notes."""
+    if has_lists(root):
+        return *split_by_lists(names, read_lists(root), root), []
+    split, note = every_nth(names)
+    return split, {}, [note]
+
+
 def read_plain(root: Path, chosen: str = "") -> ForeignScene:
     """COLMAP with images: split by lists, else every 8th photo tests."""
     model = read_named_model(root, chosen)
-    names = model_names(model)
     factors = shipped_factors(root)
     factor = factors[0] if len(factors) == 1 and not photo_folder(root).is_dir() else 1
-    if has_lists(root):
-        split, missing = split_by_lists(names, read_lists(root), root)
-        return ForeignScene("colmap", root, model, photo_folder(root), split, factor, missing)
-    sides, note = every_nth(names)
-    return ForeignScene("colmap", root, model, photo_folder(root), sides, factor, notes=(note,))
+    split, missing, notes = sides(model_names(model), root)
+    return ForeignScene("colmap", root, model, photo_folder(root), split, factor, missing, notes=tuple(notes))
 
 
 def keyword_sides(names: Iterable[str]) -> dict[str, Split | None]:
@@ -197,9 +201,12 @@ def read_drone(root: Path, chosen: str = "") -> ForeignScene:
         model,
         photo_folder(root),
         split,
-        missing=missing,
-        max_width=DRONE_WIDTH,
-        dataset="Drone Imagery",
+        1,
+        missing,
+        {},
+        DRONE_WIDTH,
+        None,
+        "Drone Imagery",
         notes=notes,
     )
 

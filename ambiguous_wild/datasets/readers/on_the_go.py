@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
@@ -91,24 +92,14 @@ def read_on_the_go(root: Path, chosen: str = "") -> ForeignScene:
     if model_folder(root) is not None:
         model, folder = read_named_model(root, chosen), photo_folder(root)
         notes.append("poses from the COLMAP model in the folder, names from transforms.json")
-        source = "model"
+        points: Literal["model", "triangulate"] = "model"
     else:
         model, folder, _ = read_frames(root, path, data)
         notes.append("poses from transforms.json; the release has no points, so they are triangulated")
-        source = "triangulate"
+        points = "triangulate"
     split, missing = split_by_lists(model_names(model), listed, root / "split.json")
-    return ForeignScene(
-        "on-the-go",
-        root,
-        model,
-        folder,
-        split,
-        published_factor(root),
-        missing,
-        dataset=DATASET,
-        notes=tuple(notes),
-        points=source,  # type: ignore[arg-type]
-    )
+    scene = ForeignScene("on-the-go", root, model, folder, split, published_factor(root), missing)
+    return replace(scene, dataset=DATASET, notes=tuple(notes), points=points)
 
 
 def _undistorted(root: Path, chosen: str = "") -> ForeignScene:
@@ -116,16 +107,9 @@ def _undistorted(root: Path, chosen: str = "") -> ForeignScene:
     odd = sorted({c.model for c in model.cameras.values()} - {"PINHOLE", "SIMPLE_PINHOLE"})
     split, missing = split_by_lists(model_names(model), read_lists(root), root)
     notes = (f"cameras are {shortlist(odd)}: undistorted here",) if odd else ()
+    photos, factor = photo_folder(root), _undistorted_factor(root, model)
     return ForeignScene(
-        "on-the-go",
-        root,
-        model,
-        photo_folder(root),
-        split,
-        _undistorted_factor(root, model),
-        missing,
-        dataset=DATASET,
-        notes=notes,
+        "on-the-go", root, model, photos, split, factor, missing, dataset=DATASET, notes=notes
     )
 
 

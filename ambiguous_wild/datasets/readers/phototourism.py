@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, split_by_lists
+from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, read_text, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import (
     has_lists,
     model_names,
@@ -22,7 +22,6 @@ NERF_W: Evaluation = {
     "effects": ["appearance"],
     "source": "NeRF-W: colour is fitted on the left half of a test photo, the right half is measured",
 }
-_LARGEST = 10_000_000  # bytes; the published tables have under 200 kB
 LEAST_SHARE = 0.5  # of the table's photos in the model; below, the table is of another scene
 
 
@@ -47,15 +46,7 @@ def read_table(path: Path) -> dict[Split, list[str]]:
         AwError: unreadable, without the columns, or with an unknown side.
     """
     try:
-        if path.stat().st_size > _LARGEST:
-            raise AwError(f"{path} is larger than {_LARGEST // 10**6} MB: no table of photos")
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise AwError(
-            f"cannot read {path}: {getattr(error, 'strerror', None) or 'it is not UTF-8'}"
-        ) from error
-    try:
-        rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
+        rows = list(csv.DictReader(read_text(path).splitlines(), delimiter="\t"))
     except csv.Error as error:
         raise AwError(f"{path} is no table: {error}") from error
     lacking = [c for c in COLUMNS[:3] if not rows or c not in rows[0]]
@@ -99,14 +90,7 @@ def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
     split, missing = split_by_lists(names, listed, where)
     unlisted = len(names) - len(split)
     notes = (f"{unlisted} photos of the model are in no list: left out",) if unlisted else ()
+    name, photos = "Photo Tourism", photo_folder(root)
     return ForeignScene(
-        "photo-tourism",
-        root,
-        model,
-        photo_folder(root),
-        split,
-        missing=missing,
-        dataset="Photo Tourism",
-        evaluation=NERF_W,
-        notes=notes,
+        "photo-tourism", root, model, photos, split, 1, missing, dataset=name, evaluation=NERF_W, notes=notes
     )

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any
-
-import numpy as np
+from typing import Any, Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import (
-    ForeignScene,
-    every_nth,
-    find_photo,
-    inside,
-    pose_from_opengl,
-    quaternion_from_rotation,
-    split_by_lists,
-)
-from ambiguous_wild.datasets.readers.colmap import has_lists, read_lists
-from ambiguous_wild.io.colmap_model import check_camera
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
+from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, find_photo, inside, read_text, split_by_lists
+from ambiguous_wild.datasets.readers.colmap import sides
+from ambiguous_wild.datasets.readers.posed import brown_camera, model_of_poses
+from ambiguous_wild.io.colmap_records import Model, ModelCamera, points_without_tracks
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
 
-_LARGEST = 100_000_000  # bytes
+_MODELS = ["OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
 _LENS = ("k1", "k2", "p1", "p2")
 WHITE = (255, 255, 255)
 
@@ -39,11 +29,7 @@ def read_json(path: Path) -> dict[str, Any]:
         AwError: unreadable, too large, or something else.
     """
     try:
-        if path.stat().st_size > _LARGEST:
-            raise AwError(f"{path} is larger than {_LARGEST // 10**6} MB")
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror}") from error
+        data = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise AwError(f"{path} is no JSON ({error}); copy it again") from error
     if not isinstance(data, dict):
@@ -116,55 +102,13 @@ def frame_camera(
     third = [value(k) or 0.0 for k in ("k3", "k4")]
     model = str(both.get("camera_model", "OPENCV")).upper()
     fisheye = model == "OPENCV_FISHEYE" or bool(both.get("is_fisheye"))
-    if model not in (
-        "OPENCV",
-        "OPENCV_FISHEYE",
-        "PINHOLE",
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "PERSPECTIVE",
-    ):
-        raise AwError(
-            f"{path}: camera_model {model[:40]!r} is not supported; undistort the photos to PINHOLE"
-        )
+    if model not in _MODELS:
+        told = f"{path}: camera_model {model[:40]!r} is not supported"
+        raise AwError(f"{told}; undistort the photos to PINHOLE")
     size_px = (round(width), round(height))
     if fisheye:
-        return ModelCamera(number, "OPENCV_FISHEYE", *size_px, (fx, fy, cx, cy, lens[0], lens[1], *third))
-    if any(third):
-        params = (fx, fy, cx, cy, *lens, third[0], 0.0, 0.0, 0.0)
-        return ModelCamera(number, "FULL_OPENCV", *size_px, params)
-    if any(lens):
-        return ModelCamera(number, "OPENCV", *size_px, (fx, fy, cx, cy, *lens))
-    return ModelCamera(number, "PINHOLE", *size_px, (fx, fy, cx, cy))
-
-
-def model_of_frames(frames: Sequence[tuple[str, Mapping[str, Any], ModelCamera]]) -> Model:
-    """A model without points; equal cameras are one."""
-    cameras: dict[tuple[Any, ...], ModelCamera] = {}
-    images: dict[int, ModelImage] = {}
-    for number, (name, frame, camera) in enumerate(sorted(frames, key=lambda f: f[0]), start=1):
-        key = (camera.model, camera.width, camera.height, camera.params)
-        check_camera(Path(name), camera)
-        known = cameras.setdefault(
-            key, ModelCamera(len(cameras) + 1, camera.model, camera.width, camera.height, camera.params)
-        )
-        try:
-            pose = pose_from_opengl(np.array(frame["transform_matrix"], dtype=np.float64))
-        except (ValueError, TypeError) as error:
-            raise AwError(f"{name}: its transform_matrix is not [4, 4] numbers") from error
-        except AwError as error:
-            raise AwError(f"{name}: {error}") from None
-        images[number] = ModelImage(
-            number,
-            quaternion_from_rotation(pose[:3, :3]),
-            pose[:3, 3],
-            known.camera_id,
-            name,
-            np.zeros((0, 2)),
-            np.zeros(0, np.int64),
-        )
-    return Model({c.camera_id: c for c in cameras.values()}, images, points_without_tracks())
+        return ModelCamera(number, "OPENCV_FISHEYE", *size_px, (fx, fy, cx, cy, *lens[:2], *third))
+    return brown_camera(size_px, (fx, fy, cx, cy), (*lens[:2], *third), lens[2:], str(path))
 
 
 def read_frames(
@@ -188,8 +132,8 @@ def read_frames(
     top = tops.pop() if len(tops) == 1 else ""
     folder = root / top if top else root
     named = {name[len(top) + 1 :] if top else name: frame for name, frame in found.items()}
-    rows = [(n, f, frame_camera(1, f, data, folder / n, path)) for n, f in named.items()]
-    return model_of_frames(rows), folder, named
+    rows = [(n, f["transform_matrix"], frame_camera(1, f, data, folder / n, path)) for n, f in named.items()]
+    return model_of_poses(rows), folder, named
 
 
 def read_transforms(root: Path) -> ForeignScene:
@@ -198,16 +142,12 @@ def read_transforms(root: Path) -> ForeignScene:
     data = read_json(path)
     model, folder, named = read_frames(root, path, data)
     names = sorted(named)
-    missing: dict[Split, list[str]] = {}
     notes: list[str] = []
     if any(isinstance(data.get(f"{side}_filenames"), list) for side in ("train", "val", "test")):
         listed = _listed(data, path, root, folder)
         split, missing = split_by_lists(names, listed, path)
-    elif has_lists(root):
-        split, missing = split_by_lists(names, read_lists(root), root)
     else:
-        split, note = every_nth(names)
-        notes.append(note)
+        split, missing, notes = sides(names, root)
     masks = _masks(named, split, root)
     points = data.get("ply_file_path")
     studio = isinstance(points, str) or "camera_model" in data or "applied_transform" in data
@@ -216,16 +156,9 @@ def read_transforms(root: Path) -> ForeignScene:
         xyz, rgb = read_point_ply(root / inside(points, root))
         model = Model(model.cameras, model.images, points_without_tracks(xyz, rgb))
         notes.append(f"points from {points}, without the photos that see them")
+    where: Literal["model", "triangulate"] = "model" if len(model.points.ids) else "triangulate"
     return ForeignScene(
-        kind,
-        root,
-        model,
-        folder,
-        split,
-        missing=missing,
-        masks=masks,
-        notes=tuple(notes),
-        points="model" if len(model.points.ids) else "triangulate",
+        kind, root, model, folder, split, missing=missing, masks=masks, notes=tuple(notes), points=where
     )
 
 
@@ -256,8 +189,8 @@ def _masks(named: Mapping[str, Mapping[str, Any]], split: Mapping[str, Split], r
 
 def read_blender(root: Path) -> ForeignScene:
     """Blender scenes of NeRF: transforms_train.json and transforms_test.json, RGBA photos before white."""
-    rows, split = [], {}
-    for side in ("train", "test"):
+    rows, split = [], dict[str, Split]()
+    for side in SIDES:
         path = root / f"transforms_{side}.json"
         data = read_json(path)
         for frame in frames_of(data, path):
@@ -268,16 +201,8 @@ def read_blender(root: Path) -> ForeignScene:
             name = photo.relative_to(root).as_posix()
             if name in split:
                 raise AwError(f"{path}: {name!r} is there twice, or on both sides")
-            rows.append((name, frame, frame_camera(1, frame, data, photo, path)))
+            rows.append((name, frame["transform_matrix"], frame_camera(1, frame, data, photo, path)))
             split[name] = side
     note = "photos with alpha are put before white; initial points are random, as there is no model"
-    return ForeignScene(
-        "blender",
-        root,
-        model_of_frames(rows),
-        root,
-        split,  # type: ignore[arg-type]
-        background=WHITE,
-        points="random",
-        notes=(note,),
-    )
+    model = model_of_poses(rows)
+    return ForeignScene("blender", root, model, root, split, background=WHITE, points="random", notes=(note,))

@@ -22,7 +22,7 @@ _ANY = math.inf
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """From photo and render to M_final. docs/refinesplat.md holds the figures behind every default.
+    """From photo and render to M_final. docs/notes/refinesplat.md: figures behind the defaults.
 
     `structure` judges pixels by colour and structure (structure.py) and needs no features; all other
     statistics are on the feature grid and are the paper's, or nearer to it. Fields marked F are used with

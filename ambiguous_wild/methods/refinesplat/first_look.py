@@ -60,7 +60,8 @@ class FirstLookConfig:
     smooth: float = 5.0  # px of a map of 20 000 px, radius of the filter over each answer; 0 = none
     # of a photo: if less would be masked, nothing is; so few distractors do no harm at the start
     least: float = 0.1
-    # how much the features that move or stay (`vision/moving.py`) raise or lower an answer; 0 = not used
+    # how much the features that move or stay (`vision/moving.py`) raise or lower an answer, but in a crowd;
+    # 0 = not used
     motion: float = 1.0
     weight: float = 1.5  # `structure`: later evidence is multiplied or divided by up to this; 1 = unchanged
     # the weight in a crowd, where the first renders show distractors; other photos show the background
@@ -125,7 +126,7 @@ def first_look(
     ranges = [None if s is None else (cv2.erode(s, _WINDOW), cv2.dilate(s, _WINDOW)) for s in small]
     near = nearest_views(cameras, 2 * config.views)
 
-    moves = moving if moving is not None else [None] * len(small)
+    moves = list(moving) if moving is not None else [None] * len(small)
 
     def answer(
         view: int, views: int, before: Sequence[np.ndarray | None], masked: Sequence[np.ndarray | None]
@@ -153,8 +154,15 @@ def first_look(
         return found if last is None else 0.5 * (found + last)
 
     everything = range(len(small))
-    answers = [answer(view, config.views, [None] * len(small), moves) for view in everything]
-    views = config.views * (2 if masked_share(answers) >= config.crowd else 1)
+    nothing: list[np.ndarray | None] = [None] * len(small)
+    answers = [answer(view, config.views, nothing, moves) for view in everything]
+    views = config.views
+    if masked_share(answers) >= config.crowd:
+        moves, views = (
+            nothing,
+            2 * views,
+        )  # features of a crowd are too few: renders get worse by 0.3 to 0.8 dB
+        answers = [answer(view, config.views, nothing, nothing) for view in everything]
     for _ in range(config.rounds):
         before, answers = answers, [answer(view, views, answers, answers) for view in everything]
         if _changed(before, answers) < _SETTLED:

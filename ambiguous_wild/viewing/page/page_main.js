@@ -10,7 +10,7 @@ function psnrLine() {
   const chosen = [state.left, ...(state.mode === "single" ? [] : [state.right])].filter((c) => c !== PHOTO);
   const values = chosen.filter((c) => Object.hasOwn(DATA.models[c].psnr, view.name))
     .map((c) => `${DATA.models[c].label} ${shown(DATA.models[c].psnr[view.name])} dB`);
-  return [`${view.split} photo`, ...values].join(" · ");
+  return [view.split ? `${view.split} photo` : "render", ...values].join(" · ");
 }
 
 async function drawPhotos() {

@@ -1,0 +1,109 @@
+"""Start a run from a splat file or a point cloud (PLY), as `aw bench --start` does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.ply import has_splats, read_point_ply
+from ambiguous_wild.io.splat_files import Splats, read_splats
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.pace import TrainConfig
+    from ambiguous_wild.splat.parts import Parts
+
+_CHECKED_POINTS = 2000  # number of points that are projected into the train views
+
+
+@dataclass(frozen=True)
+class StartFile:
+    """A file, and the hash of its content when the run was planned."""
+
+    path: Path
+    sha256: str
+
+
+def start_file(path: Path) -> StartFile:
+    """Check that a run can start from the file, and hash it.
+
+    Raises:
+        AwError: the file cannot be read, or is of another kind.
+    """
+    _read(path)
+    return StartFile(path.resolve(), sha256_file(path))
+
+
+def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
+    """Return the parts of a method with the content of the file to start from.
+
+    Raises:
+        AwError: the file has changed, or no train camera of the scene sees its content.
+    """
+    if start is None:
+        return parts
+    import torch
+
+    from ambiguous_wild.splat.gaussians import Gaussians
+    from ambiguous_wild.viewing.model import moved
+
+    content, place = _read(start.path), scene.place
+    if sha256_file(start.path) != start.sha256:
+        raise AwError(f"{start.path} has changed since the run was planned; bench again")
+    if isinstance(content, Splats):
+        arrays = moved(content.gaussians, content.place, place)
+        _refuse_unseen(start.path, arrays["means"], scene)
+        return replace(
+            parts, given=Gaussians(**{k: torch.from_numpy(np.array(a)) for k, a in arrays.items()})
+        )
+    xyz = (content[0] - place.centre) * place.scale
+    _refuse_unseen(start.path, xyz, scene)
+    return replace(parts, given=(xyz, content[1]))
+
+
+def start_line(start: StartFile, method: str, parts: Parts, train: TrainConfig, scene: Scene) -> str:
+    """Return a line that says how many splats or points of the file a run starts from."""
+    from ambiguous_wild.splat.pace import room
+    from ambiguous_wild.splat.parts import thinned
+
+    content = _read(start.path)
+    is_splats = isinstance(content, Splats)
+    count = len(content.gaussians["means"]) if isinstance(content, Splats) else len(content[0])
+    sizes = [(view.camera.height, view.camera.width) for view in scene.train]
+    most = room(train, parts.schedule, sizes, parts.density_config.max_gaussians)
+    kept = len(thinned(count, most))
+    thin = f", chosen at random: it may have {most:,} Gaussians (--max-gaussians)" if kept < count else ""
+    of = f"{kept:,} of the {count:,} {'splats' if is_splats else 'points'} of {start.path.name}"
+    return f"{scene.name}: {method} starts from {of}{thin}"
+
+
+def _read(path: Path) -> Splats | tuple[np.ndarray, np.ndarray]:
+    """Read the Gaussians of a splat file, or the points [M, 3] and colours [M, 3] of another PLY."""
+    if has_splats(path):
+        return read_splats(path)
+    xyz, rgb = read_point_ply(path)
+    if not len(xyz):
+        raise AwError(f"{path} holds no point")
+    return xyz, rgb
+
+
+def _refuse_unseen(path: Path, xyz: np.ndarray, scene: Scene) -> None:
+    """Raise AwError if no train camera sees any of the points [N, 3]."""
+    sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:_CHECKED_POINTS]].astype(np.float64)
+    for view in scene.train:
+        camera = view.camera
+        x, y, z = (sample @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]).T
+        ahead = np.where(z > 0, z, np.nan)
+        u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
+        if ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).any():
+            return
+    middle = np.median(sample, axis=0) / scene.place.scale + scene.place.centre
+    coordinates = ", ".join(f"{c:.4g}" for c in middle)
+    raise AwError(
+        f"{path}: no train camera of {scene.name} sees its content around ({coordinates}): give a file in "
+        "the coordinates of the scene"
+    )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
+from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain, with_options
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.measures import MASK_LABELS, Measure, measure
@@ -56,16 +56,6 @@ class Summary(TypedDict):
     spread: float | None
 
 
-class VariantRun(TypedDict):
-    """A run of a variant; beside these keys it has the values of `METRICS`."""
-
-    scene: str
-    seed: int
-    folder: str
-    error: str | None
-    untimed: str  # why its times are not ranked; empty where they are
-
-
 class VariantRow(TypedDict):
     """A variant: its values, its differences to the default, its runs."""
 
@@ -78,7 +68,7 @@ class VariantRow(TypedDict):
     same_as: str  # the row that has the same runs; empty if there is none
     values: dict[str, Summary]  # by the keys of `METRICS`
     differences: dict[str, Summary]  # by the keys of `DIFFERENCES`
-    runs: list[VariantRun]
+    runs: list[Facts]  # scene, seed, folder, error, untimed (why times are not ranked), and `METRICS`
 
 
 class StudyReport(StudyFacts):

@@ -377,9 +377,7 @@ def _remarks(cells: Sequence[Cell]) -> list[str]:
 
 def _rescore_hint(report: BenchReport, metrics: Sequence[Words] = ()) -> str:
     """Return a line with the metrics that `aw rescore` could add to kept runs; empty where there are none."""
-    kept = [
-        run.result for run in report.runs if run.outcome in ("kept", "skipped") and run.result is not None
-    ]
+    kept = [r.result for r in report.runs if r.outcome in ("kept", "skipped") and r.result is not None]
     if not metrics and not any(result["missing"] for result in kept):
         return ""
     from ambiguous_wild.harness.store import could_be_measured

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
-from ambiguous_wild.core.errors import counted
+from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, own
 from ambiguous_wild.harness.result_file import (
     FAILED,
@@ -110,11 +110,9 @@ def read_runs(*folders: Path | str) -> Runs:
 
 def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FolderResult]:
     """Read the results below one folder; runs without a result are added to `incomplete`."""
-    if not root.is_dir():
-        raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
     results: list[FolderResult] = []
     before = len(incomplete)
-    for run in run_folders(root):
+    for run in find_runs([root]):
         paths = [run / name for name in (RESULT, FAILED) if (run / name).exists()]
         try:
             if not paths:
@@ -179,6 +177,27 @@ def run_folders(root: Path) -> Iterator[Path]:
         if not {RESULT, FAILED, CONFIG}.isdisjoint(files):
             folders.clear()
             yield Path(name)
+
+
+def check_names(kind: str, names: Iterable[str], present: Sequence[str]) -> None:
+    """Raise AwError for the first of the names of methods, scenes or metrics that no run has."""
+    for name in names:
+        if name not in present:
+            raise unknown(kind, name, present)
+
+
+def find_runs(folders: Sequence[Path]) -> list[Path]:
+    """Return the run folders below, each once, as one of the given folders may be inside another.
+
+    Raises:
+        AwError: no such folder.
+    """
+    runs: dict[Path, Path] = {}
+    for root in folders:
+        if not root.is_dir():
+            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+        runs |= {run.resolve(): run for run in run_folders(root)}
+    return list(runs.values())
 
 
 def read_config(run: Path) -> ReadConfig:

@@ -81,14 +81,8 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
         "values": values,
         "differences": differences,
         "runs": [
-            {
-                "scene": o.scene,
-                "seed": o.seed,
-                "folder": str(o.folder),
-                "error": o.error or None,
-                "untimed": o.untimed,
-                **{key: o.value(key) for key in KEYS},  # type: ignore[typeddict-item]
-            }
+            {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
+            | {"untimed": o.untimed, **{key: o.value(key) for key in KEYS}}
             for o in outcomes
         ],
     }

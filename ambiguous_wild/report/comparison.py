@@ -19,7 +19,7 @@ import pandas as pd
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
-from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, read_runs
+from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, read_runs
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.notes import incomparable, notes, untimed
@@ -53,9 +53,7 @@ def comparison(
         names = shortlist(f"{i.folder} ({i.reason})" for i in runs.incomplete)
         raise AwError(f"no finished run: {names}")
     present = sorted(frame["scene"].unique())
-    for name in scenes:
-        if name not in present:
-            raise unknown("scene", name, present)
+    check_names("scene", scenes, present)
     chosen = tuple(dict.fromkeys(scenes)) or tuple(present)
     runs = replace(
         runs,
@@ -324,10 +322,7 @@ def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ())
 
 
 def _only(frame: pd.DataFrame, column: str, names: Sequence[str]) -> pd.DataFrame:
-    present = sorted(frame[column].unique())
-    for name in names:
-        if name not in present:
-            raise unknown(column, name, present)
+    check_names(column, names, sorted(frame[column].unique()))
     return frame[frame[column].isin(list(names))].copy() if names else frame
 
 

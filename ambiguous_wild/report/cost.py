@@ -161,42 +161,18 @@ def _point_row(p: Point) -> Facts:
 
 
 def _reach_row(r: Reach) -> Facts:
-    return {
-        "scene": r.scene or "",
-        "curve": r.curve,
-        "length": r.length,
-        "target": r.target,
-        "psnr": r.psnr,
-        **_both("minutes", r.minutes),
-        "minutes_low": r.low,
-        "minutes_high": r.high,
-        "not_ranked": r.unranked,
-        "upper_bound": r.bound,
-        "reached": r.reached,
-        "runs": r.runs,
-        "missing": r.missing,
-    }
+    row: Facts = {"scene": r.scene or "", "curve": r.curve, "length": r.length, "target": r.target}
+    row |= {"psnr": r.psnr} | _both("minutes", r.minutes)
+    row |= {"minutes_low": r.low, "minutes_high": r.high, "not_ranked": r.unranked}
+    return row | {"upper_bound": r.bound, "reached": r.reached, "runs": r.runs, "missing": r.missing}
 
 
 def _change_row(c: Change) -> Facts:
-    return {
-        "kind": c.kind,
-        "name": c.name,
-        "method": c.method,
-        "before": c.before,
-        "after": c.after,
-        "length": c.length,
-        "scenes": " ".join(c.scenes),
-        "pairs": c.pairs,
-        **_both("db", c.db),
-        "db_low": c.low,
-        "db_high": c.high,
-        **_both("minutes", c.minutes),
-        **_both("ms_per_iteration", c.ms),
-        "db_per_minute": c.per_minute,
-        "same_time": c.same_time,
-        "not_ranked": c.unranked,
-    }
+    row: Facts = {"kind": c.kind, "name": c.name, "method": c.method, "before": c.before, "after": c.after}
+    row |= {"length": c.length, "scenes": " ".join(c.scenes), "pairs": c.pairs}
+    row |= _both("db", c.db) | {"db_low": c.low, "db_high": c.high}
+    row |= _both("minutes", c.minutes) | _both("ms_per_iteration", c.ms)
+    return row | {"db_per_minute": c.per_minute, "same_time": c.same_time, "not_ranked": c.unranked}
 
 
 def _timeline_rows(curves: Iterable[Curve]) -> Iterable[Facts]:

@@ -19,7 +19,7 @@ import numpy as np
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, Options, RunResult, mean_of, read_result
-from ambiguous_wild.harness.store import ReadConfig, read_config, run_folders
+from ambiguous_wild.harness.store import ReadConfig, check_names, find_runs, read_config
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.metrics import stats
 
@@ -101,7 +101,7 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
     """
     runs: list[CostRun] = []
     notes: list[str] = []
-    for folder in _find_runs(folders):
+    for folder in find_runs(folders):
         path = next((folder / n for n in (RESULT, FAILED) if (folder / n).exists()), None)
         if path is None:
             notes.append(f"not finished, left out: {folder}")
@@ -110,12 +110,7 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
             runs.append(_run(folder, read_result(path)))
         except AwError as error:
             notes.append(f"left out: {error}")
-    present = sorted({run.scene for run in runs})
-    for name in scenes:
-        if name not in present:
-            from ambiguous_wild.core.errors import unknown
-
-            raise unknown("scene", name, present)
+    check_names("scene", scenes, sorted({run.scene for run in runs}))
     runs = [run for run in runs if not scenes or run.scene in scenes]
     if all(math.isnan(run.psnr) for run in runs):
         raise AwError(
@@ -163,17 +158,6 @@ def why_unranked(runs: Iterable[CostRun]) -> str:
     timings = [run.timing for run in runs if not run.error]
     wrong = [timing for timing in timings if timing.verdict != "alone"]
     return f"{len(wrong)} of {len(timings)} runs {wrong[0].verdict}: {wrong[0].reason}" if wrong else ""
-
-
-def _find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Return the run folders below, each once, as one of the given folders may be inside another."""
-    runs: dict[Path, Path] = {}
-    for root in folders:
-        if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
-        for folder in run_folders(root):
-            runs.setdefault(folder.resolve(), folder)
-    return list(runs.values())
 
 
 def _run(folder: Path, result: RunResult) -> CostRun:

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.harness.store import Runs, check_names
 from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, Number, read_tables
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.report.table import BLANK, Cell, Column, Row, Table
@@ -139,9 +138,7 @@ def divided(
         AwError: an unknown scene, or a scene in two datasets.
     """
     present = sorted(set(runs.runs["scene"]) | {i.scene for i in runs.incomplete})
-    for name in [*scenes, *(s for members in datasets.values() for s in members)]:
-        if name not in present:
-            raise unknown("scene", name, present)
+    check_names("scene", [*scenes, *(s for members in datasets.values() for s in members)], present)
     wanted = list(dict.fromkeys(scenes)) or sorted(set(runs.runs["scene"]))
     of: dict[str, str] = {}
     for dataset, members in datasets.items():

@@ -24,7 +24,7 @@ from ambiguous_wild.harness.result_file import (
     read_result,
     write_result,
 )
-from ambiguous_wild.harness.store import lacks, read_config, run_folders
+from ambiguous_wild.harness.store import find_runs, lacks, read_config
 from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
@@ -60,15 +60,11 @@ def rescore(
     Raises:
         AwError: no such folder, or no run in it.
     """
-    runs: dict[Path, Path] = {}
-    for root in folders:
-        if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
-        runs |= {run.resolve(): run for run in run_folders(root)}
+    runs = find_runs(folders)
     if not runs:
         raise AwError(f"no run in {', '.join(map(str, folders))}: 'aw bench -o' makes one")
     outcomes, scenes = [], _Scenes(scene)
-    for done, run in enumerate(runs.values(), 1):
+    for done, run in enumerate(runs, 1):
         try:
             outcomes.append(_rescore(run, scenes))
         except AwError as error:

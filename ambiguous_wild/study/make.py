@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.models import open_scene
-from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.harness.store import check_names, read_runs
 from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
@@ -96,10 +96,7 @@ def render_pairs(
     frame = read_runs(folder).runs
     frame = frame[frame["status"] == "ok"]
     for kind, asked in (("method", methods), ("scene", scenes)):
-        present = sorted(set(frame[kind]))
-        for name in asked:
-            if name not in present:
-                raise unknown(kind, name, present)
+        check_names(kind, asked, sorted(set(frame[kind])))
     if methods:
         frame = frame[frame["method"].isin(methods)]
     if scenes:

@@ -289,7 +289,7 @@ class Outcome:
             train_s, setup_s = cost.get("train_s"), cost.get("setup_s")
             return None if train_s is None or setup_s is None else train_s + setup_s
         if metric in cost:
-            return cost[metric]  # type: ignore[literal-required,no-any-return]
+            return cost[metric]  # type: ignore[literal-required]
         mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
 

@@ -31,9 +31,9 @@ from ambiguous_wild.harness.session import Session
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport, Outcome, Overwrite, Protocol
     from ambiguous_wild.harness.effects_plan import Plan
-    from ambiguous_wild.harness.models import Viewer
     from ambiguous_wild.harness.result_file import RunResult
     from ambiguous_wild.harness.store import Runs
+    from ambiguous_wild.harness.trained_models import Viewer
     from ambiguous_wild.methods.entry import MethodEntry
 
 Place = Literal["mask", "density", "regulariser"]
@@ -88,7 +88,7 @@ class RunReport:
         Raises:
             AwError: the run has no model, or its scene has been moved.
         """
-        from ambiguous_wild.harness.models import Viewer
+        from ambiguous_wild.harness.trained_models import Viewer
 
         return Viewer([self.folder], height=height)
 
@@ -130,7 +130,7 @@ class BenchReport:
 
     def show(self, height: int = 640) -> Viewer:
         """Return the page of `aw view` with all models side by side, for a notebook; see `RunReport.show`."""
-        from ambiguous_wild.harness.models import Viewer
+        from ambiguous_wild.harness.trained_models import Viewer
 
         return Viewer([run.folder for run in self.runs if run.outcome != "failed"], height=height)
 
@@ -337,7 +337,7 @@ def _check_effects(
     methods: Collection[MethodEntry],
 ) -> None:
     """Raise AwError for an unknown effect, or a plan that no method would use."""
-    from ambiguous_wild.harness.choosing import check_wanted, takes_effects
+    from ambiguous_wild.harness.chosen_effects import check_wanted, takes_effects
 
     for wanted in choices:
         check_wanted(wanted)
@@ -363,7 +363,7 @@ def _read_plan(plan: Plan | Words | None) -> Plan | None:
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
     """Return a line for each set of effects, each method that cannot take them, each warning of a scene."""
-    from ambiguous_wild.harness.choosing import NOT_OURS, takes_effects
+    from ambiguous_wild.harness.chosen_effects import NOT_OURS, takes_effects
 
     lines = []
     effects = dict.fromkeys((c.scene.name, c.chosen.effects) for c in cells if c.chosen.effects)

@@ -23,7 +23,7 @@ import ambiguous_wild
 from ambiguous_wild import __version__
 from ambiguous_wild.core import UNMOVED, AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
-from ambiguous_wild.harness.choosing import Chosen, mixed_tests, scene_protocol
+from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
     SCHEMA,

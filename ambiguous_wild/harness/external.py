@@ -16,7 +16,7 @@ import torch
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.cell import Cell
-from ambiguous_wild.harness.choosing import NOT_OURS
+from ambiguous_wild.harness.chosen_effects import NOT_OURS
 from ambiguous_wild.harness.meter import Meter, cores, own_s
 from ambiguous_wild.harness.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.files import atomic_path
@@ -139,8 +139,8 @@ class _Splats:
             AwError: the file of splats cannot be read.
         """
         assert produced.ply is not None
-        arrays = read_splat_ply(produced.ply)
-        self.gaussians = Gaussians(**{k: torch.from_numpy(v) for k, v in arrays.items()}).to(device)
+        tensors = {name: torch.from_numpy(a) for name, a in read_splat_ply(produced.ply).items()}
+        self.gaussians = Gaussians(**tensors).to(device)  # type: ignore[arg-type]
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendered:

@@ -18,7 +18,7 @@ from ambiguous_wild.harness.cell import (
     RunOptions,
     scene_identity,
 )
-from ambiguous_wild.harness.choosing import (
+from ambiguous_wild.harness.chosen_effects import (
     Chosen,
     check_wanted,
     chosen_by,

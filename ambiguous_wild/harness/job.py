@@ -19,7 +19,7 @@ from pathlib import Path
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
-from ambiguous_wild.harness.choosing import Chosen
+from ambiguous_wild.harness.chosen_effects import Chosen
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
 from ambiguous_wild.harness.run import error_line, run_cell

@@ -6,6 +6,7 @@ On clusters without shared storage, scenes and run folders travel through Ray's 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import tempfile
 import uuid
@@ -51,7 +52,7 @@ class RayCluster:
         if not self.ours:
             return
         address = engine.address or os.environ.get("RAY_ADDRESS")
-        start = partial(ray.init, log_to_driver=False, logging_level="ERROR")
+        start = partial(ray.init, log_to_driver=False, logging_level=logging.ERROR)
         try:
             if address:
                 start(address=address, namespace="ambiguous_wild")

@@ -12,9 +12,9 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.harness.models import open_scene
 from ambiguous_wild.harness.regions import true_distractor
 from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.page_parts import jpeg_bytes

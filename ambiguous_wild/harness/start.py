@@ -57,9 +57,8 @@ def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
     if isinstance(content, Splats):
         arrays = moved(content.gaussians, content.place, place)
         _refuse_unseen(start.path, arrays["means"], scene)
-        return replace(
-            parts, given=Gaussians(**{k: torch.from_numpy(np.array(a)) for k, a in arrays.items()})
-        )
+        tensors = {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
+        return replace(parts, given=Gaussians(**tensors))  # type: ignore[arg-type]
     xyz = (content[0] - place.centre) * place.scale
     _refuse_unseen(start.path, xyz, scene)
     return replace(parts, given=(xyz, content[1]))

@@ -308,4 +308,5 @@ def _load(run: Path) -> Gaussians:
     from ambiguous_wild.splat.gaussians import Gaussians
 
     arrays = read_splat_ply(run / "point_cloud.ply")
-    return Gaussians(**{k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()})
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
+    return Gaussians(**tensors)  # type: ignore[arg-type]

@@ -22,8 +22,8 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.harness.measures import measure
-from ambiguous_wild.harness.models import TrainedModel, find_models, open_scene
 from ambiguous_wild.harness.result_file import RESULT
+from ambiguous_wild.harness.trained_models import TrainedModel, find_models, open_scene
 from ambiguous_wild.io.files import (
     atomic_dir,
     check_output,

@@ -14,7 +14,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.cell import config_identity
-from ambiguous_wild.harness.choosing import mixed_tests
+from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.measures import ImageRow, Metric, measure, measure_images, metrics
 from ambiguous_wild.harness.result_file import (
     FAILED,

@@ -168,8 +168,10 @@ class _Index:
                 values = values.where(rows["mask_recall"].notna())
             return values.sort_index()
         images = self.images.get((method, scene, column.key))
-        values = {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
-        means = {seed: stats.mean(values.get(seed, np.empty(0))) for seed in sorted(rows.index)}
+        by_seed = (
+            {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
+        )
+        means = {seed: stats.mean(by_seed.get(seed, np.empty(0))) for seed in sorted(rows.index)}
         return pd.Series(means, dtype=float)
 
     def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:

@@ -21,7 +21,7 @@ import numpy as np
 
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
-from ambiguous_wild.report.cost_read import CostRun, Length, why_unranked
+from ambiguous_wild.report.cost_runs import CostRun, Length, why_unranked
 
 SAME_TIME = 0.01  # of the training: a smaller difference of times counts as none
 _ABSENT = "(absent)"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from ambiguous_wild.harness.choosing import MIXED
+from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.report.notes import UNEQUAL
 from ambiguous_wild.report.plain_formats import plain

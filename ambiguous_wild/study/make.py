@@ -14,8 +14,8 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.models import open_scene
 from ambiguous_wild.harness.store import check_names, read_runs
+from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed

@@ -12,7 +12,7 @@ import pytest
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness import effects_plan, residual_probe
 from ambiguous_wild.harness import effects_plan as decide_module
-from ambiguous_wild.harness.choosing import check_wanted
+from ambiguous_wild.harness.chosen_effects import check_wanted
 from ambiguous_wild.harness.effects_plan import (
     FEW_PHOTOS,
     OUTWARD,

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.models import Viewer, read_render_settings, view_runs
+from ambiguous_wild.harness.trained_models import Viewer, read_render_settings, view_runs
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.harness.bench import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
-from ambiguous_wild.harness.models import find_models, open_scene, read_files, read_models
+from ambiguous_wild.harness.trained_models import find_models, open_scene, read_files, read_models
 from ambiguous_wild.io.files import check_output, refuse_files_there
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene

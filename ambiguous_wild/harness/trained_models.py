@@ -12,7 +12,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.cell import refuse_other_scene, scene_identity
-from ambiguous_wild.harness.choosing import mixed_tests
+from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
 from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders
 from ambiguous_wild.io.ply import splat_count

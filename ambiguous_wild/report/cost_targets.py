@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.report.cost_curves import Curve, Summary, scenes_of, summary
-from ambiguous_wild.report.cost_read import CostRun, why_unranked
+from ambiguous_wild.report.cost_runs import CostRun, why_unranked
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
 

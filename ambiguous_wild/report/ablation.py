@@ -80,12 +80,13 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
         "same_as": row.same_as,
         "values": values,
         "differences": differences,
-        "runs": [
-            {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
-            | {"untimed": o.untimed, **{key: o.value(key) for key in KEYS}}
-            for o in outcomes
-        ],
+        "runs": [_run_row(outcome) for outcome in outcomes],
     }
+
+
+def _run_row(o: Outcome) -> Facts:
+    row: Facts = {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
+    return row | {"untimed": o.untimed} | {key: o.value(key) for key in KEYS}
 
 
 def _networks(row: Planned) -> list[str]:

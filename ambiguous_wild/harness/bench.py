@@ -208,7 +208,7 @@ def bench(
     metrics = [metrics] if isinstance(metrics, str | Path) else metrics
     for file in metrics:
         load_metrics(Path(file))
-    entries = _find_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
+    entries = find_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
     folders = [Path(scenes)] if isinstance(scenes, str | Path) else [Path(scene) for scene in scenes]
     choices = [effects] if isinstance(effects, str) else list(effects)
     _check_effects(choices, plan, folders, entries.values())
@@ -303,7 +303,7 @@ def bench(
     return bench_report
 
 
-def _find_methods(
+def find_methods(
     methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str], passes: int
 ) -> dict[str, MethodEntry]:
     """Return the methods, with the parts they take, by the name that finds them again in another process.

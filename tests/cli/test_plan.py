@@ -67,7 +67,7 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
         (["bench", "--method", "refinesplat", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
         (
             ["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "plan.json", "--effects", "none"],
-            "--plan plan.json would not be read: 3dgs with --effects none; add --effects auto",
+            "--plan plan.json would not be used: 3dgs with --effects none; add --effects auto",
         ),
     ],
 )  # fmt: skip

@@ -152,7 +152,7 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     _, job = cell
     other = write_tiny_scene(tmp_path / "other", distractors=False)
     (other / "test_list.txt").write_text("test_0.png\n")
-    assert "another state of ambiguous_wild" in jobs.run_job(replace(job, code="x")).error
+    assert "the code of ambiguous_wild differs" in jobs.run_job(replace(job, code="x")).error
     assert "would be another run" in jobs.run_job(replace(job, scene=str(other))).error
     changed = [replace(s, content=s.content + b"\nenvironment: {A: b}\n") for s in job.sources]
     registry.registered.clear()

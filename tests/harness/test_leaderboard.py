@@ -224,7 +224,7 @@ def test_another_scene_of_the_same_name_is_refused(one: Path, tmp_path: Path) ->
     (scene / "test_list.txt").write_text(names[0] + "\n")
     other = write_run(tmp_path / "more", scene, "refinesplat")
     done = add(tmp_path / "board", other)
-    assert done.exit_code == 2 and "their numbers do not compare" in done.stdout
+    assert done.exit_code == 2 and "their numbers cannot be compared" in done.stdout
 
 
 def test_without_its_scene_a_run_is_marked_and_needs_a_dataset(one: Path, tmp_path: Path) -> None:

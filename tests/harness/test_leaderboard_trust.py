@@ -160,7 +160,7 @@ def test_every_metric_of_pictures_is_computed_again(one: Path, tmp_path: Path) -
         (one / "metrics.json").write_text(good)
         if all(metric in row for row in rows):
             change_result(one, without(metric, at))
-            assert f"is partial: no {metric} of test_{at}.png" in add(tmp_path / "board", one).stdout
+            assert f"is partial: it has no {metric} of test_{at}.png" in add(tmp_path / "board", one).stdout
             (one / "metrics.json").write_text(good)
     change_result(one, lambda r: r["per_image"][1].update(psnr_valid=40.0))  # that photo has no mask
     assert "no such pixel" in add(tmp_path / "board", one).stdout

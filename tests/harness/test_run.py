@@ -91,8 +91,8 @@ def far_principal_point(root):
     [
         (no_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
         (user_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
-        (points_behind, "of one colour: no Gaussian lies in front"),
-        (far_principal_point, "of one colour: no Gaussian lies in front"),
+        (points_behind, "a single colour each: no Gaussian is in front"),
+        (far_principal_point, "a single colour each: no Gaussian is in front"),
     ],
 )
 def test_a_run_that_learns_or_shows_nothing_fails_with_the_reason(spoil, reason, tmp_path):

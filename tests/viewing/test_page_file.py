@@ -181,7 +181,7 @@ def test_another_model_or_another_state_of_the_scene_is_refused(tmp_path: Path) 
     with pytest.raises(AwError, match="was measured on another state of"):
         view_runs([run], tmp_path / "out")
     done = aw("export", run, "--format", "spz")
-    assert "loss not measured" in done.stderr and "another state of" in done.stderr
+    assert "loss is not measured" in done.stderr and "another state of" in done.stderr
     done = aw("video", run, "-o", tmp_path / "v.mp4")
     assert done.returncode == 2 and "another state of" in done.stderr and done.stderr.count("\n") == 1
 

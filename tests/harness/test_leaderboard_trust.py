@@ -75,8 +75,8 @@ def edit_index(board: Path) -> None:
 
 EDITS = {
     "row": (edit, "tiny-set.csv row 2 (3dgs on wall with seed 0 (100 iterations)) was changed by hand"),
-    "all": (edit_all, "all.csv is not what"),
-    "row dropped": (drop_row, "all.csv is not what"),
+    "all": (edit_all, "all.csv does not match"),
+    "row dropped": (drop_row, "all.csv does not match"),
     "index": (edit_index, "index.csv row 2 was changed by hand"),
 }
 

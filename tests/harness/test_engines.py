@@ -157,7 +157,7 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     changed = [replace(s, content=s.content + b"\nenvironment: {A: b}\n") for s in job.sources]
     registry.registered.clear()
     assert "would be another run" in jobs.run_job(replace(job, sources=tuple(changed))).error
-    with pytest.raises(AwError, match=r"does not see .*--transfer store"):
+    with pytest.raises(AwError, match=r"cannot see .*--transfer store"):
         jobs.check_storage(replace(job, token=str(tmp_path / "absent")), wait_s=0.0)
 
 

@@ -27,7 +27,7 @@ from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import Cell, environment
-from ambiguous_wild.harness.choosing import chosen_by
+from ambiguous_wild.harness.chosen_effects import chosen_by
 from ambiguous_wild.harness.grid import Probing, cell_folder, plan_cells
 from ambiguous_wild.harness.run import EFFECTS, refuse_other_config
 from ambiguous_wild.harness.store import read_runs

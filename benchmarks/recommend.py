@@ -22,8 +22,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import environment
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.methods.registry import knows_truth
-from ambiguous_wild.report.cost_read import CostRun, read_cost_runs
 from ambiguous_wild.report.cost_recommend import CLOSE_DB, additive, values_within
+from ambiguous_wild.report.cost_runs import CostRun, read_cost_runs
 
 RESULTS = Path(__file__).parent / "results" / "recommend.json"
 

@@ -15,7 +15,7 @@ from ambiguous_wild.cli.options import Number, PathName, only_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
-    from ambiguous_wild.report.cost_read import CostRuns
+    from ambiguous_wild.report.cost_runs import CostRuns
 
 
 @click.command(name="cost")
@@ -66,7 +66,7 @@ def command(
         raise AwError("--target must be a number of dB, e.g. 25")
     from ambiguous_wild.io.files import check_output
     from ambiguous_wild.report.cost import cost_report, plain_data, to_text, write_report
-    from ambiguous_wild.report.cost_read import read_cost_runs
+    from ambiguous_wild.report.cost_runs import read_cost_runs
 
     if (recommended is None) != (budget is None):
         raise AwError(

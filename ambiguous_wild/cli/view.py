@@ -109,7 +109,7 @@ def view_command(
     if live is not None:
         if runs:
             raise AwError("--live trains a run of its own: leave RUNS out, or leave --live out")
-        from ambiguous_wild.report.views import watch
+        from ambiguous_wild.report.model_views import watch
 
         folder = Path("runs") if chosen is click.core.ParameterSource.DEFAULT else output
         watch(
@@ -119,7 +119,7 @@ def view_command(
         return
     if not runs:
         raise AwError("no RUNS: give the folder that 'aw bench -o' wrote, or --live SCENE")
-    from ambiguous_wild.harness.models import view_runs
+    from ambiguous_wild.harness.trained_models import view_runs
 
     page = view_runs(
         runs,
@@ -171,7 +171,7 @@ def video_command(
     aw video runs --path orbit --seconds 12 --fps 30 --gif video.gif
     """
     from ambiguous_wild.methods.registry import load_plugin
-    from ambiguous_wild.report.views import video_runs
+    from ambiguous_wild.report.model_views import video_runs
 
     for plugin in plugins:
         load_plugin(plugin)
@@ -256,7 +256,7 @@ def export_command(
     aw export stranger.spz --format ply
     """
     from ambiguous_wild.methods.registry import load_plugin
-    from ambiguous_wild.report.views import export_runs
+    from ambiguous_wild.report.model_views import export_runs
 
     for plugin in plugins:
         load_plugin(plugin)

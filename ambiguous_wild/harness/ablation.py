@@ -1,21 +1,29 @@
-"""Plan an ablation study. Every variant is ordinary cells: runs resume, and `aw table` reads them."""
+"""Plan an ablation study. Its variants are ordinary cells: their runs resume, and `aw table` reads them."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash, flatten, to_plain, with_options
+from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain, with_options
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.measures import MASK_LABELS, Measure, measure
-from ambiguous_wild.harness.result_file import FAILED, RESULT, RunResult, mean_of, read_result
+from ambiguous_wild.harness.result_file import (
+    FAILED,
+    RESULT,
+    RunResult,
+    TrainRecord,
+    mask_scores,
+    mean_of,
+    read_result,
+)
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.describe import BACK_ENDS
@@ -24,11 +32,11 @@ from ambiguous_wild.splat.pace import TrainConfig
 
 
 class StudyFacts(TypedDict):
-    """Facts that two studies must share before one report can hold both."""
+    """Facts in which two studies must agree before one report can hold both."""
 
     method: str
-    settings: list[str]  # on top of the defaults, in every row
-    train: dict[str, Any]  # fields of `TrainConfig`; the seed is None
+    settings: list[str]  # that replace defaults in every row
+    train: TrainRecord
     scenes: list[str]
     seeds: list[int]
 
@@ -38,7 +46,7 @@ class GroupFacts(TypedDict):
 
     name: str
     title: str
-    source: str  # in the paper; empty without
+    source: str  # table or section of the paper; empty if there is none
 
 
 class Summary(TypedDict):
@@ -56,19 +64,19 @@ class VariantRow(TypedDict):
     settings: list[str]
     text: str
     status: Literal["ok", "failed", "missing"]
-    reason: str  # of another status than ok
-    same_as: str
-    values: dict[str, Summary]  # by key of `plan.METRICS`
-    differences: dict[str, Summary]  # by key of `plan.DIFFERENCES`
-    runs: list[dict[str, Any]]  # scene, seed, folder, error, untimed, and `plan.METRICS`
+    reason: str  # why the status is not ok
+    same_as: str  # the row that has the same runs; empty if there is none
+    values: dict[str, Summary]  # by the keys of `METRICS`
+    differences: dict[str, Summary]  # by the keys of `DIFFERENCES`
+    runs: list[Facts]  # scene, seed, folder, error, untimed (why times are not ranked), and `METRICS`
 
 
 class StudyReport(StudyFacts):
-    """ablation.json."""
+    """The content of ablation.json."""
 
     schema: int
     made_by: str  # the command
-    note: NotRequired[str]  # what the method says about itself
+    note: NotRequired[str]  # of the method, about itself
     groups: list[GroupFacts]
     rows: list[VariantRow]
 
@@ -83,8 +91,8 @@ class Planned:
     group: str
     variant: Variant
     cells: tuple[Cell, ...]
-    missing: str = ""  # why there are none
-    same_as: str = ""  # its settings are those of the default, or of a variant planned before
+    missing: str = ""  # why there are no cells
+    same_as: str = ""  # the default, or an earlier variant, with the same settings
 
     @property
     def is_default(self) -> bool:
@@ -97,17 +105,17 @@ class Study:
 
     method: str
     groups: tuple[Group, ...]
-    settings: tuple[str, ...]  # on top of the defaults, in every row
+    settings: tuple[str, ...]  # that replace defaults in every row
     default: tuple[Cell, ...]
     rows: tuple[Planned, ...]  # in the order of the groups; each group begins with the default
 
     @property
     def note(self) -> str:
-        """What the method says about itself, with the options of the default rows."""
+        """The method's note about itself, for the options of the default rows."""
         return get_method(self.method).about([flatten(to_plain(self.default[0].options))])
 
     def facts(self) -> StudyFacts:
-        """Facts that two studies must share before one report can hold both."""
+        """Return the facts in which two studies must agree before one report can hold both."""
         return {
             "method": self.method,
             "settings": list(self.settings),
@@ -136,20 +144,20 @@ def plan_study(
     device: str = "cpu",
     factor: int | None = None,
 ) -> Study:
-    """Every variant on every scene with every seed; nothing is trained.
+    """Plan every variant on every scene with every seed; nothing is trained.
 
-    A variant whose method, option or weights are missing becomes a row with the reason. Variants of equal
-    settings share their runs, whatever groups are chosen.
+    A variant whose method, option or weights are missing becomes a row with the reason. Variants with equal
+    settings share their runs, whichever groups are chosen.
 
     Args:
         method: a name of `aw methods` that declares ablations.
         scenes: scene folders.
-        seeds: of training.
+        seeds: seeds of training.
         train: length and bookkeeping.
-        groups: names; empty = all.
-        settings: "key=value" on top of the defaults, in every row, the default's included.
+        groups: names of groups; empty = all.
+        settings: "key=value", replace defaults in every row, the default row included.
         device: "cpu" or "cuda".
-        factor: which images_N; None = what the scene was built for.
+        factor: N of the folder images_N; None = the one that the scene was built for.
 
     Raises:
         AwError: unknown method, group, option in `settings` or scene.
@@ -172,7 +180,7 @@ def plan_study(
                     cells = plan_cells(
                         [variant.method], scenes, seeds, train, settings=given, device=device, factor=factor
                     )
-                    if given or variant.settings:  # at its defaults the run has the method's own name
+                    if given or variant.settings:  # without settings the run has the method's own name
                         of_graft = variant.settings if host else ()
                         cells = _renamed(cells, variant.method, of_graft, folder_name(method, group, variant))
                     rows.append(Planned(group.name, variant, tuple(cells)))
@@ -192,36 +200,36 @@ def plan_study(
 
 
 def _settings_of(variant: Variant, method: str, settings: Sequence[str]) -> list[str]:
-    """Settings of a variant that is another method.
+    """Return the settings of a variant that is another method.
 
-    Those of the study where its method is the donor of the graft, and the study's networks where the other
-    method has such options: networks of its own would decide the comparison. Then the variant's own.
+    They are the study's settings if the method is the donor of the graft, the study's networks if the other
+    method has such options (other networks would decide the comparison), and the variant's own settings.
     """
     peer, name = get_method(variant.method), variant.method.partition("@")[0]
     shared = [f"{method}.{text}" for text in settings if peer.option_keys(method, "key")]
-    known = to_plain(get_method(name).options())
-    both = [key for key in BACK_ENDS if key in known]
-    nets = [f"{name}.{text}" for text in settings if text.partition("=")[0] in both]
+    options = to_plain(get_method(name).options())
+    networks = [key for key in BACK_ENDS if key in options]
+    nets = [f"{name}.{text}" for text in settings if text.partition("=")[0] in networks]
     return [*shared, *nets, *(f"{method}.{text}" for text in variant.settings)]
 
 
 def earlier_groups(study: Study, output: Path) -> list[str]:
-    """Groups that an earlier report in the folder holds and this study does not; all else is equal.
+    """Return the groups that an earlier report in the folder has and this study lacks.
 
-    A report that cannot be read, or of another scene, seed, length or setting, has none.
+    The list is empty if the report is damaged, or of another scene, seed, length or setting.
     """
     try:
-        known = json.loads((output / REPORT).read_text(encoding="utf-8"))
-        same = all(known[key] == value for key, value in study.facts().items())
-        names = [str(group["name"]) for group in known["groups"]] if same else []
+        report = json.loads((output / REPORT).read_text(encoding="utf-8"))
+        same = all(report[key] == value for key, value in study.facts().items())
+        names = [str(group["name"]) for group in report["groups"]] if same else []
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
-    there = {group.name for group in get_method(study.method).ablation_groups()}
-    return [n for n in names if n in there and n not in {group.name for group in study.groups}]
+    declared = {group.name for group in get_method(study.method).ablation_groups()}
+    return [n for n in names if n in declared and n not in {group.name for group in study.groups}]
 
 
 def _renamed(cells: Sequence[Cell], method: str, settings: Sequence[str], name: str) -> list[Cell]:
-    """Cells of another method with these options on top, under a name of their own."""
+    """Return cells of another method with these settings, under the given name."""
     given = {key: value for key, _, value in (setting.partition("=") for setting in settings)}
     options = with_options(cells[0].options, given, f"option of {method}")
     entry = dataclasses.replace(cells[0].method, name=name)
@@ -229,9 +237,9 @@ def _renamed(cells: Sequence[Cell], method: str, settings: Sequence[str], name: 
 
 
 class _Names:
-    """Names of runs by their options: the first variant of all groups with these options gives the name.
+    """Names of runs by their options: a run is called after the first variant with these options.
 
-    Groups that were not chosen count too, so that a run keeps its folder when other groups are chosen.
+    Groups that were not chosen are included, so that a run keeps its folder when other groups are chosen.
     """
 
     def __init__(self, entry: MethodEntry, default: Any, groups: Sequence[Group]) -> None:
@@ -253,7 +261,7 @@ class _Names:
 
 
 def _check_features(variant: Variant) -> None:
-    """Raise AwError where the features the variant needs cannot be made: no weights, no package."""
+    """Raise AwError if the variant's features cannot be made: weights or a package are missing."""
     if variant.features:
         from ambiguous_wild.vision.backends import make_features
 
@@ -271,30 +279,28 @@ class Outcome:
     error: str = ""
 
     def value(self, metric: str) -> float | None:
-        """One number of the run, see `METRICS`; None where it is missing."""
+        """Return one number of the run, see `METRICS`; None if it is missing."""
         if self.result is None:
             return None
-        cost: Mapping[str, Any] = self.result["cost"]
-        masks: Mapping[str, Any] = self.result["masks"] or {}
+        cost = self.result["cost"]
         if metric in MASK_LABELS:
-            return masks.get(metric)
+            return mask_scores(self.result).get(metric)
         if metric == "total_s":
-            parts = (cost.get("train_s"), cost.get("setup_s"))
-            known = [part for part in parts if part is not None]
-            return sum(known) if len(known) == len(parts) else None
+            train_s, setup_s = cost.get("train_s"), cost.get("setup_s")
+            return None if train_s is None or setup_s is None else train_s + setup_s
         if metric in cost:
-            return cost[metric]
+            return cost[metric]  # type: ignore[literal-required]
         mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
 
     @property
     def untimed(self) -> str:
-        """Why its times are not ranked; empty for a run that was alone, or has none."""
+        """The reason why times are not ranked; empty for a run that was alone, or has no result."""
         timing = timing_of(self.result["cost"]) if self.result else None
         return f"{timing.verdict}: {timing.reason}" if timing and timing.verdict != "alone" else ""
 
 
-# What is tabulated of every variant; keys as in ablation.json.
+# The columns of the tables; keys as in ablation.json.
 METRICS = (
     *map(measure, ("psnr", "ssim", "lpips_alex")),
     *(Measure(key, f"mask {label}", "higher", 3) for key, label in MASK_LABELS.items()),
@@ -305,15 +311,15 @@ DIFFERENCES = tuple(m for m in METRICS if m.key in ("psnr", "iou", "ms_per_itera
 
 
 def read_outcomes(cells: Sequence[Cell], output: Path) -> list[Outcome]:
-    """The results of cells as they lie on disk."""
-    found = []
+    """Read the results of cells from their folders."""
+    outcomes = []
     for cell in cells:
         folder = cell_folder(output, cell)
         where = (cell.scene.name, cell.train.seed, folder)
         if (folder / RESULT).is_file():
-            found.append(Outcome(*where, read_result(folder / RESULT)))
+            outcomes.append(Outcome(*where, read_result(folder / RESULT)))
         elif (folder / FAILED).is_file():
-            found.append(Outcome(*where, None, str(read_result(folder / FAILED)["error"])))
+            outcomes.append(Outcome(*where, None, str(read_result(folder / FAILED)["error"])))
         else:
-            found.append(Outcome(*where, None, "not run"))
-    return found
+            outcomes.append(Outcome(*where, None, "not run"))
+    return outcomes

@@ -16,7 +16,7 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
@@ -31,9 +31,10 @@ from ambiguous_wild.harness.session import Session
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport, Outcome, Overwrite, Protocol
     from ambiguous_wild.harness.effects_plan import Plan
-    from ambiguous_wild.harness.models import Viewer
     from ambiguous_wild.harness.result_file import RunResult
     from ambiguous_wild.harness.store import Runs
+    from ambiguous_wild.harness.trained_models import Viewer
+    from ambiguous_wild.methods.entry import MethodEntry
 
 Place = Literal["mask", "density", "regulariser"]
 Words = str | Path
@@ -52,7 +53,7 @@ class TrainSettings(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class RunReport:
-    """What became of one run."""
+    """The outcome of one run, and its result."""
 
     method: str
     scene: str
@@ -66,33 +67,35 @@ class RunReport:
 
     def __repr__(self) -> str:
         psnr = self.mean("psnr")
-        what = f"{self.outcome}{'' if psnr is None else f', {psnr:.2f} dB'}{self.error and f': {self.error}'}"
-        return f"RunReport({self.method} on {self.scene}, seed {self.seed}: {what})"
+        summary = (
+            self.outcome + ("" if psnr is None else f", {psnr:.2f} dB") + (self.error and f": {self.error}")
+        )
+        return f"RunReport({self.method} on {self.scene}, seed {self.seed}: {summary})"
 
     def mean(self, metric: str) -> float | None:
-        """Mean of an image metric over the test views, of the finite values; None where any is missing."""
+        """Return the mean of a metric's finite values over the test views; None where a view has none."""
         from ambiguous_wild.harness.result_file import mean_of
 
         mean = mean_of(self.result, metric)
         return None if math.isnan(mean) else mean
 
     def show(self, height: int = 640) -> Viewer:
-        """The page of `aw view` for this run; as the last value of a notebook's cell it is shown there.
+        """Return the page of `aw view` for this run; a notebook shows it if it is the last value of a cell.
 
         Args:
-            height: of the frame, px.
+            height: height of the frame, px.
 
         Raises:
-            AwError: the run has no model, or its scene is not where it was.
+            AwError: the run has no model, or its scene has been moved.
         """
-        from ambiguous_wild.harness.models import Viewer
+        from ambiguous_wild.harness.trained_models import Viewer
 
         return Viewer([self.folder], height=height)
 
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Every run of a `bench`, in the order in which they were planned."""
+    """All runs of a `bench`, in the order in which they were planned."""
 
     output: Path
     runs: tuple[RunReport, ...]
@@ -107,16 +110,16 @@ class BenchReport:
 
     @property
     def outcomes(self) -> dict[Outcome, int]:
-        """How many runs were trained, kept, skipped or failed."""
+        """Number of runs by outcome: trained, kept, skipped or failed."""
         return dict(Counter(run.outcome for run in self.runs))
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        """A folder for each length and choice of effects: `read` takes one of them."""
+        """One folder for each training length and choice of effects; `read` takes one of them."""
         return tuple(dict.fromkeys(self.output / run.group for run in self.runs))
 
     def read(self, folder: Path | None = None) -> Runs:
-        """All results below a folder as pandas tables, e.g. for `tables.comparison.comparison`.
+        """Read all results below a folder as pandas tables, e.g. for `report.comparison.comparison`.
 
         Args:
             folder: one of `folders`; None = the first.
@@ -126,8 +129,8 @@ class BenchReport:
         return read_runs(self.folders[0] if folder is None else folder)
 
     def show(self, height: int = 640) -> Viewer:
-        """The page of `aw view` with every model side by side, for a notebook; see `RunReport.show`."""
-        from ambiguous_wild.harness.models import Viewer
+        """Return the page of `aw view` with all models side by side, for a notebook; see `RunReport.show`."""
+        from ambiguous_wild.harness.trained_models import Viewer
 
         return Viewer([run.folder for run in self.runs if run.outcome != "failed"], height=height)
 
@@ -166,52 +169,53 @@ def bench(
         methods: names of `aw methods`, FILE.py:RECIPE, external:FILE.yaml or nerfbaselines:METHOD.
         scenes: scene folders.
         output: folder of the runs: OUTPUT/[GROUP/]SCENE/METHOD/seed0.
-        seeds: of training.
+        seeds: every method is trained once with each seed.
         iterations: length of a training; None = 30000.
-        budgets_s: seconds of training instead; several = every length, each in a group of its own.
+        budgets_s: length in seconds of training instead; several = every length, each in its own group.
         effects: "none", "all", "auto" (the plan of the scene) or names with commas, for all methods alike;
-            several = every choice, each in a group of its own.
-        plan: of `aw plan`, or its file, for the one scene; None = made where one is needed.
+            several = every choice, each in its own group.
+        plan: a plan of `aw plan`, or its file, for the only scene; None = made where one is needed.
         settings: options of methods, "METHOD.KEY=VALUE".
         parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}.
         passes: 2 = train again from the start with the final masks; the runs are called METHOD+2passes.
         train: other settings of training.
         plugins: Python files that register methods.
-        metrics: Python files with metrics of your own, see docs/metrics.md.
+        metrics: Python files with your own metrics, see docs/metrics.md.
         device: where to train; "auto" = the GPU where it can be used.
-        threads: of the CPU kernels; None = all cores. The result does not depend on it.
-        jobs: cells at a time on this machine; None = what `engine` says.
+        threads: threads of the CPU kernels; None = all cores. The result does not depend on it.
+        jobs: number of cells that run at a time on this machine; None = what `engine` says.
         engine: where cells run; None = this machine.
-        factor: which images_N; None = what the scene was built for.
+        factor: N of the folder images_N to train on; None = the one that the scene was built for.
         protocol: "full" or "half" (right halves are measured, NeRF-W); None = scene.json's, else "full".
         start: a splat file or a point cloud (PLY) to start from; None = the scene's points.
-        overwrite: as `aw bench --overwrite`.
-        cache: for features and instance masks; None = OUTPUT/.cache.
+        overwrite: "missing" keeps finished runs and resumes stopped ones, "changed" also trains again
+            where a method's file has changed, "always" starts anew, "never" leaves folders that exist.
+        cache: folder for features and instance masks; None = OUTPUT/.cache.
         pictures: draw what the method saw into RUN/pictures.
-        callbacks: told what happens; None = nothing is. `Lines()` prints a line a run.
+        callbacks: called at every event; None = no calls. `Lines()` prints a line for each run.
 
     Returns:
-        A report with every run. A run that failed is in it too: look at `failed`.
+        A report with every run, failed ones included: see `failed`.
 
     Raises:
-        AwError: unknown method, scene, effect or option, or a folder of another configuration; all found
-            before anything is trained.
+        AwError: unknown method, scene, effect or option, or a folder of another configuration; all are
+            checked before anything is trained.
     """
-    told = Callbacks() if callbacks is None else callbacks
-    where = Engine() if engine is None else engine
-    where = where if jobs is None else dataclasses.replace(where, jobs=jobs)
-    where.check()
+    callbacks = Callbacks() if callbacks is None else callbacks
+    engine = Engine() if engine is None else engine
+    engine = engine if jobs is None else dataclasses.replace(engine, jobs=jobs)
+    engine.check()
     metrics = [metrics] if isinstance(metrics, str | Path) else metrics
     for file in metrics:
         load_metrics(Path(file))
-    names = _check_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
+    entries = find_methods([methods] if isinstance(methods, str) else methods, plugins, parts or {}, passes)
     folders = [Path(scenes)] if isinstance(scenes, str | Path) else [Path(scene) for scene in scenes]
     choices = [effects] if isinstance(effects, str) else list(effects)
-    _check_effects(choices, plan, folders, names)
+    _check_effects(choices, plan, folders, entries.values())
     if iterations is not None and budgets_s:
         raise AwError("iterations and budgets_s exclude each other: a run is as long as one of them says")
     out = Path(output)
-    with Session(where, threads, told) as session:
+    with Session(engine, threads, callbacks) as session:
         from ambiguous_wild.harness.cell import RunOptions
         from ambiguous_wild.harness.external import check_program
         from ambiguous_wild.harness.grid import (
@@ -230,27 +234,28 @@ def bench(
         from ambiguous_wild.splat.calibration import prepare_cpu
         from ambiguous_wild.splat.pace import TrainConfig
 
-        chosen = session.device(device)
+        used_device = session.device(device)
         config = TrainConfig(
             iterations=iterations or TrainConfig.iterations,
             budget_s=budgets_s[0] if budgets_s else None,
             **(train or {}),
         )
-        read = _read_plan(plan)
-        place = out / ".cache" if cache is None else Path(cache)
+        given_plan = _read_plan(plan)
+        cache_dir = out / ".cache" if cache is None else Path(cache)
+        say = callbacks.say
         shortest = dataclasses.replace(config, budget_s=min(budgets_s, default=None))
-        probing = Probing(shortest, place / "plans", lambda: prepare_cpu(threads, told.say), told.say)
+        probing = Probing(shortest, cache_dir / "plans", lambda: prepare_cpu(threads, say), say)
         planned = {
             wanted: plan_cells(
-                names,
+                list(entries.values()),
                 folders,
                 seeds,
                 config,
                 settings=settings,
-                device=chosen,
+                device=used_device,
                 factor=factor,
                 effects=wanted,
-                plan=read,
+                plan=given_plan,
                 protocol=protocol,
                 start=None if start is None else Path(start),
                 probing=probing,
@@ -262,48 +267,49 @@ def bench(
         for cell in {cell.method.name: cell for cell in cells}.values():
             check_passes(cell)
         for line in [*_remarks(cells), *warnings]:
-            told.say(line)
-        to_run = [] if where.remote else unfinished(cells, out, overwrite)
+            say(line)
+        to_run = [] if engine.remote else unfinished(cells, out, overwrite)
         for cell in {cell.method.name: cell for cell in to_run}.values():
             check_program(cell)
         to_train = [cell for cell in to_run if cell.method.program is None]
         for line in try_recipes(to_train):
-            told.say(line)
+            say(line)
         for cell in {cell.scene_id: cell for cell in to_run}.values():
             try_own(cell.scene)
         check_output(out / "run")  # before half a minute of compiling
-        if chosen == "cpu" and not where.remote and any(cell.method.program is None for cell in cells):
-            prepare_cpu(threads, told.say)
+        if used_device == "cpu" and not engine.remote and any(cell.method.program is None for cell in cells):
+            prepare_cpu(threads, say)
             if to_train and iterations is None and not budgets_s:
-                told.say(expected_line(to_train))
+                say(expected_line(to_train))
         one_by_one = session.in_process(cells)
-        told.planned(cells, one_by_one)
+        callbacks.planned(cells, one_by_one)
         if one_by_one:
             reports = run_cells(
                 cells,
                 out,
                 overwrite=overwrite,
-                cache_dir=place,
-                tick=told.tick,
+                cache_dir=cache_dir,
+                tick=callbacks.tick,
                 pictures=pictures,
-                on_start=told.started,
-                on_end=told.ended,
+                on_start=callbacks.started,
+                on_end=callbacks.ended,
             )
         else:
-            sources = read_sources(plugins, names, metrics)
-            reports = session.run(cells, out, RunOptions(place, overwrite, pictures), sources)
-    made = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
-    if said := _rescorable(made, metrics):
-        told.say(said)
-    return made
+            sources = read_sources(plugins, list(entries), metrics)
+            reports = session.run(cells, out, RunOptions(cache_dir, overwrite, pictures), sources)
+    bench_report = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
+    if hint := _rescore_hint(bench_report, metrics):
+        say(hint)
+    return bench_report
 
 
-def _check_methods(
+def find_methods(
     methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str], passes: int
-) -> list[str]:
-    """The methods' names with the parts they take; a misspelt one is answered before torch is imported.
+) -> dict[str, MethodEntry]:
+    """Return the methods, with the parts they take, by the name that finds them again in another process.
 
-    "a,b" are two methods, but for the places of a graft (a@mask=b,density=c) and files with a comma.
+    A misspelt name is an error before torch is imported. "a,b" are two methods, except in a graft with two
+    places (a@mask=b,density=c) and in the name of a file that exists.
     """
     from ambiguous_wild.methods.graft import graft_name
     from ambiguous_wild.methods.references import reference_file
@@ -316,19 +322,22 @@ def _check_methods(
     names = []
     for text in methods:
         file = reference_file(text)
-        whole = file is not None and file.exists()
-        for name in [text] if whole else [part.strip() for part in _BETWEEN_METHODS.split(text)]:
+        is_file = file is not None and file.exists()
+        for name in [text] if is_file else [part.strip() for part in _BETWEEN_METHODS.split(text)]:
             once = trained_once(name)
             names.append(second_pass_name(graft_name(once, donors), passes if once == name else 2))
-    entries = [get_method(name) for name in names]
-    return [name if entry.given_as else entry.name for name, entry in zip(names, entries)]
+    entries = [(name, get_method(name)) for name in names]
+    return {name if entry.given_as else entry.name: entry for name, entry in entries}
 
 
 def _check_effects(
-    choices: Sequence[str], plan: Plan | Words | None, scenes: Sequence[Path], methods: Sequence[str]
+    choices: Sequence[str],
+    plan: Plan | Words | None,
+    scenes: Sequence[Path],
+    methods: Collection[MethodEntry],
 ) -> None:
-    from ambiguous_wild.harness.choosing import check_wanted, takes_effects
-    from ambiguous_wild.methods.registry import get_method
+    """Raise AwError for an unknown effect, or a plan that no method would use."""
+    from ambiguous_wild.harness.chosen_effects import check_wanted, takes_effects
 
     for wanted in choices:
         check_wanted(wanted)
@@ -337,10 +346,10 @@ def _check_effects(
     name = plan if isinstance(plan, str | Path) else plan.scene
     if len(scenes) > 1:
         raise AwError(f"--plan {name} is of one scene; bench {len(scenes)} scenes one by one, or without it")
-    if "auto" not in choices or not any(takes_effects(get_method(m)) for m in methods):
+    if "auto" not in choices or not any(map(takes_effects, methods)):
         raise AwError(
-            f"--plan {name} would not be read: {', '.join(methods)} with --effects {', '.join(choices)}; "
-            "add --effects auto"
+            f"--plan {name} would not be used: {', '.join(method.name for method in methods)} with "
+            f"--effects {', '.join(choices)}; add --effects auto"
         )
 
 
@@ -353,28 +362,28 @@ def _read_plan(plan: Plan | Words | None) -> Plan | None:
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
-    """Effects that are on, who cannot take them, warnings of the scenes; each once."""
-    from ambiguous_wild.harness.choosing import NOT_OURS, takes_effects
+    """Return a line for each set of effects, each method that cannot take them, each warning of a scene."""
+    from ambiguous_wild.harness.chosen_effects import NOT_OURS, takes_effects
 
     lines = []
-    on = dict.fromkeys((c.scene.name, c.chosen.effects) for c in cells if c.chosen.effects)
-    lines += [f"{scene}: all methods train with the effects {', '.join(names)}" for scene, names in on]
-    without = {c.method.name: c.method for c in cells if on and not takes_effects(c.method)}
+    effects = dict.fromkeys((c.scene.name, c.chosen.effects) for c in cells if c.chosen.effects)
+    lines += [f"{scene}: all methods train with the effects {', '.join(names)}" for scene, names in effects]
+    without = {c.method.name: c.method for c in cells if effects and not takes_effects(c.method)}
     lines += [f"{name} trains without effects: {NOT_OURS}" for name in without]
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         lines += [f"warning: {scene.name}: {warning}" for warning in scene.info.get("warnings", ())]
     return lines
 
 
-def _rescorable(made: BenchReport, metrics: Sequence[Words] = ()) -> str:
-    """What `aw rescore` could add to runs that were kept; empty where it could add nothing."""
-    kept = [run.result for run in made.runs if run.outcome in ("kept", "skipped") and run.result is not None]
+def _rescore_hint(report: BenchReport, metrics: Sequence[Words] = ()) -> str:
+    """Return a line with the metrics that `aw rescore` could add to kept runs; empty where there are none."""
+    kept = [r.result for r in report.runs if r.outcome in ("kept", "skipped") and r.result is not None]
     if not metrics and not any(result["missing"] for result in kept):
         return ""
     from ambiguous_wild.harness.store import could_be_measured
 
     names = could_be_measured(kept)
-    command = shlex.join(["aw", "rescore", str(made.output), *(f"--metric-file={file}" for file in metrics)])
+    command = shlex.join(["aw", "rescore", str(report.output), *(f"--metric-file={f}" for f in metrics)])
     return (
         f"runs that were kept lack {', '.join(names)}, which can be measured now: {command}" if names else ""
     )

@@ -1,13 +1,13 @@
-"""Where runs are made, and what a caller is told meanwhile. Imports nothing heavy."""
+"""Settings of where runs are made, and the calls that report their progress. Imports nothing heavy."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ambiguous_wild.core.errors import AwError, install_command
 
@@ -55,23 +55,23 @@ class Callbacks:
     """Called while runs are made; does nothing. A subclass overrides what it needs."""
 
     def say(self, text: str) -> None:
-        """One line: effects that a plan chose, a warning, what is compiled, the cluster."""
+        """A line for the user is due: effects of a plan, a warning, a compilation, the cluster."""
 
     def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
-        """Before the first run. `one_by_one`: in this process; only then is `tick` called."""
+        """The runs are planned. `one_by_one`: they run in this process; only then is `tick` called."""
 
     def started(self, cell: Cell, folder: Path) -> None:
-        """A run begins, or begins again after its process died. A Ray cluster does not tell."""
+        """A run begins, or begins again after its process died. With Ray this is never called."""
 
     def tick(self, trainer: Trainer) -> None:
-        """After every iteration, with the clock of the run stopped."""
+        """An iteration has ended; the clock of the run is stopped."""
 
     def ended(self, cell: Cell, report: CellReport) -> None:
         """A run was trained, kept, skipped or failed."""
 
 
 class Lines(Callbacks):
-    """Writes a line where a run begins and one where it ends."""
+    """Write a line when a run begins and when it ends."""
 
     def __init__(self, write: Callable[[str], None] = print) -> None:
         self.write = write
@@ -92,12 +92,12 @@ class Lines(Callbacks):
 
 
 def run_name(cell: Cell) -> str:
-    """ "3dgs on courtyard, seed 0"."""
+    """Return, for example, "3dgs on courtyard, seed 0"."""
     return f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}"
 
 
 def outcome_line(report: CellReport) -> str:
-    """What became of a run, in one line."""
+    """Return the outcome of a run as one line."""
     if report.outcome == "kept":
         return "finished before, kept"
     if report.outcome == "skipped":
@@ -108,19 +108,20 @@ def outcome_line(report: CellReport) -> str:
         return "trained"
     from ambiguous_wild.harness.timing import timing_of
 
-    cost: Mapping[str, Any] = report.result["cost"]
+    cost = report.result["cost"]
     values = [float(v) for row in report.result["per_image"] if (v := row.get("psnr")) is not None]
     parts = [f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views"] if values else []
-    # Of an external program not everything is known.
-    known = {
-        "train_s": "{:.0f} s training",
-        "ms_per_iteration": "{:.1f} ms/iteration",
-        "gaussians": "{:,} Gaussians",
-    }
-    parts += [text.format(cost[name]) for name, text in known.items() if cost.get(name) is not None]
-    effects: Mapping[str, Mapping[str, Any]] = report.result["facts"].get("effect_facts", {})
-    bare = [name for name, facts in effects.items() if facts.get("points") == 0]
-    parts += [f"no point of {' and '.join(bare)} (no room under --max-gaussians?)"] if bare else []
+    # an external program may not report all of these
+    if (train_s := cost.get("train_s")) is not None:
+        parts.append(f"{train_s:.0f} s training")
+    if (ms := cost.get("ms_per_iteration")) is not None:
+        parts.append(f"{ms:.1f} ms/iteration")
+    if (gaussians := cost.get("gaussians")) is not None:
+        parts.append(f"{gaussians:,} Gaussians")
+    effects = report.result["facts"].get("effect_facts", {})
+    empty = [name for name, facts in effects.items() if facts.get("points") == 0]
+    if empty:
+        parts.append(f"{' and '.join(empty)} added no point (no room under --max-gaussians?)")
     timing = timing_of(cost)
     parts += [f"time not ranked: {timing.reason}"] if timing.verdict == "contended" else []
     return ", ".join(parts)

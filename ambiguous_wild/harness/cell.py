@@ -1,4 +1,4 @@
-"""A cell of the grid: one method on one scene with one seed; its identity, its provenance, its report.
+"""A cell of the grid is one method on one scene with one seed: its identity, provenance and report.
 
 Identities are hashes that anybody can compute again from the files.
 """
@@ -23,15 +23,17 @@ import ambiguous_wild
 from ambiguous_wild import __version__
 from ambiguous_wild.core import UNMOVED, AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
-from ambiguous_wild.harness.choosing import Chosen, mixed_tests, scene_protocol
+from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
     SCHEMA,
     Cost,
     Environment,
     MaskScores,
+    Options,
     Provenance,
     RunConfig,
+    RunFacts,
     RunResult,
     UnusualConfig,
 )
@@ -47,7 +49,7 @@ PACKAGES = ("numpy", "numba", "torch", "opencv-contrib-python-headless", "scipy"
 
 
 def environment(device: str) -> Environment:
-    """Versions, platform and device as plain values."""
+    """Return versions, platform and device as plain values."""
     import torch
 
     facts: Environment = {
@@ -68,7 +70,7 @@ def environment(device: str) -> Environment:
 
 
 def installed(package: str) -> str | None:
-    """The version of an installed distribution, or None."""
+    """Return the version of an installed distribution, or None."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -86,80 +88,80 @@ def _cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
-# Keys of config.yaml that do not decide the result: how often it is saved and probed, what is done about
+# Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
 # values that are not finite (the result says so where there were any), where the scene lies.
 IGNORED: dict[str, tuple[str, ...]] = {
     "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
     "scene": ("path",),
     "start": ("path",),
 }
-# Files of a scene that say how it came to be, versions included, and that nothing is trained or scored on:
-# the same photos simulated by a later version are the same scene.
+# Files that record how a scene was made, versions included. Nothing is trained or scored on them: the same
+# photos simulated by a later version are the same scene.
 RECORDS = ("truth/capture.json",)
 
 
-def config_identity(config: Mapping[str, Any]) -> str:
-    """sha256 of what decides a run's result.
+def config_identity(config: RunConfig | Mapping[str, Any]) -> str:
+    """Return the sha256 of the settings that decide a run's result.
 
     Args:
-        config: the resolved configuration, as in config.yaml; its own "config_hash" does not count.
+        config: the resolved configuration, as in config.yaml; its own "config_hash" is ignored.
 
     Raises:
-        ValueError: it holds a number that is not finite.
-        TypeError: it holds what JSON does not.
+        ValueError: a number in it is not finite.
+        TypeError: a value in it has no form in JSON.
     """
-    known = {k: v for k, v in config.items() if k != "config_hash"}
-    for part in IGNORED.keys() & known.keys():
-        known[part] = {k: v for k, v in config[part].items() if k not in IGNORED[part]}
-    return config_hash(known)
+    settings: Options = {k: v for k, v in config.items() if k != "config_hash"}
+    for part in IGNORED.keys() & settings.keys():
+        settings[part] = {k: v for k, v in settings[part].items() if k not in IGNORED[part]}
+    return config_hash(settings)
 
 
 def scene_identity(scene: Scene) -> str:
-    """sha256 that stands for the scene: over its files' hashes, its split and the size it is loaded at."""
-    files = scene.info.get("files")
-    known = (
-        {name: entry["sha256"] for name, entry in files.items() if name not in RECORDS}
-        if isinstance(files, dict)
+    """Return the sha256 of a scene: over its files' hashes, its split and the size it is loaded at."""
+    listed = scene.info.get("files")
+    hashes: dict[str, object] = (
+        {name: entry["sha256"] for name, entry in listed.items() if name not in RECORDS}
+        if isinstance(listed, dict)
         else {}
     )
     split = [(v.name, v.split, v.camera.width, v.camera.height) for v in scene.views]
-    if not known:
-        known = _of_plain(scene)
+    if not hashes:
+        hashes = _contents(scene)
     # masks that were put into the folder later are in no list
     for view in scene.views:
         if view.keep_path is not None:
             name = view.keep_path.relative_to(scene.root).as_posix()
-            if name not in known:
-                known[name] = _digest(view.keep_path)
-    if MOTION not in known and (scene.root / MOTION).is_file():
-        known[MOTION] = _digest(scene.root / MOTION)
+            if name not in hashes:
+                hashes[name] = _digest(view.keep_path)
+    if MOTION not in hashes and (scene.root / MOTION).is_file():
+        hashes[MOTION] = _digest(scene.root / MOTION)
     moved = {} if scene.place == UNMOVED else {"place": [*scene.place.centre, scene.place.scale]}
-    return config_hash({"files": known, "split": split, **moved})
+    return config_hash({"files": hashes, "split": split, **moved})
 
 
 def asked_length(train: TrainConfig) -> str:
-    """What a run was asked for, "60 s" or "2000 iterations"."""
+    """Return the length that was asked for, "60 s" or "2000 iterations"."""
     return f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
 
 
-def refuse_other_scene(run: Path, scene: Path, now: str, known: str) -> None:
-    """Raise AwError if a scene is not in the state that a run saw.
+def refuse_other_scene(run: Path, scene: Path, now: str, before: str) -> None:
+    """Raise AwError if a scene has changed since a run was measured on it.
 
     Args:
-        run: its folder.
+        run: the run's folder.
         scene: the scene's folder.
         now: `scene_identity` of the scene as it is.
-        known: that of the scene as the run saw it.
+        before: `scene_identity` of the scene as the run used it.
     """
-    if now != known:
+    if now != before:
         raise AwError(
-            f"{run} was measured on another state of {scene}: hash {known[:12]}, now {now[:12]}; restore the "
-            "scene, or name the folder of the right one"
+            f"{run} was measured on another state of {scene}: hash {before[:12]}, now {now[:12]}; restore "
+            "the scene, or name the folder of the right one"
         )
 
 
-def _of_plain(scene: Scene) -> dict[str, Any]:
-    """What stands for a plain COLMAP scene, which lists no hashes: cameras, points and photos."""
+def _contents(scene: Scene) -> dict[str, object]:
+    """Return cameras, points and photos of a plain COLMAP scene, which lists no hashes of its files."""
     cameras = [v.camera for v in scene.views]
     lenses = [(c.fx, c.fy, c.cx, c.cy) for c in cameras]
     return {
@@ -173,7 +175,7 @@ def _of_plain(scene: Scene) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> str:
-    """sha256 of a file, computed once for each state of it."""
+    """Return the sha256 of a file, computed again only when the file has changed."""
     state = path.stat()
     return _digest_of(path, state.st_size, state.st_mtime_ns)
 
@@ -190,7 +192,7 @@ Outcome = Literal["trained", "kept", "skipped", "failed"]
 
 @dataclass(frozen=True)
 class Cell:
-    """One run to be made. Two cells of the same identity give the same result on the same machine."""
+    """A run to be made. Two cells of the same identity give the same result on the same machine."""
 
     method: MethodEntry
     options: Any  # the method's frozen dataclass
@@ -198,7 +200,7 @@ class Cell:
     scene_id: str  # sha256 of what the scene was built from, see `scene_identity`
     train: TrainConfig
     device: str = "cpu"
-    chosen: Chosen = field(default_factory=Chosen)  # optional effects, and why
+    chosen: Chosen = field(default_factory=Chosen)  # optional effects, and the reasons for them
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
     start: StartFile | None = None  # what it starts from instead of the scene's points
     group: str = ""  # folder below the output, where one output takes several lengths or effects
@@ -206,7 +208,7 @@ class Cell:
     @property
     def config(self) -> RunConfig:
         """The resolved configuration, as written to config.yaml."""
-        # Keys at their usual value are left out: runs from before these keys existed keep their identity.
+        # Keys with the usual value are left out, so that runs from before these keys keep their identity.
         unusual: UnusualConfig = {}
         if self.chosen.effects:
             unusual["effects"] = list(self.chosen.effects)
@@ -232,7 +234,10 @@ class Cell:
 
     @property
     def identity(self) -> str:
-        """Hash of all settings that decide the result."""
+        """Hash of all settings that decide the result, so without those in `IGNORED`.
+
+        `on_nonfinite` is among them: it acts only on a value that is not finite, which the facts report.
+        """
         return config_identity(self.config)
 
     def result(
@@ -242,24 +247,24 @@ class Cell:
         per_image: Sequence[ImageRow] = (),
         missing: Mapping[str, str] | None = None,
         masks: MaskScores | None = None,
-        facts: Mapping[str, Any] | None = None,
+        facts: RunFacts | None = None,
         cost: Cost | None = None,
     ) -> RunResult:
-        """The result of this cell, whoever made it: a training, a program, or, with an error, a failure.
+        """Return the result of this cell, made by a training or a program; with an error, of a failure.
 
         Args:
-            error: why it failed; None = it was trained and measured.
+            error: why the run failed; None = it was trained and measured.
             per_image: metrics of each test image.
             missing: why a metric is missing, by metric.
-            masks: scores of the predicted masks, None without exact ones.
-            facts: of the method, its effects and the watchdog.
-            cost: what it took.
+            masks: scores of the predicted masks; None without exact masks.
+            facts: what the method, its effects and the watchdog report.
+            cost: time, memory and size.
         """
-        known: dict[str, Any] = {**(facts or {}), "length": asked_length(self.train)}
+        all_facts: RunFacts = {**(facts or {}), "length": asked_length(self.train)}
         if mixed := mixed_tests(self.scene):
-            known["test_photos"] = mixed
+            all_facts["test_photos"] = mixed
         if self.start is not None:
-            known["start"] = f"{self.start.path.name} ({self.start.sha256[:8]})"
+            all_facts["start"] = f"{self.start.path.name} ({self.start.sha256[:8]})"
         return {
             "schema": SCHEMA,
             "method": self.method.name,
@@ -272,7 +277,7 @@ class Cell:
             "metrics": records({key for row in per_image for key in row}),
             "missing": dict(missing or {}),
             "masks": masks,
-            "facts": known,
+            "facts": all_facts,
             "cost": cost or {},
             "config_hash": self.identity,
             "scene_hash": self.scene_id,
@@ -282,9 +287,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How runs are made and kept; nothing of this changes a result."""
+    """How runs are made and kept. No option changes a result."""
 
-    cache_dir: Path  # for features and instance masks shared between runs
+    cache_dir: Path  # features and instance masks that runs share
     # "missing" keeps a finished run and resumes a stopped one, "changed" also replaces one whose method's
     # file has changed, "always" starts anew, "never" leaves a folder that exists as it is
     overwrite: Overwrite = "missing"
@@ -293,16 +298,16 @@ class RunOptions:
 
 @dataclass
 class CellReport:
-    """What became of a cell's run."""
+    """The outcome of a cell's run."""
 
     folder: Path
     outcome: Outcome
     error: str = ""
-    result: RunResult | None = None  # of a run that was trained now
+    result: RunResult | None = None  # only of a run that was trained now
 
 
 def provenance(cell: Cell) -> Provenance:
-    """Where and how the result of a cell is made."""
+    """Return the machine, the code and the command that make the result of a cell."""
     return {
         "environment": environment(cell.device),
         "code_hash": code_hash(),
@@ -312,9 +317,9 @@ def provenance(cell: Cell) -> Provenance:
 
 @cache
 def code_hash() -> str:
-    """sha256 over the package's Python files: two runs with the same one ran the same code.
+    """Return the sha256 over the package's Python files: two runs with the same one ran the same code.
 
-    A plugin is not part of it: its own hash is in config.yaml under `source`.
+    Plugins are not included: the hash of a plugin stands in config.yaml under `source`.
     """
     root = Path(ambiguous_wild.__file__).parent
     sources = sorted(p for p in root.rglob("*.py") if "__pycache__" not in p.parts)
@@ -322,7 +327,10 @@ def code_hash() -> str:
 
 
 def reproduce(cell: Cell) -> str:
-    """The command that makes this result again, whatever the defaults of a later version are."""
+    """Return the command that makes this result again, whatever the defaults of a later version are.
+
+    It names no output folder (-o, by default runs/).
+    """
     method, train = cell.method, cell.train
     name = _base(method).name
     given = method.given_as or name
@@ -348,30 +356,28 @@ def _length(train: TrainConfig) -> list[str]:
 
 
 def _base(method: MethodEntry) -> MethodEntry:
-    """The method that a variant of an ablation is one of: same recipe, another name."""
+    """Return the method with the same recipe whose name can be looked up: a variant's name cannot."""
     if isinstance(method.recipe, Graft):
         return replace(method, name=method.recipe.name)
-    known = all_methods()
-    if method.name in known:
+    methods = all_methods()
+    if method.name in methods:
         return method
-    same = (
-        entry for entry in known.values() if (entry.recipe, entry.config) == (method.recipe, method.config)
-    )
+    same = (e for e in methods.values() if (e.recipe, e.config) == (method.recipe, method.config))
     return next(same, method)
 
 
 def _settings(method: MethodEntry, name: str, options: Any) -> list[str]:
-    """METHOD.KEY=VALUE of every option that is not at its default."""
+    """Return METHOD.KEY=VALUE for every option that is not at its default."""
     now, default = flatten(to_plain(options)), flatten(to_plain(method.options()))
     changed = {key: value for key, value in now.items() if default.get(key, ...) != value}
-    found = []
+    settings = []
     for key, value in changed.items():
         owner, rest = name, key
-        if method.places:  # of a graft: the setting is named after whose place it is
+        if method.places:  # a graft: its settings are named after the donor of the part
             place, _, rest = key.partition(".")
             owner = dict(method.places)[place]
-        found.append(f"{owner}.{rest}={_text(value)}")
-    return list(dict.fromkeys(found))
+        settings.append(f"{owner}.{rest}={_text(value)}")
+    return list(dict.fromkeys(settings))
 
 
 def _text(value: Any) -> str:
@@ -381,16 +387,16 @@ def _text(value: Any) -> str:
 
 
 def _plugins(method: MethodEntry) -> list[Path]:
-    """The files given as --plugin, for a method that came from one, or a graft of such methods."""
-    known = all_methods()
-    members = [known[name] for _, name in method.places if name in known] or [method]
+    """Return the --plugin files that a method, or the members of a graft, came from."""
+    methods = all_methods()
+    members = [methods[name] for _, name in method.places if name in methods] or [method]
     # a reference is no plugin: its file need not call register
-    found = [file_of(member) for member in members if not member.given_as]
-    return [path for path in dict.fromkeys(found) if path is not None]
+    files = [file_of(member) for member in members if not member.given_as]
+    return [path for path in dict.fromkeys(files) if path is not None]
 
 
 def file_of(method: MethodEntry) -> Path | None:
-    """The file of a method of one's own."""
+    """Return the file of a user's own method; None for every other."""
     if method.given_as:
         return reference_file(method.given_as)
     module = sys.modules.get(getattr(method.recipe, "__module__", "") or "")

@@ -1,8 +1,7 @@
-"""Decide which effects a scene needs: evidence against thresholds; plans as JSON files.
+"""Decide which effects a scene needs, from evidence that needs no training, and keep the plan as JSON.
 
-Evidence that needs no training: what the sparse model and the photos at its points say.
-
-Every function returns a number, NaN where the scene cannot tell; `decide.py` holds the thresholds.
+The evidence comes from the sparse model and the colours of the photos at its points. Every function that
+measures it returns a number, NaN where the scene has too little data; `decide` compares them with thresholds.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -21,37 +20,37 @@ from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
 from ambiguous_wild.vision.sparse_surface import has_surface
 
-LEAST = 50  # observations below which nothing is said
-LEAST_VIEWS = 6  # of a point, to fit four numbers to its colour
+LEAST = 50  # observations; fewer give no evidence
+LEAST_VIEWS = 6  # photos of a point, to fit four numbers to its colour
 OUTLYING = 4.5  # median deviations from a point's median colour: three standard deviations of noise
-RELIT = 0.5  # share of a photo's points that are far from their medians: more, and its light is another one
-LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they stand at one place
-LEAST_SPREAD = 0.01  # code values, or of the logarithm: the median deviation counts as at least so much
-MOST_PHOTOS = 64  # whose uncovered share is taken
-MOST = 20_000  # points whose view dependence is fitted; more do not change a median
+RELIT = 0.5  # if more of a photo's points than this share are far from their medians, its light differs
+LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they are all at one place
+LEAST_SPREAD = 0.01  # of the colour range, or of the logarithm: smallest median deviation that is used
+MOST_PHOTOS = 64  # number of photos whose uncovered share is measured
+MOST = 20_000  # number of points whose view dependence is fitted; more do not change a median
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a scene shows, each in the unit of its threshold; NaN = it cannot be told."""
+    """The measurements of a scene, each in the unit of its threshold; NaN = too little data."""
 
-    exposure: float  # spread of the photos' gains, share of a code value
-    appearance: float  # spread at a point that a gain per photo leaves, share of a code value
-    sampling: float  # ratio of the coarsest photo's pixel to the finest's, on the scene
-    view_dependence: float  # median amplitude of what follows the direction, code values in [0, 1]
-    reprojection_px: float  # median of points in the train photos, px of the loaded images
-    observations: int  # in train photos, usable for colour
-    photos: int = 0  # that train; 0 = not counted
-    outward: float = math.nan  # spread of what the train cameras look at, over their own
+    exposure: float  # spread of the photos' gains, as a share of the colour range
+    appearance: float  # spread at a point after a gain per photo, as a share of the colour range
+    sampling: float  # size of a pixel on the scene, coarsest photo over finest
+    view_dependence: float  # median amplitude of colour that follows the direction, of the colour range
+    reprojection_px: float  # median error of points in the train photos, px of the loaded images
+    observations: int  # number in train photos that are usable for colour
+    photos: int = 0  # number of train photos; 0 = not counted
+    outward: float = math.nan  # spread of the places that train cameras look at, over that of the cameras
     uncovered: float = math.nan  # share of the train photos where no SfM points lie
 
 
 def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
-    """All of it.
+    """Measure all evidence.
 
     Args:
-        scene: with tracks.
-        photos: of the train views, [H, W, 3] in [0, 1].
+        scene: a scene with tracks.
+        photos: the photos of its train views, [H, W, 3] in [0, 1].
     """
     colours = track_colours(scene, photos)
     gains = log_gains(colours, len(scene.train))
@@ -72,15 +71,15 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
 
 
 def has_tracks(scene: Scene) -> bool:
-    """Whether any point was seen at a known place of a photo; without, no photo need be read."""
+    """Return whether enough observations of points are known; without them no photo need be read."""
     return bool((scene.points.track_views >= 0).sum() >= LEAST)
 
 
 def exposure_spread(colours: TrackColours, gains: np.ndarray) -> float:
-    """Standard deviation of log gain between the photos that see a same point, rms over channels.
+    """Return the standard deviation of log gain between photos that see the same point, rms over channels.
 
-    Not between all photos: along a strip of photos small errors add up from neighbour to neighbour, and
-    two photos that share nothing cannot disagree.
+    Photos without a common point are not compared: along a strip of photos small errors add up from
+    neighbour to neighbour.
     """
     counts = np.bincount(colours.point)
     rows = counts[colours.point] >= 2
@@ -93,9 +92,9 @@ def exposure_spread(colours: TrackColours, gains: np.ndarray) -> float:
 
 
 def sampling_ratio(scene: Scene) -> float:
-    """Ratio of the 95th to the 5th percentile, over train photos, of a pixel's size on the points it sees.
+    """Return the 95th over the 5th percentile, over train photos, of the size of a pixel on the scene.
 
-    A pixel covers depth / focal length; each photo counts with the median over its points.
+    A pixel covers depth / focal length; the depth of a photo is the median over its points.
     """
     sizes = [depth / (0.5 * (camera.fx + camera.fy)) for camera, depth in _looking_at(scene)]
     if len(sizes) < 3:
@@ -105,11 +104,11 @@ def sampling_ratio(scene: Scene) -> float:
 
 
 def outward(scene: Scene) -> float:
-    """Spread of the places that train cameras look at, over that of the cameras themselves.
+    """Return the spread of the places that train cameras look at, over that of the cameras themselves.
 
-    Near 0 where they stand around something, 1 where they look the same way, large where they stand in the
-    middle. A camera looks at its axis, as far away as its points are in the median. NaN if all stand at one
-    place.
+    It is near 0 for cameras around an object, 1 for cameras that look the same way, and large for cameras in
+    the middle of a place. A camera looks at the point of its axis at the median depth of its points. NaN if
+    all cameras are at one place.
     """
     looking = _looking_at(scene)
     if len(looking) < 3:
@@ -123,24 +122,24 @@ def outward(scene: Scene) -> float:
 
 
 def uncovered(scene: Scene) -> float:
-    """Share of the train photos' pixels with no SfM points around them, in the mean of up to 64 photos.
+    """Return the share of the train photos' pixels without SfM points near them, mean of up to 64 photos.
 
-    There the photos show what SfM did not find, in most scenes the background. Tracks are not needed.
-    A photo with too few points for a surface counts as bare; NaN if most photos are such.
+    Such pixels show in most scenes the background. Tracks are not needed. A photo with too few points for a
+    surface counts as wholly uncovered; the result is NaN if most photos are such.
     """
     cameras = [view.camera for view in scene.train]
     cameras = cameras[:: max(-(-len(cameras) // MOST_PHOTOS), 1)]
     if not cameras or not len(scene.points):
         return float("nan")
-    known = [has_surface(camera, scene.points.sure_xyz) for camera in cameras]
-    if 2 * sum(k is None for k in known) > len(known):
+    surfaces = [has_surface(camera, scene.points.sure_xyz) for camera in cameras]
+    if 2 * sum(surface is None for surface in surfaces) > len(surfaces):
         return float("nan")
-    return float(np.mean([1.0 if k is None else 1.0 - k.mean() for k in known]))
+    return float(np.mean([1.0 if surface is None else 1.0 - surface.mean() for surface in surfaces]))
 
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
-    """Train cameras that see five points or more, each with the median depth of its points."""
-    owner, found = _owner(scene), []
+    """Return the train cameras that see five points or more, each with the median depth of its points."""
+    owner, cameras = _point_of_observation(scene), []
     for index, view in enumerate(scene.views):
         if view.split == "train":
             pose = view.camera.cam_from_world
@@ -148,13 +147,13 @@ def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
             depth = (xyz @ pose[:3, :3].T + pose[:3, 3])[:, 2]
             depth = depth[depth > 0]
             if len(depth) >= 5:
-                found.append((view.camera, float(np.median(depth))))
-    return found
+                cameras.append((view.camera, float(np.median(depth))))
+    return cameras
 
 
 def reprojection(scene: Scene) -> float:
-    """Median distance between where a point was found and where it projects, px of the loaded photos."""
-    owner, found = _owner(scene), []
+    """Return the median distance of observed points from their projections, px of the loaded photos."""
+    owner, distances = _point_of_observation(scene), []
     for index, view in enumerate(scene.views):
         if view.split != "train":
             continue
@@ -165,24 +164,23 @@ def reprojection(scene: Scene) -> float:
         front = local[:, 2] > 1e-6
         local = local[front]
         uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        found.append(np.linalg.norm(uv - scene.points.track_xy[rows][front], axis=1))
-    errors = np.concatenate(found) if found else np.zeros(0)
+        distances.append(np.linalg.norm(uv - scene.points.track_xy[rows][front], axis=1))
+    errors = np.concatenate(distances) if distances else np.zeros(0)
     return float(np.median(errors)) if len(errors) >= LEAST else float("nan")
 
 
 @dataclass(frozen=True)
 class _Fits:
-    """Of every point seen often enough, the variance of its colour that its viewing direction explains."""
+    """The variance of each point's colour, split by whether the viewing direction explains it."""
 
-    explained: np.ndarray  # [P] beyond chance; scatters about zero where there is nothing
-    left: np.ndarray  # [P] unbiased variance of what it does not
+    explained: np.ndarray  # [P] explained variance beyond chance; about zero without view dependence
+    left: np.ndarray  # [P] unbiased variance of the rest
 
 
 def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fits:
-    """A constant and three numbers linear in the direction, by least squares, for points of six photos on.
+    """Fit colour as linear in the viewing direction, by least squares, for points in six photos or more.
 
-    A fit explains noise too: what it explains by chance is subtracted (the adjusted coefficient of
-    determination).
+    A fit explains some noise too; that share is subtracted (adjusted coefficient of determination).
     """
     order = np.argsort(colours.point, kind="stable")
     point, view, values = colours.point[order], colours.view[order], values[order]
@@ -194,7 +192,7 @@ def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fit
     centres = np.array([v.camera.center for v in scene.train])
     groups = [starts[k] + np.arange(sizes[k]) for k in chosen]
     fits = []
-    for rows in _usual(groups, values, view):
+    for rows in _without_outliers(groups, values, view):
         if len(rows) < LEAST_VIEWS:
             continue
         direction = centres[view[rows]] - scene.points.xyz[point[rows[0]]]
@@ -203,11 +201,11 @@ def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fit
     return _Fits(*np.array(fits).reshape(-1, 2).T)
 
 
-def _usual(groups: Sequence[np.ndarray], values: np.ndarray, view: np.ndarray) -> list[np.ndarray]:
-    """Of each point, the rows whose colour is near the point's median colour.
+def _without_outliers(groups: Sequence[np.ndarray], values: np.ndarray, view: np.ndarray) -> list[np.ndarray]:
+    """Return for each point the rows whose colour is near the point's median colour.
 
-    A colour far from the median shows something that stands before the point. But where most colours of a
-    photo are far, its light is another one, and its rows stay.
+    A colour far from the median shows something in front of the point. But if most colours of a photo are
+    far, the light of that photo differs, and its rows are kept.
     """
     if not groups:
         return []
@@ -223,7 +221,7 @@ def _usual(groups: Sequence[np.ndarray], values: np.ndarray, view: np.ndarray) -
 
 def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     n = len(values)
-    # directions of a narrow arc are nearly one: what they cannot tell apart is left out of the fit
+    # directions within a narrow arc are nearly equal: axes that they do not span are left out of the fit
     axes, spread, _ = np.linalg.svd(direction - direction.mean(axis=0), full_matrices=False)
     rank = int((spread > 0.05 * np.sqrt(n)).sum())
     centred = values - values.mean()
@@ -233,38 +231,38 @@ def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 def view_dependence(fits: _Fits) -> float:
-    """Median over points of the amplitude of colour that is linear in the viewing direction."""
+    """Return the median over points of the amplitude of colour that is linear in the viewing direction."""
     if len(fits.explained) < 10:
         return float("nan")
     return float(np.sqrt(max(np.median(fits.explained), 0.0)))
 
 
 def remaining_spread(fits: _Fits) -> float:
-    """Median over points of what is left between photos once each has its gain and each point its shine."""
+    """Return the median over points of the spread between photos that gain and direction do not explain."""
     if len(fits.left) < 10:
         return float("nan")
     return float(np.sqrt(np.median(fits.left)))
 
 
-def _owner(scene: Scene) -> np.ndarray:
+def _point_of_observation(scene: Scene) -> np.ndarray:
     return np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
 
 
 Answer = Literal["on", "off", "unknown"]
 SCHEMA = 1
 
-# Set on tracks with the effect injected and without (tests/harness/test_planning.py) and on the captures of
-# docs/notes/effects.md, which says how near to them what was measured lies.
+# Thresholds, set on tracks with and without the injected effect (tests/harness/test_planning.py) and on the
+# captures of docs/notes/effects.md, which lists how near the measured values are.
 EXPOSURE = 0.05
 APPEARANCE = 0.043
-# A highlight is not linear in the direction: what is left of it, times its linear part (1.7 at the strongest
-# that the tests inject), is no light that differs by place.
+# A highlight is not linear in the direction. Its remainder, up to 1.7 times its linear part in the tests,
+# must not be taken for light that differs by place.
 OF_SHINE = 1.7
 SAMPLING = 1.5
 VIEW_DEPENDENCE = 0.015
 REPROJECTION_PX = 1.0
-# cameras around something have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1:
-# there a dense start of 30 photos paid (docs/notes/effects.md)
+# cameras around an object have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1;
+# for the last a dense start of 30 photos was better (docs/notes/effects.md)
 OUTWARD = 2.0
 # captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/notes/effects.md)
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24
@@ -278,32 +276,32 @@ class Decision:
 
     effect: str
     evidence: str  # what was measured, in words
-    value: float  # NaN: it could not be
+    value: float  # NaN: it could not be measured
     threshold: float
     unit: str
     decision: Answer
     why: str
-    how: str  # what switches it
-    cost_ms: float | None = None  # an iteration more; None: not measured
+    how: str  # the option that switches the effect
+    cost_ms: float | None = None  # extra ms per iteration; None: not measured
     gain_db: float | None = None  # on pixels left out of training; None: not tried
-    error_db: float | None = None  # standard error of that over the photos
+    error_db: float | None = None  # standard error of the gain over the photos
 
-    def plain(self) -> dict[str, Any]:
-        """For JSON, which has no NaN."""
+    def plain(self) -> dict[str, object]:
+        """Return the fields for JSON, with None instead of NaN."""
         value = None if math.isnan(self.value) else self.value
         return {**self.__dict__, "value": value}
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What the probes of a plan cost."""
+    """The cost of a plan's probes."""
 
-    iterations: int  # of all probes, on their small photos
-    seconds: float  # of the process that made the plan; probes that were kept cost nothing again
-    share: float  # expected, of the run that the plan is for
+    iterations: int  # of all probes, on small photos
+    seconds: float  # spent by the process that made the plan, without probes that were made before
+    share: float  # expected share of the run that the plan is for
 
     def line(self) -> str:
-        """For a terminal."""
+        """Return the cost as a line for a terminal."""
         return (
             f"probes: {self.iterations} iterations on small photos, {self.seconds:.0f} s; "
             f"about {100 * self.share:.1f} % of the run (at most 10 %)"
@@ -316,23 +314,23 @@ class Plan:
 
     scene: str
     decisions: tuple[Decision, ...]
-    probed: bool = False  # masks were decided on too
-    cost: Cost | None = None  # None: nothing was tried
+    probed: bool = False  # a render was made, so the plan has lines on masks
+    cost: Cost | None = None  # None: no probe was made
 
     def __repr__(self) -> str:
         return f"Plan({self.scene}: --effects {','.join(self.effects()) or 'none'})"
 
     def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
-        """Names for `--effects`: effects that were decided on, among those allowed.
+        """Return the names of effects to switch on, for `--effects`; with `among`, only those in it.
 
-        A lower SH degree is never among them: it saves no time worth mentioning, and on matt scenes too cost
-        a third to half a decibel (docs/notes/effects.md).
+        A lower SH degree is never among them: it saves almost no time and costs a third to half a decibel,
+        on matt scenes too (docs/notes/effects.md).
         """
-        found = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
-        return tuple(name for name in found if among is None or name in tuple(among))
+        names = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
+        return tuple(name for name in names if among is None or name in tuple(among))
 
-    def plain(self) -> dict[str, Any]:
-        """As it is written to files."""
+    def plain(self) -> dict[str, object]:
+        """Return the plan as it is written to files."""
         return {
             "schema": SCHEMA,
             "scene": self.scene,
@@ -343,7 +341,7 @@ class Plan:
         }
 
     def with_costs(self, costs: dict[str, float]) -> Plan:
-        """The same plan with ms an iteration of each effect, by the name that switches it."""
+        """Return the plan with the extra ms per iteration of each effect, by its name for `--effects`."""
         lines = (
             replace(d, cost_ms=costs.get(d.how.removeprefix("--effects "), d.cost_ms)) for d in self.decisions
         )
@@ -356,96 +354,92 @@ def _adds(decision: Decision) -> bool:
 
 
 def answer(value: float, threshold: float) -> Answer:
-    """On from the threshold up."""
+    """Return "on" from the threshold up, "off" below it, "unknown" for NaN."""
     if math.isnan(value):
         return "unknown"
     return "on" if value >= threshold else "off"
 
 
-def decide(scene: str, found: Evidence) -> Plan:
-    """The lines that need no training."""
-    seen = f"{found.observations} observations of SfM points"
-    shine = 0.0 if math.isnan(found.view_dependence) else OF_SHINE * found.view_dependence
-    by_place = found.appearance - min(shine, found.appearance)  # NaN stays NaN
-    local = answer(by_place, APPEARANCE)
-    globally = answer(found.exposure, EXPOSURE)
-    by_gain = "a gain per photo explains it" if globally == "on" else "photos agree"
-    if local == "on":
-        globally_why = "the embedding covers it" if globally == "on" else by_gain
-    else:
-        globally_why = by_gain
-    smooth = answer(found.sampling, SAMPLING)
-    bent = answer(found.view_dependence, VIEW_DEPENDENCE)
-    moved = answer(found.reprojection_px, REPROJECTION_PX)
-    behind = answer(found.uncovered, UNCOVERED)
+def decide(scene: str, evidence: Evidence) -> Plan:
+    """Return the plan that follows from the evidence alone."""
+    shine = 0.0 if math.isnan(evidence.view_dependence) else OF_SHINE * evidence.view_dependence
+    by_place = evidence.appearance - min(shine, evidence.appearance)  # NaN stays NaN
+    appearance = answer(by_place, APPEARANCE)
+    exposure = answer(evidence.exposure, EXPOSURE)
+    exposure_why = "a gain per photo explains it" if exposure == "on" else "all photos agree"
+    if appearance == exposure == "on":
+        exposure_why = "the appearance embedding includes it"
+    antialias = answer(evidence.sampling, SAMPLING)
+    harmonics = answer(evidence.view_dependence, VIEW_DEPENDENCE)
+    poses = answer(evidence.reprojection_px, REPROJECTION_PX)
+    skybox = answer(evidence.uncovered, UNCOVERED)
     lines: tuple[Decision, ...] = (
         Decision(
             "appearance", "spread at a point after gain and shine", by_place,
-            APPEARANCE, "of the colour range", local,
-            "light differs by place" if local == "on" else "no more than texture and noise",
+            APPEARANCE, "of the colour range", appearance,
+            "light differs by place" if appearance == "on" else "not above texture and noise",
             "--effects appearance",
         ),
         Decision(
-            "exposure", "spread of the photos' gains at the same points", found.exposure, EXPOSURE,
-            "of the colour range", "off" if local == "on" and globally == "on" else globally, globally_why,
+            "exposure", "spread of the photos' gains at the same points", evidence.exposure, EXPOSURE,
+            "of the colour range", "off" if appearance == exposure == "on" else exposure, exposure_why,
             "--effects exposure",
         ),
         Decision(
-            "antialias", "pixel size on the scene, coarsest over finest photo", found.sampling, SAMPLING,
-            "times", smooth,
-            "seen from near and far" if smooth == "on" else "all photos resolve about the same",
+            "antialias", "pixel size on the scene, coarsest over finest photo", evidence.sampling, SAMPLING,
+            "times", antialias,
+            "photos from near and far" if antialias == "on" else "all photos have about the same resolution",
             "--effects antialias",
         ),
         Decision(
-            "SH degree", "colour that follows the viewing direction", found.view_dependence, VIEW_DEPENDENCE,
-            "code values", bent,
-            "degree 3 has work to do" if bent == "on" else "colours hardly follow the direction",
+            "SH degree", "colour that follows the viewing direction", evidence.view_dependence,
+            VIEW_DEPENDENCE, "of the colour range", harmonics,
+            "degree 3 is needed" if harmonics == "on" else "colours hardly follow the direction",
             "--effects sh1",
         ),
         Decision(
-            "poses", "reprojection error of the sparse model", found.reprojection_px,
-            REPROJECTION_PX, "px", moved,
-            "poses are off by more than the photos can hide" if moved == "on" else "poses fit the photos",
+            "poses", "reprojection error of the sparse model", evidence.reprojection_px,
+            REPROJECTION_PX, "px", poses,
+            "the poses are inaccurate" if poses == "on" else "the poses fit the photos",
             "--effects poses",
         ),
         Decision(
-            "skybox", "share of the photos where no SfM points lie", found.uncovered, UNCOVERED,
-            "of the pixels", behind,
-            "background, or plain walls" if behind == "on" else "SfM found points nearly everywhere",
+            "skybox", "share of the photos where no SfM points lie", evidence.uncovered, UNCOVERED,
+            "of the pixels", skybox,
+            "a background, or plain walls" if skybox == "on" else "SfM found points nearly everywhere",
             "--effects skybox",
         ),
-        _dense_start(found),
+        _dense_start(evidence),
     )  # fmt: skip
-    missing = {"skybox": "cannot be told: most photos show too few SfM points, or none"}
+    too_few = f"{evidence.observations} observations of SfM points are too few to decide"
+    missing = {"skybox": "most photos show too few SfM points to decide"}
     lines = tuple(
-        replace(d, why=missing.get(d.effect, f"cannot be told from {seen}")) if d.decision == "unknown" else d
-        for d in lines
+        replace(d, why=missing.get(d.effect, too_few)) if d.decision == "unknown" else d for d in lines
     )
     return Plan(scene, lines)
 
 
-def _dense_start(found: Evidence) -> Decision:
-    """On for few photos, and for those from the middle of a place.
+def _dense_start(evidence: Evidence) -> Decision:
+    """Decide on a dense start: on for few photos, and for cameras in the middle of a place.
 
-    Exposures must be known: where they differed and nothing said so, test PSNR fell.
+    It is unknown without a measured exposure: where exposures differed unnoticed, test PSNR fell.
     """
-    photos, tracks = found.photos, not math.isnan(found.exposure)
-    few, middle = photos <= FEW_PHOTOS, found.outward > OUTWARD
-    known = tracks and photos >= LEAST_PHOTOS
-    decision: Answer = "unknown" if not known else "on" if few or middle else "off"
+    photos = evidence.photos
+    few, middle = photos <= FEW_PHOTOS, evidence.outward > OUTWARD
+    measured = photos >= LEAST_PHOTOS and not math.isnan(evidence.exposure)
+    decision: Answer = "unknown" if not measured else "on" if few or middle else "off"
     if middle and not few:
         return Decision(
-            "dense", "spread of what cameras look at, over theirs", found.outward, OUTWARD, "times",
-            decision, "cameras look outward", "--effects dense",
+            "dense", "spread of the places looked at, over that of the cameras", evidence.outward, OUTWARD,
+            "times", decision, "the cameras look outward", "--effects dense",
         )  # fmt: skip
-    return Decision(
-        "dense", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS, "photos",
-        decision, "photos leave much to guess" if few else "enough photos see a surface", "--effects dense",
-    )  # fmt: skip
+    why = "so few photos leave gaps between points" if few else "enough photos show each surface"
+    return Decision("dense", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS, "photos",
+                    decision, why, "--effects dense")  # fmt: skip
 
 
 def plan_without_training(scene: Scene) -> Plan:
-    """Read the train photos at the SfM points and decide; a scene without tracks reads nothing.
+    """Measure the train photos at the SfM points and decide; without tracks no photo is read.
 
     Raises:
         AwError: a photo cannot be read.
@@ -460,10 +454,10 @@ def plan_without_training(scene: Scene) -> Plan:
 
 
 def read_plan(path: Path) -> Plan:
-    """A plan that `aw plan` wrote.
+    """Read a plan that `aw plan` wrote.
 
     Raises:
-        AwError: no such file, or it is none.
+        AwError: there is no such file, or it is no plan.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))

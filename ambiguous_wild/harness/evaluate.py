@@ -1,4 +1,4 @@
-"""Renders, masks and numbers of a trained model; every number comes from the saved 8-bit images."""
+"""Write renders and masks of a trained model and measure them; every number comes from 8-bit images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FPS_SECONDS = 2.0  # of all rounds together: long enough to average over schedul
 
 
 class Picture(Protocol):
-    """What `Renderable.render` gives."""
+    """The result of `Renderable.render`."""
 
     @property
     def image(self) -> torch.Tensor:
@@ -38,19 +38,19 @@ class Picture(Protocol):
 
 
 class Renderable(Protocol):
-    """Draws test views: a trained model, splats that a program left, or the pictures that it left."""
+    """Draws test views: a trained model, or the splats or pictures that an external program wrote."""
 
     def render(self, camera: Camera) -> Picture:
-        """The picture of a test view's camera."""
+        """Return the picture of a test view's camera."""
         ...
 
     def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
-        """The picture [H, W, 3] after colour effects, if there are any, were fitted to a part of the photo.
+        """Fit colour effects, if there are any, to a part of the photo; return the picture [H, W, 3].
 
         Args:
             camera: of the test view.
             photo: [H, W, 3] float32 in [0, 1], on the CPU.
-            keep: [H, W] float32 on the CPU, 1 where the fit may look.
+            keep: [H, W] float32 on the CPU, 1 where the fit may use the photo.
         """
         ...
 
@@ -66,10 +66,10 @@ class TestPhoto:
 
 
 def load_test_photos(scene: Scene) -> list[TestPhoto]:
-    """The test views' photos as 8-bit RGB.
+    """Read the test views' photos as 8-bit RGB.
 
     Raises:
-        AwError: one is too small to be measured; said here, before anything is trained.
+        AwError: a photo is too small to be measured; checked here, before anything is trained.
     """
     for view in scene.test:
         image_metrics.check_size(view.camera.height, view.camera.width)
@@ -77,7 +77,7 @@ def load_test_photos(scene: Scene) -> list[TestPhoto]:
 
 
 def mean_psnr(truth: Sequence[TestPhoto], draw: Callable[[Camera], np.ndarray]) -> float:
-    """Mean PSNR in dB over the test views, from 8-bit images."""
+    """Return the mean PSNR in dB over the test views, from 8-bit images."""
     return float(np.mean([image_metrics.psnr(to_uint8(draw(t.view.camera)), t.photo) for t in truth]))
 
 
@@ -94,13 +94,13 @@ def render_and_measure(
     Args:
         model: draws the test views.
         truth: the test photos.
-        folder: for the PNG files.
-        scene: what the metrics of regions are about.
+        folder: where the PNG files are written.
+        scene: the scene, for metrics of regions.
         half: NeRF-W's protocol: colour effects are fitted on the left half of each test photo, columns
-            0 to ceil(W / 2), everything else stays, and the right half, from W // 2, is measured.
+            0 to ceil(W / 2), nothing else is changed, and the right half, from W // 2, is measured.
 
     Returns:
-        Per-image metrics, and for each metric that is missing the reason.
+        Metrics of each image, and the reason for each metric that is missing.
     """
     if not truth:
         return [], dict.fromkeys(metrics(), "the scene has no test views")
@@ -118,25 +118,25 @@ def render_and_measure(
 
 
 def refuse_empty(truth: Sequence[TestPhoto], folder: Path) -> None:
-    """Raise AwError if every render is of one colour and some photo is not: the model shows nothing.
+    """Raise AwError if every render has a single colour while some photo has more: the model shows nothing.
 
     Args:
         truth: the test photos.
-        folder: of the renders.
+        folder: where the renders are.
     """
     renders = (read_png_rgb(folder / Path(t.view.name).with_suffix(".png")) for t in truth)
     if any(np.ptp(t.photo, axis=(0, 1)).any() for t in truth) and not any(
         np.ptp(render, axis=(0, 1)).any() for render in renders
     ):
         raise AwError(
-            f"all {len(truth)} test renders are of one colour: no Gaussian lies in front of the test "
+            f"all {len(truth)} test renders have a single colour each: no Gaussian is in front of the test "
             "cameras; check poses, focal lengths, principal points and points of the scene"
         )
 
 
 @contextmanager
 def kernel_threads() -> Iterator[None]:
-    """Let torch use as many threads as the CPU kernels; drawing keeps those it had."""
+    """Let torch use as many threads as the CPU kernels until the `with` ends."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads())
     try:
@@ -153,7 +153,7 @@ def _fitted(model: Renderable, test: TestPhoto) -> torch.Tensor:
 
 
 def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
-    """Write every train view's keep map and score it, see `write_keeps`."""
+    """Write the keep map of every train view and score it, see `write_keeps`."""
 
     def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for index, view in enumerate(trainer.data.scene.train):
@@ -169,8 +169,8 @@ def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: 
     """Write keep maps [H, W] bool of train views (white = keep) and score them where the truth is known.
 
     Returns:
-        IoU, precision and recall of the distractor pixels, counted over all photos together (a photo
-        where nothing is masked has no precision of its own), or None without truth.
+        IoU, precision and recall of the distractor pixels, counted over all photos together (a single photo
+        has no precision where nothing is masked), or None without truth.
     """
     counts = []
     with atomic_dir(folder) as temporary:
@@ -188,10 +188,10 @@ def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: 
 
 
 def frames_per_second(trainer: Trainer) -> Cost:
-    """Rendered frames a second over the views of the scene, after a warm-up.
+    """Measure the rendered frames per second over the views of the scene, after a warm-up.
 
     Returns:
-        fps, the median of several rounds, and fps_low and fps_high, the slowest and the fastest of them.
+        fps, the median of several rounds, and fps_low and fps_high, the slowest and the fastest round.
     """
     cameras = [v.camera for v in (trainer.data.scene.test or trainer.data.scene.train)]
     with torch.no_grad():

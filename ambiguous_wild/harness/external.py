@@ -1,4 +1,4 @@
-"""Run an external method as a cell: its program trains and renders, its files are measured as any other."""
+"""Run an external method as a cell: its program trains and renders, its files are measured like any run's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ import torch
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.cell import Cell
-from ambiguous_wild.harness.choosing import NOT_OURS
+from ambiguous_wild.harness.chosen_effects import NOT_OURS
 from ambiguous_wild.harness.meter import Meter, cores, own_s
 from ambiguous_wild.harness.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.files import atomic_path
@@ -29,7 +29,7 @@ from ambiguous_wild.splat.rendered import Rendered
 
 
 def run_program(cell: Cell, folder: Path) -> RunResult:
-    """Run the method's program and measure what it left; the result as in metrics.json.
+    """Run the method's program, measure its files and return the result as in metrics.json.
 
     Raises:
         AwError: the program failed, or a picture is missing, no 8-bit PNG, or of another size.
@@ -86,10 +86,10 @@ def check_program(cell: Cell) -> None:
 
 
 def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
-    """Run the program between two calibrations; its output, and what is known of its time.
+    """Run the program between two calibrations; return its output and the cost of its time.
 
-    Nothing is known where its training ended before this call, or where the kernel cannot run here: a program
-    has packages of its own.
+    The cost is empty where the program's training ended before this call, or where the calibration kernel
+    cannot run: a program needs none of our packages.
     """
     meter, begin, before = Meter(task.device, cores()), time.perf_counter(), own_s()
     try:
@@ -117,7 +117,7 @@ class _Files:
     """The pictures that the program wrote."""
 
     def __init__(self, truth: list[evaluate.TestPhoto], renders: Mapping[str, Path]) -> None:
-        # Every view has a camera object of its own, which identifies the view.
+        # every view has its own camera object, which identifies the view
         self.paths = {id(t.view.camera): (t.view, renders[t.view.name]) for t in truth}
 
     def render(self, camera: Camera) -> _Picture:
@@ -126,7 +126,7 @@ class _Files:
         return _Picture(torch.from_numpy(read_png_rgb(path).astype(np.float32) / 255.0))
 
     def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
-        """The plain render: effects of a program cannot be fitted here."""
+        """Return the plain render: the effects of a program cannot be fitted here."""
         return self.render(camera).image
 
 
@@ -139,34 +139,32 @@ class _Splats:
             AwError: the file of splats cannot be read.
         """
         assert produced.ply is not None
-        known: dict[str, Any] = {
-            name: torch.from_numpy(values) for name, values in read_splat_ply(produced.ply).items()
-        }
-        self.gaussians = Gaussians(**known).to(device)
+        tensors = {name: torch.from_numpy(a) for name, a in read_splat_ply(produced.ply).items()}
+        self.gaussians = Gaussians(**tensors).to(device)  # type: ignore[arg-type]
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendered:
         return render(self.gaussians, camera, sh_degree=self.gaussians.sh_degree)
 
     def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
-        """The plain render: splats have no colours of a photo."""
+        """Return the plain render: splats have no colour effects that could be fitted."""
         return self.render(camera).image
 
 
 def _check_picture(view: View, path: Path, what: str) -> None:
-    """Raise AwError unless the file is a PNG of 8 bits at the size of the view."""
+    """Raise AwError unless the file is an 8-bit PNG of the view's size."""
     with open(path, "rb") as f:
         head = f.read(25)
     if head[:8] != b"\x89PNG\r\n\x1a\n":
-        raise AwError(f"{what} {path} is no PNG: what is measured must not have lost anything on the way")
+        raise AwError(f"{what} {path} is no PNG: only files without compression loss are measured")
     if head[24] != 8:
-        raise AwError(f"{what} {path} has {head[24]} bits a channel; write 8, as every method does")
+        raise AwError(f"{what} {path} has {head[24]} bits per channel; write 8, as every method does")
     width, height = image_size(path)
     if (width, height) != (view.camera.width, view.camera.height):
         raise AwError(
             f"{what} {path} is {width}x{height}, its photo {view.name} {view.camera.width}x"
-            f"{view.camera.height}: nothing is resized, so let the program work at that size ({{images}}, "
-            "{factor}) or run with --factor"
+            f"{view.camera.height}: pictures are not resized, so let the program work at that size "
+            "({images}, {factor}) or run with --factor"
         )
 
 
@@ -185,7 +183,7 @@ def _masks(scene: Scene, masks: Mapping[str, Path], folder: Path) -> MaskScores 
 
 
 def _model(cell: Cell, produced: Produced, folder: Path) -> dict[str, float]:
-    """Number and size of the splats, which become point_cloud.ply of the run."""
+    """Make the splats the run's point_cloud.ply; return their number and the size of the file."""
     if produced.ply is None:
         return {}
     target = folder / "point_cloud.ply"

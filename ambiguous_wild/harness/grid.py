@@ -18,7 +18,7 @@ from ambiguous_wild.harness.cell import (
     RunOptions,
     scene_identity,
 )
-from ambiguous_wild.harness.choosing import (
+from ambiguous_wild.harness.chosen_effects import (
     Chosen,
     check_wanted,
     chosen_by,
@@ -45,13 +45,13 @@ from ambiguous_wild.splat.parts import Parts
 
 
 def try_recipes(cells: Sequence[Cell]) -> list[str]:
-    """Put every method's parts together once: the last method's fault is found before the first is trained.
+    """Build the parts of every method once, so that a faulty last method is found before the first trains.
 
     Returns:
-        What they start from with `--start`, a line for each scene.
+        A line for each method and scene on the file that they start from (`--start`).
 
     Raises:
-        AwError: an option or the weights that a recipe refuses. Other errors are a run's own.
+        AwError: a recipe refuses an option, or its weights are missing. Other errors are left to the runs.
     """
     from ambiguous_wild.splat.effects import with_effects
 
@@ -72,10 +72,10 @@ def try_recipes(cells: Sequence[Cell]) -> list[str]:
 
 
 def check_grafts(cells: Sequence[Cell]) -> list[str]:
-    """Warnings of grafts, each once.
+    """Return the warnings about grafted methods, each once.
 
     Raises:
-        AwError: a graft that could not train, or would change nothing.
+        AwError: a graft could not train, or would change nothing.
     """
     from ambiguous_wild.methods.graft import check_graft
 
@@ -89,7 +89,7 @@ def check_grafts(cells: Sequence[Cell]) -> list[str]:
 
 
 def plan_cells(
-    methods: Sequence[str],
+    methods: Sequence[str | MethodEntry],
     scenes: Sequence[Path],
     seeds: Sequence[int],
     train: TrainConfig,
@@ -103,28 +103,28 @@ def plan_cells(
     start: Path | None = None,
     probing: Probing | None = None,
 ) -> list[Cell]:
-    """Every method on every scene with every seed; all names and options are checked before any training.
+    """Plan every method on every scene with every seed, after a check of all names and options.
 
     Args:
-        methods: names of `aw methods`.
+        methods: names of `aw methods`, or their entries.
         scenes: scene folders.
         seeds: seeds of training.
         train: length and bookkeeping; its seed is replaced.
         settings: "method.key=value" strings.
         device: "cpu" or "cuda".
-        factor: which images_N; None = what the scene was built for.
+        factor: N of the folder images_N; None = the one that the scene was built for.
         effects: "none", "all", "auto" or names of effects; the same for all methods that can take them.
-        plan: of the one scene, where it was made before; None = made where one is needed.
+        plan: plan of the only scene, if it was made before; None = made where one is needed.
         protocol: "full" measures whole test photos, "half" the right half; None = what scene.json says.
         start: a splat file or point cloud to start from; None = the scene's points.
-        probing: for plans that are made; None = the limits decide alone.
+        probing: how plans are made from probes; None = the limits decide alone.
 
     Raises:
         AwError: unknown method, option or scene; a start that no camera sees; two scenes of the same name.
     """
-    named = _named(methods)
+    named = _by_name(methods)
     by_method = _settings_by_method(settings, list(named.values()))
-    resolved = [  # before a plan is made: that trains
+    resolved = [  # options are checked before a plan is made: making one trains
         (entry, with_options(entry.options(), by_method[name], f"option of {entry.name}"))
         for name, entry in named.items()
     ]
@@ -145,7 +145,10 @@ def plan_cells(
         )
     file = None if start is None else start_file(start)
     if file and (programs := [name for name, entry in named.items() if not takes_effects(entry)]):
-        raise AwError(f"--start {start}: {', '.join(programs)} starts by itself; bench it without")
+        raise AwError(
+            f"--start {start}: the external program {', '.join(programs)} cannot start from a file; bench it "
+            "without --start"
+        )
     for scene in loaded:
         started(Parts(), file, scene)
     cells = []
@@ -162,10 +165,11 @@ def plan_cells(
     return cells
 
 
-def _named(methods: Sequence[str]) -> dict[str, MethodEntry]:
-    """The methods by name, each once: a graft may be written two ways, and so may a path."""
+def _by_name(methods: Sequence[str | MethodEntry]) -> dict[str, MethodEntry]:
+    """Return the methods by name, each once: a graft, or a path, may be written in two ways."""
     named: dict[str, MethodEntry] = {}
-    for entry in map(get_method, methods):
+    for method in methods:
+        entry = get_method(method) if isinstance(method, str) else method
         other = named.setdefault(entry.name, entry)
         if other.source_hash != entry.source_hash:
             raise AwError(f"two methods are called {entry.name}: their runs would share a folder; rename one")
@@ -179,19 +183,19 @@ def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry])
         method, dot, option = key.partition(".")
         if not equals or not dot:
             raise AwError(f"--set {setting!r}: write METHOD.KEY=VALUE, e.g. refinesplat.lambda_cr=0.1")
-        reached = False
+        applied = False
         for entry in entries:
             keys = entry.option_keys(method, option)
             grouped[entry.name] |= dict.fromkeys(keys, value)
-            reached = reached or bool(keys)
-        if not reached:
-            known = {entry.name for entry in entries} | {name for e in entries for _, name in e.places}
-            raise unknown("method in --set", method, known)
+            applied = applied or bool(keys)
+        if not applied:
+            names = {entry.name for entry in entries} | {name for e in entries for _, name in e.places}
+            raise unknown("method in --set", method, names)
     return grouped
 
 
 def cell_folder(output: Path, cell: Cell) -> Path:
-    """OUTPUT/[<group>/]<scene>/<method>/seed<k>."""
+    """Return the run folder OUTPUT/[<group>/]<scene>/<method>/seed<k>."""
     return output / cell.group / cell.scene.name / cell.method.name / f"seed{cell.train.seed}"
 
 
@@ -206,10 +210,10 @@ def run_cells(
     on_start: Callable[[Cell, Path], None] | None = None,
     on_end: Callable[[Cell, CellReport], None] | None = None,
 ) -> list[CellReport]:
-    """Run what is missing; a cell's error becomes its result and the next cell goes on.
+    """Run the unfinished cells one after another; an error of one is its outcome and does not stop others.
 
     Raises:
-        AwError: a run folder holds another configuration (found before anything is trained).
+        AwError: a run folder holds another configuration; checked before anything is trained.
     """
     options = RunOptions(cache_dir or output / ".cache", overwrite, pictures)
     reports = []
@@ -224,10 +228,10 @@ def run_cells(
 
 
 def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) -> list[Path]:
-    """The run folder of every cell; all are checked first.
+    """Return the run folder of every cell, after a check of all of them.
 
     Raises:
-        AwError: one holds another configuration or no run of ours, or nothing can be written there.
+        AwError: a folder holds another configuration or foreign files, or cannot be written.
     """
     folders = [cell_folder(output, cell) for cell in cells]
     for cell, folder in zip(cells, folders):
@@ -236,18 +240,18 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
             if not made_anew(folder, options.overwrite, cell.config):
                 refuse_other_config(folder, cell)
     for needed in (output, options.cache_dir):
-        check_output(needed / "run")  # what cannot be written is found before it is needed
+        check_output(needed / "run")  # a folder that cannot be written is found before the training
     return folders
 
 
 def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = ()) -> list[Cell]:
-    """Every cell with every budget, the shortest budget first, with the name of its group.
+    """Combine every cell with every budget, shortest first, and name the group of each.
 
-    A single budget or choice of effects gets no folder of its own.
+    Where there is a single budget or choice of effects, it gets no folder of its own.
 
     Args:
-        planned: cells by the effects they were asked for.
-        budgets_s: seconds of training; empty = as the cells have it.
+        planned: cells by the effects that were asked for.
+        budgets_s: seconds of training; empty = the cells keep their length.
     """
     cells = []
     lengths: list[float | None] = [*sorted(set(budgets_s))]
@@ -255,37 +259,40 @@ def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = 
         for effects, members in planned.items():
             group = [f"budget-{seconds:g}s"] if len(lengths) > 1 else []
             group += [f"effects-{effects.replace(' ', '').replace(',', '+')}"] if len(planned) > 1 else []
-            cells += [_moved(cell, seconds, "/".join(group)) for cell in members]
+            cells += [_in_group(cell, seconds, "/".join(group)) for cell in members]
     return cells
 
 
-def _moved(cell: Cell, seconds: float | None, group: str) -> Cell:
+def _in_group(cell: Cell, seconds: float | None, group: str) -> Cell:
     train = cell.train if seconds is None else dataclasses.replace(cell.train, budget_s=seconds)
     return dataclasses.replace(cell, train=train, group=group)
 
 
 def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
-    """The cells that will be run: not those that are kept."""
+    """Return the cells that will be run, without those that are kept or skipped."""
     return [cell for cell in cells if left_alone(cell_folder(output, cell), overwrite, cell.config) is None]
 
 
 def expected_line(cells: Sequence[Cell]) -> str:
-    """What runs whose length nobody chose take on this machine's CPU; kernels must be compiled."""
+    """Return a line with the expected time of runs of the default length on this machine's CPU.
+
+    The kernels must be compiled.
+    """
     total, slower = 0.0, slowness()
     for cell in cells:
         camera = cell.scene.train[0].camera
         pixels = camera.width * camera.height
-        most = min(cell.train.max_gaussians or pixels, pixels)
-        total += expected_s(cell.train.iterations, pixels, most) * slower
+        gaussians = min(cell.train.max_gaussians or pixels, pixels)
+        total += expected_s(cell.train.iterations, pixels, gaussians) * slower
     runs = "1 run" if len(cells) == 1 else f"{len(cells)} runs"
     return (
-        f"no --iterations and no --budget: {runs} of {cells[0].train.iterations} iterations, "
-        f"{_words(LEAST * total)} to {_words(MOST * total)} for 3dgs here, other methods up to 3 times that; "
-        "--budget 10m ends each after ten minutes"
+        f"no --iterations and no --budget: {runs} of {cells[0].train.iterations} iterations take "
+        f"{_duration(LEAST * total)} to {_duration(MOST * total)} with 3dgs on this machine, up to 3 times "
+        "as long with other methods; --budget 10m ends each after ten minutes"
     )
 
 
-def _words(seconds: float) -> str:
+def _duration(seconds: float) -> str:
     if seconds < 5400:
         return f"{max(round(seconds / 60), 1)} min"
     return f"{seconds / 3600:.1f} h"
@@ -293,12 +300,12 @@ def _words(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class Probing:
-    """How a plan is made from probes: for which run, and where they are kept."""
+    """How a plan is made from probes: for runs of which length, and where the probes are kept."""
 
     train: TrainConfig  # length of the runs
-    folder: Path
-    prepare: Callable[[], None]  # makes the CPU kernels ready
-    say: Callable[[str], None]  # told every decision
+    folder: Path  # of the probes
+    prepare: Callable[[], None]  # compiles the CPU kernels
+    say: Callable[[str], None]  # gets a line for every decision
 
 
 def choose(
@@ -308,17 +315,17 @@ def choose(
     plan: Plan | None = None,
     probing: Probing | None = None,
 ) -> dict[str, Chosen]:
-    """What every method trains with on this scene, by its name.
+    """Return the effects that every method trains with on this scene, by the method's name.
 
     Args:
-        wanted: as `--effects` takes it; for all methods but external programs, which take no effects.
+        wanted: the value of `--effects`, for all methods except external programs, which take no effects.
         scene: the scene.
         methods: the methods.
-        plan: made before; None = made now if any method needs it.
-        probing: for a plan that is made now; None = the limits decide alone.
+        plan: a plan made before; None = made now if any method needs it.
+        probing: how a plan is made now; None = the limits decide alone.
 
     Raises:
-        AwError: unknown effect, or a plan of another scene.
+        AwError: an effect is unknown, or the plan is of another scene.
     """
     named = check_wanted(wanted)
     if plan is not None and plan.scene != scene.name:
@@ -328,8 +335,8 @@ def choose(
         return {m.name: asked if takes_effects(m) else Chosen() for m in methods}
     if plan is None and any(map(takes_effects, methods)):
         plan = _make_plan(scene, probing)
-    found = () if plan is None else plan.effects()
-    chosen = {m.name: chosen_by(found, scene, m) for m in methods}
+    effects = () if plan is None else plan.effects()
+    chosen = {m.name: chosen_by(effects, scene, m) for m in methods}
     return {name: dataclasses.replace(c, plan=plan if c.asked else None) for name, c in chosen.items()}
 
 

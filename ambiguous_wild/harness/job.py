@@ -1,8 +1,8 @@
-"""A job: a cell as plain values, which another process or machine turns into the cell again and runs.
+"""A job is a cell as plain values, from which another process or machine makes the cell again and runs it.
 
-A `Cell` holds code (a method's recipe) and an opened scene. What travels is how to get them: names, options,
-paths and the sources of plugins. Whoever runs it compares the identity of what it made with the one it was
-sent, so that another version of the code, of a plugin or of the scene is an error and never a number.
+A `Cell` holds code (a method's recipe) and an opened scene, which cannot be sent. A job holds the names,
+options, paths and sources of plugins to make them again. The receiver compares the identity of its cell
+with the one in the job: another version of the code, a plugin or the scene is an error, not a wrong result.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
-from ambiguous_wild.harness.choosing import Chosen
+from ambiguous_wild.harness.chosen_effects import Chosen
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
 from ambiguous_wild.harness.run import error_line, run_cell
@@ -38,7 +38,7 @@ LOCK_WAIT_S = 150.0
 
 @dataclass(frozen=True)
 class Source:
-    """Code that a run needs: a plugin, metrics, or a reference such as ``recipe.py:my_recipe``."""
+    """Code that a run needs: a plugin, metrics, or a method given as ``recipe.py:my_recipe``."""
 
     text: str  # the reference as typed, or the file's path
     kind: str  # "plugin", "metric" or "method"
@@ -48,7 +48,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Job:
-    """How to make a cell again, and how to run it."""
+    """The values to make a cell again and run it."""
 
     config: RunConfig
     chosen: Chosen
@@ -57,19 +57,19 @@ class Job:
     folder: str  # absolute path of the run folder
     options: RunOptions
     sources: tuple[Source, ...]
-    threads: int | None  # of the CPU kernels; None = as many as there are
+    threads: int | None  # of the CPU kernels; None = all cores
     code: str  # `code_hash` of the sender
-    token: str = ""  # a file that the runner must see, see `check_storage`
+    token: str = ""  # path of a file that the receiver must see, see `check_storage`
 
 
 def read_sources(
     plugins: Sequence[str | Path], methods: Sequence[str], metrics: Sequence[str | Path] = ()
 ) -> tuple[Source, ...]:
-    """The code of plugins, and of methods and metrics given as files; names of `aw methods` need none."""
+    """Read the code of plugins, and of methods and metrics given as files; other methods need none."""
     sources = [_source(str(path), "plugin", Path(path)) for path in plugins]
     sources += [_source(str(path), "metric", Path(path)) for path in metrics]
     for name in methods:
-        # A graft may have a reference as its host.
+        # the host of a graft may be a reference
         host, _ = split_graft(trained_once(name))
         file = reference_file(host)
         if file is not None:
@@ -90,7 +90,7 @@ def make_job(
     sources: tuple[Source, ...] = (),
     threads: int | None = None,
 ) -> Job:
-    """The job of a cell whose method `get_method` finds once the sources are loaded."""
+    """Return the job of a cell; `get_method` must find its method once the sources are loaded."""
     config, scene = cell.config, str(cell.scene.root.resolve())
     options = RunOptions(options.cache_dir.absolute(), options.overwrite, options.pictures)
     identity, place = cell.identity, str(folder.absolute())
@@ -98,7 +98,7 @@ def make_job(
 
 
 def run_job(job: Job) -> CellReport:
-    """Make the cell and run it as `aw bench` does in one process; every error is a report."""
+    """Make the cell and run it as `aw bench` does in one process; every error becomes a report."""
     from ambiguous_wild.splat import readiness
     from ambiguous_wild.splat.calibration import prepare_cpu
 
@@ -118,15 +118,15 @@ def run_job(job: Job) -> CellReport:
 
 
 def make_cell(job: Job) -> Cell:
-    """The cell that the job describes.
+    """Make the cell that the job describes.
 
     Raises:
-        AwError: this process runs other code than the sender, or something on the way differs there.
+        AwError: the code, the scene or a file of the method differs from that of the sender.
     """
     if job.code != code_hash():
         raise AwError(
-            "here is another state of ambiguous_wild than on the machine that sent the run: "
-            "install the same on every node"
+            "the code of ambiguous_wild differs from that on the machine that sent the run: "
+            "install the same version on every node"
         )
     for source in job.sources:
         _load(source)
@@ -154,29 +154,29 @@ def make_cell(job: Job) -> Cell:
 
 
 def check_storage(job: Job, wait_s: float = 30.0) -> None:
-    """Make sure that this machine sees the folder that results go to.
+    """Check that this machine shares the output folder with the sender.
 
     Raises:
-        AwError: it does not see the file that the sender left there.
+        AwError: the file that the sender left in that folder is not visible.
     """
     deadline = time.monotonic() + wait_s
-    while job.token and not Path(job.token).exists():  # NFS remembers for seconds what was not there
+    while job.token and not Path(job.token).exists():  # NFS caches for seconds that a file is absent
         if time.monotonic() > deadline:
             raise AwError(
-                f"it does not see {Path(job.token).parent}: give a folder on storage that all "
-                "nodes share as -o, or send scenes and results with --transfer store"
+                f"this node cannot see {Path(job.token).parent}: give -o a folder on storage that all "
+                "nodes share, or send scenes and results with --transfer store"
             )
         time.sleep(1.0)
 
 
 def record_lost(cell: Cell, folder: Path, error: str) -> CellReport:
-    """Write failed.json for a run whose process died; its checkpoints stay, so that it can go on."""
+    """Write failed.json for a run whose process died; its checkpoint stays, so that it can be resumed."""
     try:
         with folder_lock(folder, "aw bench"):
             if folder.is_dir() and not (folder / RESULT).exists():
                 write_result(folder / FAILED, cell.result(error=error))
     except (AwError, OSError):
-        pass  # the report below has the error in any case
+        pass  # the report has the error in any case
     return CellReport(folder, "failed", error=error)
 
 
@@ -184,7 +184,7 @@ def _load(source: Source) -> None:
     if not source.path:
         load_reference(source.text)
         return
-    path = _present(source)
+    path = _local_file(source)
     if source.kind == "plugin":
         load_plugin(path)
     elif source.kind == "metric":
@@ -194,10 +194,10 @@ def _load(source: Source) -> None:
 
 
 @functools.cache
-def _present(source: Source) -> Path:
-    """The source's own file where this machine has it, else a copy."""
+def _local_file(source: Source) -> Path:
+    """Return the source's own file where this machine has it unchanged, else a copy."""
     path = Path(source.path)
-    with contextlib.suppress(OSError):  # another user's, or not there
+    with contextlib.suppress(OSError):  # the file is absent, or another user's
         if path.read_bytes() == source.content:
             return path
     copy = Path(tempfile.mkdtemp(prefix="aw-source-")) / path.name
@@ -207,5 +207,5 @@ def _present(source: Source) -> Path:
 
 @functools.lru_cache(maxsize=4)
 def _scene(path: str, factor: int | None) -> Scene:
-    # The sender has compared every hash; a copy with other sizes or another scene.json is found all the same.
+    # The sender has compared every hash; "quick" still finds a copy with other sizes or another scene.json.
     return load_scene(path, factor=factor, verify="quick")

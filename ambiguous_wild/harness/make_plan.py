@@ -1,12 +1,11 @@
-"""A plan from evidence: limits as the first guess, then paired probes within a tenth of the run.
+"""Make the plan of a scene: decide by limits first, then by paired probes that take a tenth of the run.
 
-Paired probes: does an effect pay on pixels that were left out of training?
+A pair of probes shows whether an effect improves pixels that were left out of training: two short trainings
+differ in that effect alone. Both leave out the same blocks of every train photo and see the same photos in
+the same order. In the second half of a training every visit of a photo measures its blocks.
 
-Two short trainings differ in one effect. Both leave out the same blocks of every train photo and see the same
-photos in the same order. In the second half every visit of a photo measures its blocks before it is learnt.
-
-The Gaussians stay those of the sparse model, because growth is chaotic: with it, two seeds of one probe
-differed by 1.9 dB in what antialiasing gives, without it by 0.02 dB.
+Probes neither add nor remove Gaussians, because growth is chaotic: with growth, two seeds of one probe
+differed by 1.9 dB in the gain of antialiasing, without it by 0.02 dB.
 """
 
 from __future__ import annotations
@@ -63,15 +62,15 @@ from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
 
-MOST_PHOTOS = 60  # evenly spaced ones are tried on: 300 iterations visit each five times
-HELD_BACK = 0.2  # of a photo's blocks
-BLOCKS = 8  # along a photo's longest side
-MEASURED_FROM = 0.5  # of a probe
+MOST_PHOTOS = 60  # evenly spaced photos of a probe: 300 iterations visit each five times
+HELD_BACK = 0.2  # share of a photo's blocks that is left out
+BLOCKS = 8  # number along a photo's longest side
+MEASURED_FROM = 0.5  # share of a probe after which visits measure
 FIXED = DensityConfig(start=1e9, stop=0.0)
 
 
 class HeldBack(MaskPolicy):
-    """Leaves blocks of every photo out of the loss and measures the render there."""
+    """Leave blocks of every photo out of the loss and measure the render there."""
 
     def __init__(
         self,
@@ -84,15 +83,15 @@ class HeldBack(MaskPolicy):
     ) -> None:
         """
         Args:
-            blocks: of every train photo, [H, W] bool, True = left out.
-            cameras: of the train photos as they were given.
-            posed: poses are refined; a test view's are not, so the blocks are drawn from the given camera.
-            patches: of every train photo, [H, W] bool: these pixels are not measured.
-            masked: nor are they trained on.
+            blocks: a map for every train photo, [H, W] bool, True = left out.
+            cameras: the given cameras of the train photos.
+            posed: poses are refined; then the blocks are measured from the given camera, like a test view.
+            patches: a map for every train photo, [H, W] bool: these pixels are not measured.
+            masked: leave the patches out of the loss too.
         """
-        seen = blocks if patches is None else [block & ~patch for block, patch in zip(blocks, patches)]
+        measured = blocks if patches is None else [block & ~patch for block, patch in zip(blocks, patches)]
         left_out = [b | p for b, p in zip(blocks, patches)] if masked and patches is not None else blocks
-        self.measured, self.keeps = seen, [(~pixels).float() for pixels in left_out]
+        self.measured, self.keeps = measured, [(~pixels).float() for pixels in left_out]
         self.cameras, self.posed = cameras, posed
         self.visits: dict[int, list[float]] = {}  # PSNR in dB by view
 
@@ -106,23 +105,20 @@ class HeldBack(MaskPolicy):
 
 
 def held_back(data: TrainData, seed: int) -> list[Tensor]:
-    """Blocks [H, W] bool of every photo, at random; never where the capture's own mask lies."""
-    found = []
+    """Choose blocks of every photo at random, [H, W] bool; never where the capture's own mask lies."""
+    maps = []
     for view, (photo, keep) in enumerate(zip(data.photos, data.user_keep)):
         height, width = photo.shape[:2]
         side = max(max(height, width) // BLOCKS, 1)
         drawn = np.random.default_rng([seed, 0x68, view]).random((-(-height // side), -(-width // side)))
         chosen = drawn <= np.quantile(drawn, HELD_BACK)
         blocks = torch.from_numpy(np.kron(chosen, np.ones((side, side), bool))[:height, :width])
-        found.append(blocks if keep is None else blocks & (keep > 0.5))
-    return found
+        maps.append(blocks if keep is None else blocks & (keep > 0.5))
+    return maps
 
 
 def sampled(scene: Scene) -> tuple[Scene, list[int]]:
-    """The scene with `MOST_PHOTOS` train photos at most, and their places in `scene.train`.
-
-    The others are not read.
-    """
+    """Return the scene with at most `MOST_PHOTOS` train photos, and their indices in `scene.train`."""
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
     if len(train) <= MOST_PHOTOS:
         return scene, list(range(len(train)))
@@ -136,7 +132,7 @@ def sampled(scene: Scene) -> tuple[Scene, list[int]]:
 
 
 def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> Points:
-    """The sparse points without what they say of held-back pixels: effects start from colours at points."""
+    """Return the points without observations in held-back pixels, from whose colours effects would start."""
     points, views = scene.points, scene.points.track_views.copy()
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
     for index, block in zip(train, blocks):
@@ -150,14 +146,14 @@ def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> Points:
 
 
 class Trials:
-    """Photos and blocks of one scene, on which arms are trained."""
+    """The photos and blocks of one scene, on which probes are trained."""
 
     def __init__(self, scene: Scene, folder: Path, *, seed: int = 0) -> None:
         """
         Args:
             scene: the scene.
-            folder: for temporary files.
-            seed: of the blocks and of training.
+            folder: folder for temporary files.
+            seed: seed of the blocks and of training.
         """
         scene, self.chosen = sampled(scene)
         data = small_data(scene, folder, seed)
@@ -175,17 +171,17 @@ class Trials:
         masked: bool = False,
         tick: Callable[[], object] | None = None,
     ) -> ProbeResult:
-        """Train one arm.
+        """Train one probe.
 
         Args:
-            effects: that are on.
-            iterations: of the probe.
+            effects: the effects that are on.
+            iterations: length of the probe.
             patches, masked: see `HeldBack`.
             tick: called after every iteration.
         """
         posed, cameras = "poses" in effects, self.data.cameras
         policy = HeldBack(self.blocks, cameras, posed=posed, patches=patches, masked=masked)
-        # "images" blanks both pictures outside: no window of SSIM reaches into the blocks
+        # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
         parts = dataclasses.replace(Parts(), mask=policy, density_config=FIXED, weighting="images")
         config = TrainConfig(iterations=iterations, seed=self.seed, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(self.data, with_effects(parts, effects), config, folder=self.folder)
@@ -196,14 +192,12 @@ class Trials:
 
         trainer.train(tick=after)
         names = [view.name for view in self.data.scene.train]
-        return ProbeResult(
-            {names[view]: float(np.mean(found)) for view, found in sorted(policy.visits.items())}
-        )
+        return ProbeResult({names[view]: float(np.mean(dbs)) for view, dbs in sorted(policy.visits.items())})
 
 
 SHARE = 0.1
-LONGEST_ARM, SHORTEST_ARM = 300, 100  # iterations; a shorter probe tells no effect from noise
-TIMED = (TIMED_ROUNDS + 1) * TIMED_STEPS  # iterations that time an effect, and as many without any
+LONGEST_ARM, SHORTEST_ARM = 300, 100  # iterations; a shorter probe cannot separate an effect from noise
+TIMED = (TIMED_ROUNDS + 1) * TIMED_STEPS  # iterations to time an effect, and as many without any
 ARMS_OF_MASKS = 2
 
 
@@ -213,10 +207,10 @@ class Allowance:
 
     run_s: float
     arm_step_s: float  # of a paired probe
-    grown_step_s: float  # of the probe of masks, whose Gaussians grow
+    grown_step_s: float  # of the probe for masks, in which Gaussians grow
 
     def arm_iterations(self, arms: int, spent_s: float = 0.0) -> int:
-        """Iterations of each of so many paired probes; 0 where the run is too short for them."""
+        """Return the iterations of each paired probe if there are `arms`; 0 if the run is too short."""
         if arms == 0:
             return 0
         most = int((SHARE * self.run_s - spent_s) / (arms * self.arm_step_s) + 1e-9) - TIMED
@@ -224,23 +218,23 @@ class Allowance:
 
     @property
     def masks_s(self) -> float:
-        """What deciding about masks takes at most."""
+        """Largest time that deciding about masks can take, in reference seconds."""
         paired = ARMS_OF_MASKS * LONGEST_ARM * self.arm_step_s
         return (ITERATIONS + SETTLED) * self.grown_step_s + paired
 
     @property
     def masks_fit(self) -> bool:
-        """Whether the run is long enough to decide about masks."""
+        """True if the run is long enough to decide about masks."""
         return self.masks_s <= SHARE * self.run_s
 
     def share(self, arm_iterations: int, grown_iterations: int = 0) -> float:
-        """Expected share of the run."""
+        """Return the expected share of the run that these iterations take."""
         spent = arm_iterations * self.arm_step_s + grown_iterations * self.grown_step_s
         return spent / self.run_s
 
 
 def allowance(scene: Scene, train: TrainConfig) -> Allowance:
-    """Of a run of that length; under a budget the kernels must be compiled.
+    """Compute the allowance of a run; if it has a budget, the kernels must be compiled.
 
     Args:
         scene: the scene, at the size that is trained on.
@@ -258,28 +252,28 @@ def allowance(scene: Scene, train: TrainConfig) -> Allowance:
     return Allowance(run_s, arm, grown)
 
 
-VERSION = 1  # of the probes: another one does not read what an earlier one kept
-SEED = 0  # a decision is the scene's: all seeds of a grid train with the same effects
-TOO_SHORT = "a tenth of the run is too short for probes"
+VERSION = 1  # of the probes; saved probes of another version are not read
+SEED = 0  # fixed: all seeds of a grid train with the same effects
+TOO_SHORT = "probes may take a tenth of the run, which is too short for them"
 
 Bar = Callable[..., AbstractContextManager[Any]]
 
 
 @contextlib.contextmanager
 def no_bar(total: int) -> Iterator[Any]:
-    """For those who show no progress."""
+    """A progress bar that shows nothing."""
     yield SimpleNamespace(update=lambda: None)
 
 
-class Kept:
-    """Probes of one scene in a file, so that a plan that was interrupted or is made again goes on."""
+class SavedProbes:
+    """The probes of one scene in a file, so that an interrupted plan, or one made again, reuses them."""
 
     def __init__(self, scene: Scene, length: Mapping[str, float], folder: Path) -> None:
         """
         Args:
             scene: the scene.
-            length: what says how long the probes are.
-            folder: of the file.
+            length: the settings that decide how long the probes are.
+            folder: folder of the file.
         """
         self.key = config_hash(
             {
@@ -292,8 +286,8 @@ class Kept:
         )
         self.path = folder / f"{scene.name}-{self.key[:12]}.json"
         self.iterations: int | None = None  # of a probe
-        self.arms: dict[str, ProbeResult] = {}
-        self.costs: dict[str, float] = {}  # ms an iteration
+        self.arms: dict[str, ProbeResult] = {}  # by the names of their effects
+        self.costs: dict[str, float] = {}  # extra ms per iteration, by effect
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
             rows = json.loads(self.path.read_text(encoding="utf-8"))
             if rows["key"] == self.key:
@@ -305,21 +299,21 @@ class Kept:
                 )
 
     def write(self) -> None:
-        """Keep what there is."""
+        """Write the probes made so far."""
         arms = {name: dict(arm.psnr) for name, arm in self.arms.items()}
         rows = {"key": self.key, "iterations": self.iterations, "costs": self.costs, "arms": arms}
         write_json(self.path, rows)
 
 
-def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
+def _numbers(row: Mapping[str, float]) -> dict[str, float]:
     return {name: float(value) for name, value in row.items()}
 
 
 def plan(scene: Path | str, *, iterations: int = TrainConfig.iterations) -> Plan:
-    """Which effects the scene in a folder needs in runs of this length: what `aw plan` does."""
+    """Decide which effects a scene needs in runs of this length, as `aw plan` does."""
     loaded, train = load_scene(scene), TrainConfig(iterations=iterations)
-    with tempfile.TemporaryDirectory(prefix="aw-plan-") as kept:
-        return plan_with_probes(loaded, train, Path(kept), masks=True, prepare=lambda: prepare_cpu(None))
+    with tempfile.TemporaryDirectory(prefix="aw-plan-") as folder:
+        return plan_with_probes(loaded, train, Path(folder), masks=True, prepare=lambda: prepare_cpu(None))
 
 
 def plan_with_probes(
@@ -332,16 +326,16 @@ def plan_with_probes(
     say: Callable[[str], None] = lambda text: None,
     bar: Bar = no_bar,
 ) -> Plan:
-    """The limits' decisions, tried where they call for something and the run is long enough.
+    """Decide by limits, then probe the effects that exceed them if the run is long enough.
 
     Args:
         scene: the scene.
         train: length of the run that the plan is for.
-        folder: where probes are kept.
+        folder: where probes are saved.
         masks: decide about masks too.
-        prepare: makes the CPU kernels ready; called if anything is probed.
-        say: told every decision.
-        bar: called with total=iterations, a context whose `update` counts one; tqdm is one.
+        prepare: compiles the CPU kernels; called before the first probe.
+        say: gets a line for every decision.
+        bar: called with total=iterations, returns a context whose `update` counts one, such as tqdm.
 
     Raises:
         AwError: a photo cannot be read.
@@ -352,52 +346,52 @@ def plan_with_probes(
         return plan
     prepare()
     begin = time.perf_counter()
-    room = allowance(scene, train)
-    if masks and not room.masks_fit:
+    allowed = allowance(scene, train)
+    if masks and not allowed.masks_fit:
         say(f"{scene.name}: masks not tried: {TOO_SHORT}")
-    masks = masks and room.masks_fit
-    spent_s = room.masks_s if masks else 0.0
+    masks = masks and allowed.masks_fit
+    spent_s = allowed.masks_s if masks else 0.0
     paired = grown = 0
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
         bench = _Bench(scene, Path(name), bar)
         if names:
-            length = room.arm_iterations(len(names) + 1, spent_s)
-            # how fast the machine is now must not decide when a run under a budget goes on
-            known = {"iterations": length} if train.budget_s is None else {"budget_s": train.budget_s}
-            kept = Kept(scene, known, folder)
-            if kept.iterations is None:
-                kept.iterations = length
-            plan, paired = _with_effects(plan, names, kept, bench, say)
+            length = allowed.arm_iterations(len(names) + 1, spent_s)
+            # under a budget, `length` depends on the speed of the machine now: it must not be part of the key
+            key = {"iterations": length} if train.budget_s is None else {"budget_s": train.budget_s}
+            saved = SavedProbes(scene, key, folder)
+            if saved.iterations is None:
+                saved.iterations = length
+            plan, paired = _with_effects(plan, names, saved, bench, say)
         if masks:
             plan, more, grown = _with_masks(plan, scene, bench, say, bar)
             paired += more
-    share = room.share(paired, grown)
+    share = allowed.share(paired, grown)
     return dataclasses.replace(plan, cost=_cost(paired + grown, begin, share) if paired + grown else None)
 
 
 def _with_effects(
-    plan: Plan, names: Sequence[str], kept: Kept, bench: _Bench, say: Callable[[str], None]
+    plan: Plan, names: Sequence[str], saved: SavedProbes, bench: _Bench, say: Callable[[str], None]
 ) -> tuple[Plan, int]:
-    """The plan with what the probes said of effects, and the iterations of all of them."""
-    length = kept.iterations
+    """Probe effects; return the plan with the decisions, and the iterations of all probes."""
+    length = saved.iterations
     if not length:
-        kept.write()
+        saved.write()
         say(f"{plan.scene}: {', '.join(names)} not tried: {TOO_SHORT}")
         return untried(plan, TOO_SHORT), 0
 
     def arm(effects: tuple[str, ...]) -> ProbeResult:
         key = "+".join(effects)
-        if key not in kept.arms:
-            kept.arms[key] = bench.train(effects, length)
-            kept.write()
-        return kept.arms[key]
+        if key not in saved.arms:
+            saved.arms[key] = bench.train(effects, length)
+            saved.write()
+        return saved.arms[key]
 
-    unknown = [name for name in names if name not in kept.costs]
+    unknown = [name for name in names if name not in saved.costs]
     if unknown:
-        kept.costs |= step_costs(bench.trials.data, unknown, bench.folder)
-        kept.write()
-    plan = try_effects(plan, names, arm, kept.costs, say)
-    return plan, length * len(kept.arms) + TIMED * (len(names) + 1)
+        saved.costs |= step_costs(bench.trials.data, unknown, bench.folder)
+        saved.write()
+    plan = try_effects(plan, names, arm, saved.costs, say)
+    return plan, length * len(saved.arms) + TIMED * (len(names) + 1)
 
 
 def _cost(iterations: int, begin: float, share: float) -> Cost:
@@ -405,7 +399,7 @@ def _cost(iterations: int, begin: float, share: float) -> Cost:
 
 
 class _Bench:
-    """Reads the photos when the first probe needs them."""
+    """Trains probes; the photos are read when the first probe needs them."""
 
     def __init__(self, scene: Scene, folder: Path, bar: Bar) -> None:
         self.scene, self.folder, self.bar = scene, folder, bar
@@ -418,28 +412,29 @@ class _Bench:
         return self._trials
 
     def train(self, effects: tuple[str, ...], length: int, **more: Any) -> ProbeResult:
-        with self.bar(total=length) as shown:
-            return self.trials.train(effects, length, tick=shown.update, **more)
+        with self.bar(total=length) as progress:
+            return self.trials.train(effects, length, tick=progress.update, **more)
 
 
 def _with_masks(
     plan: Plan, scene: Scene, bench: _Bench, say: Callable[[str], None], bar: Bar
 ) -> tuple[Plan, int, int]:
-    """The plan with the lines of masks, and the iterations of paired and of other probes."""
+    """Probe masks; return the plan with their lines, and the iterations of paired and of other probes."""
     colour = plan.effects(("exposure", "appearance"))
-    found = persists(scene, colour, bar=bar)
-    plan = with_occlusion(plan, found)
-    if found.share < OCCLUSION:
-        say(f"{scene.name}: masks off: {100 * found.share:.1f} % of the pixels unexplained")
-        return plan, 0, found.iterations
+    occlusion = persists(scene, colour, bar=bar)
+    plan = with_occlusion(plan, occlusion)
+    unexplained = f"{100 * occlusion.share:.1f} % of the pixels unexplained"
+    if occlusion.share < OCCLUSION:
+        say(f"{scene.name}: masks off: {unexplained}")
+        return plan, 0, occlusion.iterations
     chosen = bench.trials.chosen
-    patches = [torch.from_numpy(found.patches[place]) for place in chosen]
+    patches = [torch.from_numpy(occlusion.patches[place]) for place in chosen]
     base, without = (
         bench.train(colour, LONGEST_ARM, patches=patches, masked=masked) for masked in (False, True)
     )
     gain = compare(without, base)
     plan = with_masks_tried(plan, gain)
     answer = next(d.decision for d in plan.decisions if d.effect == "masks")
-    said = "too few photos to try" if gain is None else format_gain(gain)
-    say(f"{scene.name}: masks {answer}: {100 * found.share:.1f} % of the pixels unexplained, {said}")
-    return plan, ARMS_OF_MASKS * LONGEST_ARM, found.iterations
+    outcome = "too few photos to try" if gain is None else format_gain(gain)
+    say(f"{scene.name}: masks {answer}: {unexplained}, {outcome}")
+    return plan, ARMS_OF_MASKS * LONGEST_ARM, occlusion.iterations

@@ -1,7 +1,7 @@
-"""What can be measured of a run, as data: metrics of test images, built in or of one's own, masks and cost.
+"""What can be measured of a run, as data: metrics of test images (built in or a user's), masks and cost.
 
-A metric of one's own is a `Metric` in a file (`--metric-file my_metric.py`) or of a package (entry points
-`ambiguous_wild.metrics`). Its record is kept in each result, so that tables need neither.
+A user's metric is a `Metric` in a file (`--metric-file my_metric.py`) or in a package (entry points
+`ambiguous_wild.metrics`). Each result keeps a record of it, so that tables need neither file nor package.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from ambiguous_wild.methods.entry import resolve
 from ambiguous_wild.methods.references import import_file, place_of
 
 if TYPE_CHECKING:
-    from ambiguous_wild.core import Scene
+    from ambiguous_wild.core import Scene, View
 
 Better = Literal["higher", "lower", None]  # None: not ranked
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A column: how it is called, which way is better, how many digits are shown."""
+    """A column: its label, which direction is better, how many digits are shown."""
 
     key: str  # as in the result file
     label: str
     better: Better
     digits: int = 3
-    per_image: bool = True  # else one number a run
-    timed: bool = False  # a busy machine changes it: ranked only between runs that were alone
-    partial: bool = False  # of some pixels: an image without such has no value, and is no gap in a mean
+    per_image: bool = True  # else one number per run
+    timed: bool = False  # depends on the load of the machine: ranked only between runs that were alone
+    partial: bool = False  # measured on some pixels only: an image without such pixels is left out of a mean
 
     @property
     def quality(self) -> bool:
-        """Whether it says how good the result is; the others say what it costs."""
+        """True for a measure of the result's quality, False for one of its cost."""
         return self.per_image or self.key.startswith("mask_")
 
 
@@ -53,25 +53,27 @@ class Metric(Measure):
     """A measure of a test image, with the function that computes it.
 
     `function` gets the render and what `needs` names, in that order, and returns a number. Pictures are
-    [H, W, 3] uint8. NaN = this image has none. An AwError says why no image has one, e.g. missing weights.
+    [H, W, 3] uint8. It returns NaN if this image has no value, and raises AwError if no image can have one,
+    e.g. for missing weights.
     """
 
     function: str | Callable[..., float]  # "module:function" for ours
-    needs: tuple[Literal["photo", "view", "scene"], ...] = ("photo",)  # () = judges the render alone
-    unit: str = ""  # stands behind the label
-    low: float = -math.inf  # of its range
-    high: float = math.inf
-    infinite: bool = False  # inf for equal pictures is right
-    # by which a value may differ when it is computed again; None: it is not, as that takes a network
+    needs: tuple[Literal["photo", "view", "scene"], ...] = ("photo",)  # () = only the render is needed
+    unit: str = ""  # printed after the label
+    low: float = -math.inf  # smallest possible value
+    high: float = math.inf  # largest possible value
+    infinite: bool = False  # inf is the right value for equal pictures
+    # allowed difference when a value is verified; None: it is not verified, as that takes a network
     tolerance: float | None = 1e-6
     source: str = ""  # sha256 of its file
 
-    def value(self, render: np.ndarray, given: Mapping[str, Any]) -> float:
-        """Of one image; `given`: its photo, view and scene. AwError: it cannot have it; names the line."""
+    def value(self, render: np.ndarray, photo: np.ndarray, view: View, scene: Scene) -> float:
+        """Return the value of one image; raise AwError, with the line in the user's file, if that fails."""
+        inputs = {"photo": photo, "view": view, "scene": scene}
         try:
-            value = resolve(self.function)(render, *(given[name] for name in self.needs))
+            value = resolve(self.function)(render, *(inputs[name] for name in self.needs))
             if np.ndim(value) or value is None:
-                raise AwError(f"it returned {type(value).__name__}, not one number")
+                raise AwError(f"the function returned {type(value).__name__}, not one number")
             return float(value)
         except Exception as error:
             if isinstance(self.function, str) or isinstance(error, AwError):
@@ -94,8 +96,7 @@ def _lpips(key: str, label: str) -> Metric:
 
 
 _IMAGE = "ambiguous_wild.metrics.image:"
-# dB. Which pixels are covered is computed too: rounding may move one over the threshold.
-_REGION_DB = 1e-2
+_REGION_DB = 1e-2  # larger, because rounding may move a pixel into or out of a region
 
 MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 MEASURES: dict[str, Measure] = {
@@ -131,10 +132,11 @@ MEASURES: dict[str, Measure] = {
 }
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
 COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
-# A metric that is not known takes everything but its name from its family: psnr_distractor is a PSNR.
+# An unknown metric is shown like its family: psnr_distractor like PSNR.
 FAMILIES = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_alex"}
 
-own_metrics: dict[str, Metric] = {}  # registered; without a function: as a result that was read describes it
+# registered, or known only from the record in a result: then without a function
+own_metrics: dict[str, Metric] = {}
 
 
 @cache
@@ -145,15 +147,15 @@ def _installed() -> dict[str, Metric]:
 
 
 def metrics() -> dict[str, Metric]:
-    """Every metric that can be computed, by key: built in, registered, installed as entry points."""
+    """Return every metric that can be computed, by key: built in, registered, installed as entry points."""
     for key, metric in _installed().items():
-        if key not in own_metrics or not own_metrics[key].function:  # what a result describes has none
+        if key not in own_metrics or not own_metrics[key].function:
             register(metric)
     return {k: m for k, m in (MEASURES | own_metrics).items() if isinstance(m, Metric) and m.function}
 
 
 def measure(key: str) -> Measure:
-    """The column of that key; of one that is not known what its family tells."""
+    """Return the column of that key; an unknown key is shown like its family."""
     if key not in MEASURES and key not in own_metrics:
         metrics()  # an installed package may have it
     if key in MEASURES or key in own_metrics:
@@ -163,13 +165,13 @@ def measure(key: str) -> Measure:
 
 
 def register(metric: Metric) -> Metric:
-    """Add a metric; AwError where its key cannot stand in a table or is taken, or a field is wrong."""
+    """Add a metric; raise AwError if its key is unfit for a table or taken, or a field is wrong."""
     if not isinstance(metric, Metric):
         raise AwError(f"{metric!r} is no Metric: see 'Your own metric' in docs/metrics.md")
     if not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", metric.key) or metric.key.startswith("cost_"):
         raise AwError(f"{metric.key[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
     if metric.key in MEASURES:
-        raise AwError(f"metric {metric.key!r} is one of ours: give yours another key")
+        raise AwError(f"metric {metric.key!r} is built in: give yours another key")
     for field, value, right, form in (
         ("better", metric.better, metric.better in get_args(Better), "'higher', 'lower' or None"),
         ("digits", metric.digits, type(metric.digits) is int and metric.digits >= 0, "a whole number"),
@@ -187,21 +189,21 @@ def register(metric: Metric) -> Metric:
 
 
 def load_metrics(path: Path) -> None:
-    """Register every `Metric` of a Python file; AwError where it has none, or one that is refused."""
-    found = [value for value in vars(import_file(path)).values() if isinstance(value, Metric)]
-    if not found:
+    """Register every `Metric` of a Python file; raise AwError if it has none, or a wrong one."""
+    in_file = [value for value in vars(import_file(path)).values() if isinstance(value, Metric)]
+    if not in_file:
         raise AwError(f"{path} holds no Metric: see 'Your own metric' in docs/metrics.md")
-    for metric in found:
+    for metric in in_file:
         register(replace(metric, source=sha256_file(path)))
 
 
 def own() -> dict[str, Metric]:
-    """Metrics that can be computed here and are not of this package."""
+    """Return the user's metrics that can be computed, by key."""
     return {key: m for key, m in metrics().items() if key not in MEASURES}
 
 
 def try_own(scene: Scene) -> None:
-    """Raise AwError if a metric of one's own fails on a test photo against itself, before training."""
+    """Raise AwError if a user's metric fails on a test photo against itself; called before training."""
     for view in scene.test[:1] if (mine := own()) else ():
         photo = read_png_rgb(view.image_path)
         for key, why in measure_images([(view.name, photo, photo)], mine.values(), scene)[1].items():
@@ -209,7 +211,7 @@ def try_own(scene: Scene) -> None:
 
 
 class MetricRecord(TypedDict):
-    """What a result keeps of a metric that is not of this package."""
+    """The record of a user's metric in a result."""
 
     label: str
     better: Better
@@ -219,15 +221,15 @@ class MetricRecord(TypedDict):
 
 
 def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
-    """Of the own metrics among these."""
+    """Return the records of the user's metrics among these keys."""
     fields, mine = MetricRecord.__annotations__, own()
     return {k: cast(MetricRecord, {f: getattr(mine[k], f) for f in fields}) for k in keys if k in mine}
 
 
-def remember(known: Mapping[str, MetricRecord]) -> None:
-    """Name the columns of a result's metrics as the run that measured them did."""
-    for key in known.keys() - MEASURES:
-        own_metrics.setdefault(key, Metric(key, function="", **known[key]))
+def remember(in_result: Mapping[str, MetricRecord]) -> None:
+    """Register the columns of a result's own metrics from their records, without functions."""
+    for key in in_result.keys() - MEASURES:
+        own_metrics.setdefault(key, Metric(key, function="", **in_result[key]))
 
 
 class ImageRow(TypedDict, total=False):
@@ -245,24 +247,32 @@ def measure_images(
     half: bool = False,
     around: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> tuple[list[ImageRow], dict[str, str]]:
-    """Rows of metrics, and why a metric that refuses one image is missing for all; measured in `around()`.
+    """Measure pictures; return their rows, and why metrics are missing: after an AwError, for all images.
 
-    `pictures`: name of a test view, render, photo, [H, W, 3] uint8; `half`: their right halves alone.
+    Args:
+        pictures: (name of a test view, render, photo), both [H, W, 3] uint8.
+        metrics: what to measure.
+        scene: the scene of the test views.
+        half: measure the right halves alone.
+        around: context in which each metric is computed.
+
+    Raises:
+        AwError: a render differs from its photo in size.
     """
     views = {view.name: view for view in scene.test}
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, str | float]] = []
     missing: dict[str, str] = {}
     for name, *pair in pictures:
         if pair[0].shape != pair[1].shape:
-            raise AwError(f"the render of {name} is not of its photo's size: render at the photo's size")
+            raise AwError(f"the render of {name} differs from its photo in size: render at the photo's size")
         left = pair[1].shape[1] // 2 if half else 0
         render, photo = (np.ascontiguousarray(picture[:, left:]) for picture in pair)
-        given = {"photo": photo, "view": views[name], "scene": scene}
+        view = views[name]
         rows.append({"name": name})
         for metric in metrics:
             try:
                 with around():
-                    value = math.nan if metric.key in missing else metric.value(render, given)
+                    value = math.nan if metric.key in missing else metric.value(render, photo, view, scene)
             except AwError as error:
                 missing[metric.key] = str(error)
             else:

@@ -1,7 +1,7 @@
-"""Measures how busy the machine is while a run trains, and what its time is worth elsewhere.
+"""Measure the load of the machine while a run trains, and convert its time to reference seconds.
 
-The trainer calls the meter with its clock stopped: before the first step, now and then, after the last one.
-Each time a calibration kernel is timed. Its work and the record's are no part of the training time.
+The trainer calls the meter with its clock stopped: before the first step, at intervals, and after the last
+step. Each time a calibration kernel is timed. None of this is part of the training time.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from filelock import FileLock, Timeout
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.harness.result_file import Cost, TimeRecord
 from ambiguous_wild.harness.timing import Verdict, in_reference_seconds
 from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration
@@ -32,14 +32,14 @@ _GUEST = (8, 9)  # counted in user and nice already
 
 
 def cores() -> int:
-    """Processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(_allowed()) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def busy_s() -> float | None:
-    """Seconds that these processors have worked since the machine started, for anybody; None = not known.
+    """Return the seconds that the allowed processors have worked since the machine started; None = unknown.
 
-    What a hypervisor gave to other machines counts as work of others.
+    Time that a hypervisor gave to other machines is included.
     """
     allowed = {f"cpu{k}" for k in _allowed()}
     try:
@@ -54,33 +54,33 @@ def busy_s() -> float | None:
 
 
 def own_s() -> float:
-    """Processor seconds of this process and of its children that have ended."""
+    """Return the processor seconds of this process and of its children that have ended."""
     times = os.times()
     return time.process_time() + times.children_user + times.children_system
 
 
 def unit(device: str) -> str:
-    """What runs on this device share: the processors, or one GPU by its identity."""
+    """Return a name for the hardware that runs on this device share: the processors, or a GPU's identity."""
     return _gpu_name(device) if device.startswith("cuda") else "cpu"
 
 
 class Presence:
-    """Says that a run of ours works here, and counts the others that say so."""
+    """Announce a run of this program to others on the same hardware, and count them."""
 
     def __init__(self, unit: str, folder: Path | None = None) -> None:
         """
         Args:
-            unit: runs with the same one share it, see `unit`.
-            folder: where runs leave a locked file each; None = one of this user on this machine.
+            unit: name of the shared hardware, see `unit`.
+            folder: where every run has a locked file; None = a folder of this user on this machine.
         """
         safe = "".join(c if c.isalnum() or c == "-" else "-" for c in unit)
         self.folder = (_own_folder() if folder is None else folder) / safe
 
     @contextmanager
-    def here(self) -> Iterator[None]:
-        """Be counted meanwhile; the system frees the file even of a process that was killed."""
+    def announced(self) -> Iterator[None]:
+        """Let others count this run until the `with` ends; the system unlocks files of killed processes."""
         lock = None
-        with contextlib.suppress(OSError):  # a temporary folder that cannot be written: nobody is counted
+        with contextlib.suppress(OSError):  # if the temporary folder cannot be written, no run is counted
             self.folder.mkdir(parents=True, exist_ok=True)
             path = self.folder / f"{os.getpid()}-{uuid.uuid4().hex[:8]}.lock"
             lock = FileLock(path, timeout=1.0, thread_local=False)
@@ -95,7 +95,7 @@ class Presence:
                     Path(lock.lock_file).unlink(missing_ok=True)
 
     def count(self) -> int:
-        """Runs here now, this one included; files of processes that are gone are removed."""
+        """Return the number of runs now, this one included; files of ended processes are removed."""
         try:
             paths = sorted(self.folder.glob("*.lock"))
         except OSError:
@@ -142,20 +142,21 @@ def _own_folder() -> Path:
     return Path(tempfile.gettempdir()) / f"ambiguous_wild-runs-{user}"
 
 
-# One calibration is off by a tenth, on a busy machine by a fifth: a run needs about 20 of them.
-LEAST_S = 1.0  # of training between two calibrations
-SHARE = 1 / 20  # of the training so far
-EVERY_S = 15.0  # at most
-OTHERS = 0.1  # a run is contended where others use more than this share of the processors that it needs
-VARIED = 1.3  # or where the machine is this many times slower in one part of the training than in another
-LEAST_GAIN = 0.15  # processors that several threads get more than one, or they are not told apart
-PARTS = 5  # of the training that are compared
-PART_SAMPLES = 4  # that a part has at least
-COVERED = 0.9  # of the training must lie between the first and the last calibration
+# The error of one calibration is a tenth, on a busy machine a fifth, so a run needs about 20 of them.
+# Time between two calibrations: SHARE of the training so far, but from LEAST_S to EVERY_S.
+LEAST_S = 1.0
+SHARE = 1 / 20
+EVERY_S = 15.0
+OTHERS = 0.1  # a run is contended if others use more than this share of the processors that it needs
+VARIED = 1.3  # or if the machine is this many times slower in one part of the training than in another
+LEAST_GAIN = 0.15  # extra processors that several threads must get, to be distinguished from one thread
+PARTS = 5  # parts of the training that are compared
+PART_SAMPLES = 4  # fewest calibrations of a part
+COVERED = 0.9  # share of the training that must lie between the first and the last calibration
 
 
 class Meter:
-    """Of one run; its state lies in the run's checkpoint, so that a resumed run is judged as a whole."""
+    """The meter of one run; its state is in the checkpoint, so that a resumed run is judged as a whole."""
 
     def __init__(
         self,
@@ -168,25 +169,25 @@ class Meter:
         """
         Args:
             device: "cpu" or "cuda".
-            threads: that the training uses.
-            read: calibrates once; None = with the kernel of the device.
-            presence: counts runs; None = those of this machine or GPU.
+            threads: number of threads of the training.
+            read: makes one calibration; None = with the kernel of the device.
+            presence: counts runs; None = those on this machine or GPU.
         """
         self.device, self.threads = device, threads
         self.kernel = KERNELS["cuda" if device.startswith("cuda") else "cpu"]
         self._read = read or (lambda: calibration(torch.device(device)).read())
         self.presence = presence or Presence(unit(device))
         self._stack = ExitStack()
-        self.samples: list[list[float]] = []  # trained seconds and the numbers of a Reading; NaN = none
+        self.samples: list[list[float]] = []  # trained seconds and the numbers of a Reading; NaN = missing
         self.runs = 1
         # of the intervals so far: seconds, processor seconds of this run, and of others
         self.wall_s = self.own_s = self.others_s = 0.0
-        self.blind = False  # others' work could not be measured
+        self.blind = False  # True if the work of other programs could not be measured
         self._since: tuple[float, float | None, float] | None = None
 
     @classmethod
     def of(cls, device: str) -> Meter:
-        """Of a training in this process, with the threads that it was given."""
+        """Make the meter of a training in this process, with the number of threads it has."""
         import numba
 
         return cls(device, int(numba.get_num_threads()) if device == "cpu" else 1)
@@ -194,33 +195,33 @@ class Meter:
     # -- called by the trainer ---------------------------------------------------------------------
 
     def begin(self, trained_s: float) -> None:
-        """Before the first step of this process."""
-        self._stack.enter_context(self.presence.here())
+        """Start measuring, before the first step of this process."""
+        self._stack.enter_context(self.presence.announced())
         self._sample(trained_s)
         self._since = self._now()
 
     def due(self, trained_s: float, progress: float) -> bool:
-        """Whether a calibration is due after an iteration; `progress` in [0, 1]."""
+        """Return whether a calibration is due after an iteration; `progress` in [0, 1]."""
         ago = trained_s - self.samples[-1][0]
         if progress >= 1.0:
             return ago > 0.0
         return ago >= min(max(LEAST_S, SHARE * trained_s), EVERY_S)
 
     def look(self, trained_s: float) -> None:
-        """Calibrate, and note what others did since the last time."""
+        """Calibrate, and add the work of others since the last calibration."""
         self._close()
         self._sample(trained_s)
         self._since = self._now()
 
     def end(self, trained_s: float) -> None:
-        """After the last step, or where the training stops with an error."""
+        """Stop measuring, after the last step or an error."""
         if self._since is not None:
             self._close()
         self._since = None
         self._stack.close()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Plain values for a checkpoint, the open interval included."""
+    def state_dict(self) -> State:
+        """Return plain values for a checkpoint, with the time since the last calibration."""
         wall, own, others, blind = self._interval()
         return {
             "samples": [list(sample) for sample in self.samples],
@@ -231,18 +232,18 @@ class Meter:
             "blind": self.blind or blind,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; a rollback in the middle of a training keeps what was spent and seen."""
+    def load_state_dict(self, state: State) -> None:
+        """Continue from a checkpoint; at a rollback within a training the current numbers are kept."""
         if self._since is not None:
             return
         self.samples = [list(map(float, sample)) for sample in state["samples"]]
         self.runs, self.blind = int(state["runs"]), bool(state["blind"])
         self.wall_s, self.own_s, self.others_s = (float(state[k]) for k in ("wall_s", "own_s", "others_s"))
 
-    # -- what it found -----------------------------------------------------------------------------
+    # -- results -----------------------------------------------------------------------------------
 
     def cost(self, trained_s: float) -> Cost:
-        """reference_s and the record of the time, for the cost of a run."""
+        """Return reference_s and the record of the time, for the cost of a run."""
         verdict, reason = self.verdict(trained_s)
         record: TimeRecord = {
             "verdict": verdict,
@@ -259,14 +260,15 @@ class Meter:
             record["others"] = self.others_s / self.wall_s
         cost: Cost = {"timing": record}
         if self.samples:
-            found = in_reference_seconds(record["samples"], self.kernel.reference_s, [trained_s])
-            cost["reference_s"] = float(found[0])
+            (seconds,) = in_reference_seconds(record["samples"], self.kernel.reference_s, [trained_s])
+            cost["reference_s"] = float(seconds)
         return cost
 
     def parallel_share(self) -> float:
-        """Share of the time in which several threads worked; NaN where it cannot be told.
+        """Return the share of the time in which several threads worked; NaN where it is unknown.
 
-        From the processors that the training got, between those of the calibration on one thread and on all.
+        It is interpolated: the number of processors that the training used lies between those that the
+        calibration used on one thread and on all.
         """
         if not self.samples or self.wall_s <= 0.0:
             return math.nan
@@ -276,20 +278,20 @@ class Meter:
         return float(np.clip((self.own_s / self.wall_s - one) / (many - one), 0.0, 1.0))
 
     def kernel_samples(self) -> list[list[float]]:
-        """(seconds of training, seconds of the kernel were it as parallel as the training)."""
+        """Return (seconds of training, seconds of the kernel, if it were as parallel as the training)."""
         share = self.parallel_share()
         if math.isnan(share):
             return [sample[:2] for sample in self.samples]
         kernel = self.kernel
-        found = []
+        samples = []
         for at, seconds, _, serial_s, _ in self.samples:
             speed = share * kernel.reference_s / seconds
             speed += (1.0 - share) * kernel.serial_reference_s / serial_s
-            found.append([at, kernel.reference_s / speed])
-        return found
+            samples.append([at, kernel.reference_s / speed])
+        return samples
 
     def verdict(self, trained_s: float) -> tuple[Verdict, str]:
-        """Whether the run was alone, and why not."""
+        """Return whether the run was alone, and the reason if it was not."""
         if self.runs > 1:
             where = "this GPU" if self.device.startswith("cuda") else "the machine"
             return "contended", f"{self.runs} runs shared {where}"
@@ -306,10 +308,10 @@ class Meter:
             share = 100.0 * span / trained_s if trained_s > 0.0 else 0.0
             return "unknown", f"calibrations cover {share:.0f} % of the training"
         if self.blind and len(self.samples) < 3:
-            return "unknown", "this system does not tell what other programs used, and the run was short"
+            return "unknown", "the use by other programs cannot be measured here, and the run was short"
         return "alone", ""
 
-    # -- inside ------------------------------------------------------------------------------------
+    # -- internal ----------------------------------------------------------------------------------
 
     def _sample(self, trained_s: float) -> None:
         reading = self._read()
@@ -323,8 +325,8 @@ class Meter:
         return time.monotonic(), busy_s(), own_s()
 
     def _interval(self) -> tuple[float, float, float, bool]:
-        """Since the last calibration: seconds, processor seconds of this run and of others, and whether
-        those of others are unknown."""
+        """Return the time since the last calibration: seconds, processor seconds of this run and of others,
+        and whether those of others are unknown."""
         if self._since is None:
             return 0.0, 0.0, 0.0, False
         (begin, busy, own), (now, busy_now, own_now) = self._since, self._now()
@@ -339,7 +341,7 @@ class Meter:
 
 
 def speed_ratio(kernel_s: Sequence[float]) -> float:
-    """Slowest over fastest part of a training, by the medians of their calibrations; 1 with too few."""
+    """Return slowest over fastest part of a training, by the medians of calibrations; 1 if there are few."""
     parts = min(PARTS, len(kernel_s) // PART_SAMPLES)
     if parts < 2:
         return 1.0

@@ -1,9 +1,10 @@
 """Draw the pictures of a run into RUN/pictures.
 
-training_<photo>.png  what the method saw of a train view at fixed moments of the run, a row a moment
-masks.jpg             train photos with what the trained method masks
-density.png           where Gaussians were added and merged, and how many there were
-and whatever the method draws itself (RefineSplat: entropies.png)
+training_<photo>.png  photo, render, error and masks of a train view, one row for each fixed moment of the run
+masks.jpg             train photos with the masks of the trained method
+density.png           where Gaussians were added and merged, and their number over time
+
+A method may draw more pictures (RefineSplat: entropies.png).
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ from ambiguous_wild.splat.trainer import Trainer
 
 MOMENTS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)  # shares of the run
 VIEWS = 3
-CELL = 240  # px, width of a picture in a strip
+CELL = 240  # px, width of a picture in a row
 WORST = 0.5  # error that is drawn red: mean over channels of |photo - render|
-ROWS = ".moments"  # in the run folder while it trains; hidden, as it is no result
+ROWS = ".moments"  # folder of finished rows while the run trains; hidden, because it is no result
 
 
 class Recorder:
-    """Records a strip of each chosen view whenever the run passes a moment.
+    """Draw a row of pictures of each chosen view whenever the run passes a moment.
 
-    Called after an iteration, with the clock stopped. Rows lie on disk until the end, so that a run that was
-    killed and resumed has them all; nothing of it is in the trainer's state.
+    It is called after every iteration, with the clock stopped. Rows are kept on disk until the end, so that a
+    run that was killed and resumed has all of them; the trainer's state holds none.
     """
 
     def __init__(self, trainer: Trainer, folder: Path) -> None:
@@ -42,7 +43,7 @@ class Recorder:
         chosen = np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)
         self.views = [int(v) for v in np.unique(chosen)]
         self.folder = folder
-        self.on = type(trainer.parts.mask).panels is not MaskPolicy.panels  # else there is nothing to see
+        self.on = type(trainer.parts.mask).panels is not MaskPolicy.panels  # else the method has no panels
         self.passed = self._passed(trainer)
 
     def _passed(self, trainer: Trainer) -> int:
@@ -50,7 +51,7 @@ class Recorder:
         return sum(done >= moment for moment in MOMENTS)
 
     def __call__(self, trainer: Trainer) -> None:
-        """Draw if a moment was passed since the last call."""
+        """Draw the rows if a moment was passed since the last call."""
         passed = self._passed(trainer)
         if not self.on or passed == self.passed:
             return
@@ -62,7 +63,7 @@ class Recorder:
         return self.folder / ROWS / file_stem(trainer, view) / f"{moment}.png"
 
     def finish(self, trainer: Trainer) -> list[Path]:
-        """Put the rows together as pictures/training_<photo>.png; returns what was written."""
+        """Join the rows to pictures/training_<photo>.png; return the paths written."""
         written = []
         for view in self.views:
             paths = [self._row(trainer, view, k) for k in range(1, len(MOMENTS) + 1)]
@@ -77,16 +78,16 @@ class Recorder:
 
 
 def file_stem(trainer: Trainer, view: int) -> str:
-    """A file name for pictures of a train view: photos may lie in folders."""
+    """Return a file name for pictures of a train view, whose photo may be in a folder."""
     return str(PurePosixPath(trainer.data.scene.train[view].name).with_suffix("")).replace("/", "_")
 
 
 def strip(trainer: Trainer, view: int) -> np.ndarray:
-    """Photo, render, error and the method's own panels of a train view as one row, [h, w, 3] uint8."""
+    """Draw photo, render, error and the method's panels of a train view as one row, [h, w, 3] uint8."""
     spent = dict(trainer.clock.parts_s)
     step = trainer.make_step(max(trainer.iteration, 1), view, divisor=1)
     panels = trainer.parts.mask.panels(step)
-    trainer.clock.parts_s = spent  # looking is no part of training
+    trainer.clock.parts_s = spent  # drawing is not part of the training time
     photo, render = step.photo.cpu().numpy(), step.rendered.image.detach().cpu().numpy()
     error = np.abs(photo - np.clip(render, 0.0, 1.0)).mean(axis=2)
     share = 100 * trainer.progress(trainer.iteration)
@@ -99,12 +100,12 @@ def strip(trainer: Trainer, view: int) -> np.ndarray:
 
 
 def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
-    """Every picture of a finished run; returns what was written.
+    """Draw every picture of a finished run; return the paths written.
 
     Args:
-        trainer: after its last step; masks/ lies in the folder already.
-        recorder: that watched it.
-        folder: the run folder.
+        trainer: the trainer after its last step.
+        recorder: the recorder of this training.
+        folder: the run folder, which has masks/ already.
     """
     pictures = folder / "pictures"
     written = recorder.finish(trainer)
@@ -114,11 +115,11 @@ def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
     return written
 
 
-SHOWN = 20_000  # points of a kind in a picture
+SHOWN = 20_000  # most points of a kind in a picture
 
 
 def draw_density(trainer: Trainer, path: Path) -> list[Path]:
-    """Write the picture; returns what was written: nothing where density control never did anything."""
+    """Draw the work of density control; return the path written, or nothing if it never ran."""
     log = trainer.density.log
     if not log.rounds:
         return []
@@ -163,7 +164,7 @@ def _counts(axes: Any, trainer: Trainer) -> None:
 
 
 def _kinds(trainer: Trainer) -> list[tuple[str, np.ndarray, str, tuple[int, int, int], float]]:
-    """(caption, positions, marker, colour, size) of what is drawn over the scene."""
+    """Return (caption, positions, marker, colour, size) of the points to draw: added and merged Gaussians."""
     log = trainer.density.log
     return [
         (f"added: {log.added.passed:,}", log.added.xyz.numpy(), ".", ADDED, 3.0),
@@ -172,7 +173,7 @@ def _kinds(trainer: Trainer) -> list[tuple[str, np.ndarray, str, tuple[int, int,
 
 
 def _top_view(axes: Any, trainer: Trainer) -> None:
-    """From above, where above is the mean of the cameras' own."""
+    """Draw the scene from above, along the mean up direction of the cameras."""
     poses = np.stack([camera.cam_from_world for camera in trainer.data.cameras])
     up = -poses[:, 1, :3].mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
@@ -210,7 +211,7 @@ def _in_a_view(axes: Any, trainer: Trainer) -> None:
     faded = (0.35 * photo + 0.65 * 255).astype(np.uint8)
     axes.imshow(faded, extent=(0, camera.width, camera.height, 0))
     for caption, xyz, marker, colour, size in _kinds(trainer):
-        uv = _seen(xyz, camera)
+        uv = _pixels_in_view(xyz, camera)
         axes.scatter(*uv.T, size, marker=marker, color=plot_colour(colour), lw=0.5, alpha=0.7, label=caption)
     axes.set_xlim(0, camera.width)
     axes.set_ylim(camera.height, 0)
@@ -220,8 +221,8 @@ def _in_a_view(axes: Any, trainer: Trainer) -> None:
     axes.set_title(f"in {trainer.data.scene.train[index].name} (through walls)", fontsize=10)
 
 
-def _seen(xyz: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels [n, 2] of the positions in front of the camera and inside its picture."""
+def _pixels_in_view(xyz: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the pixels [n, 2] of the positions in front of the camera and inside its picture."""
     local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     local = local[local[:, 2] > 1e-6]
     u = camera.fx * local[:, 0] / local[:, 2] + camera.cx

@@ -1,4 +1,4 @@
-"""Run cells as tasks of a Ray cluster: Ray places them, and starts them again where a node was lost.
+"""Run cells as tasks of a Ray cluster: Ray places them on nodes, and restarts those whose node was lost.
 
 On clusters without shared storage, scenes and run folders travel through Ray's object store.
 """
@@ -6,11 +6,13 @@ On clusters without shared storage, scenes and run folders travel through Ray's 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import tempfile
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +29,19 @@ HEARTBEAT_S = 60.0
 
 
 class RayCluster:
-    """A connection to a Ray cluster, or a Ray of our own on this machine."""
+    """A connection to a Ray cluster, or a Ray started on this machine."""
 
     def __init__(self, engine: Engine, cpus: float) -> None:
         """
         Args:
-            engine: where the cluster is, and what a cell needs.
-            cpus: of a cell.
+            engine: the address of the cluster, and what a cell needs.
+            cpus: number of CPUs of a cell.
 
         Raises:
             AwError: there is no cluster at the address.
         """
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anyone
-        # Ray's workers step back behind everything else (nice 15); a cell's time is measured, so ours do not.
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # send no usage reports
+        # by default Ray's workers have the lowest priority (nice 15), which would distort measured times
         os.environ.setdefault("RAY_worker_niceness", "0")
         # what Ray will do by default, without its warning
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -50,30 +52,30 @@ class RayCluster:
         if not self.ours:
             return
         address = engine.address or os.environ.get("RAY_ADDRESS")
-        where: dict[str, Any] = {"address": address, "namespace": "ambiguous_wild"}
-        if not address:
-            slots = None if engine.jobs is None else max(1, round(engine.jobs * cpus))
-            where = {"address": "local", "num_cpus": slots, "include_dashboard": False}
-        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+        start = partial(ray.init, log_to_driver=False, logging_level=logging.ERROR)
         try:
-            ray.init(**where, **quiet)
+            if address:
+                start(address=address, namespace="ambiguous_wild")
+            else:
+                slots = None if engine.jobs is None else max(1, round(engine.jobs * cpus))
+                start(address="local", num_cpus=slots, include_dashboard=False)
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             text = " ".join(str(error).split())[:300]
             raise AwError(
-                f"no Ray cluster at {address or 'this machine'}: {text}; 'ray status' on its head tells more"
+                f"no Ray cluster at {address or 'this machine'}: {text}; run 'ray status' on its head node"
             ) from error
 
     def close(self) -> None:
-        """End the tasks of this connection, and a Ray that we started."""
+        """End the tasks of this connection, and Ray itself if it was started here."""
         if self.ours:
             self.ray.shutdown()
 
     def has_gpu(self) -> bool:
-        """Whether any node offers a GPU."""
+        """Return whether any node offers a GPU."""
         return self.ray.cluster_resources().get("GPU", 0.0) > 0
 
     def describe(self) -> str:
-        """ "2 nodes, 32 CPU, 4 GPU"."""
+        """Return what the cluster offers, for example "2 nodes, 32 CPU, 4 GPU"."""
         total = self.ray.cluster_resources()
         nodes = sum(1 for node in self.ray.nodes() if node["Alive"])
         parts = [f"{nodes} node{'s' if nodes != 1 else ''}", f"{total.get('CPU', 0):g} CPU"]
@@ -86,13 +88,13 @@ class RayCluster:
         on_end: Callable[[int, CellReport], None],
         say: Callable[[str], None],
     ) -> list[CellReport]:
-        """Run every job; reports in their order.
+        """Run every job; return reports in their order.
 
         Args:
             jobs: what to run.
             lost: makes the report of a job that Ray gave up, from its index and the reason.
-            on_end: told the index and what became of it.
-            say: told now and then how far it is.
+            on_end: called with the index and the report of a job that has ended.
+            say: gets a line about the progress now and then.
 
         Raises:
             AwError: no node can ever take a cell, or a scene is too large to be sent.
@@ -105,20 +107,19 @@ class RayCluster:
             {"CPU": self.cpus, "GPU": gpus, "memory": 1e9 * (engine.memory_per_cell or 0.0)}, say
         )
         # Retries are for workers and nodes that die; an error of the cell itself is its result.
-        needs: dict[str, Any] = {"num_cpus": self.cpus, "num_gpus": gpus, "max_retries": engine.retries}
-        if engine.memory_per_cell:
-            needs["memory"] = 1e9 * engine.memory_per_cell
+        memory = {"memory": 1e9 * engine.memory_per_cell} if engine.memory_per_cell else {}
+        remote = ray.remote(num_cpus=self.cpus, num_gpus=gpus, max_retries=engine.retries, **memory)
         store = engine.transfer == "store"
-        task = ray.remote(**needs)(run_sent if store else run_job)
-        made = [is_finished(Path(job.folder)) for job in jobs]
+        task = remote(run_sent if store else run_job)
+        finished = [is_finished(Path(job.folder)) for job in jobs]
         token = Path(jobs[0].folder).parents[2] / f".aw-shared-{uuid.uuid4().hex}"
-        scenes: dict[str, Any] = {}
+        scenes: dict[str, tuple[str, Any]] = {}  # by path: the key and Ray's reference to the content
         pending: dict[Any, int] = {}
         reports: dict[int, CellReport] = {}
 
         def ended(index: int, report: CellReport) -> None:
-            # Its node was lost between the end and the answer: the second attempt found it finished.
-            if report.outcome == "kept" and not made[index]:
+            # the node was lost between the end of the run and its report: a second attempt kept the run
+            if report.outcome == "kept" and not finished[index]:
                 report = replace(report, outcome="trained", result=read_result(report.folder / RESULT))
             reports[index] = report
             on_end(index, report)
@@ -154,7 +155,7 @@ class RayCluster:
         return [reports[index] for index in range(len(jobs))]
 
     def _check_room(self, needs: dict[str, float], say: Callable[[str], None]) -> None:
-        """Raise AwError if no node of a Ray of our own can take a cell; of a cluster, tell that it waits."""
+        """Raise AwError if no cell fits this machine; on a cluster, say that a larger node is awaited."""
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
         if any(all(node.get(name, 0.0) >= need for name, need in needs.items()) for node in nodes):
             return
@@ -163,7 +164,7 @@ class RayCluster:
             raise AwError(
                 f"a cell needs {', '.join(words)}, more than this machine has; ask for less or give --address"
             )
-        say(f"no node has {', '.join(words)} now: waiting for one to come (Ctrl-C to give up)")
+        say(f"no node has {', '.join(words)} now: waiting for such a node (Ctrl-C to give up)")
 
     def _report(
         self, reference: Any, job: Job, index: int, lost: Callable[[int, str], CellReport]
@@ -173,7 +174,7 @@ class RayCluster:
             value = self.ray.get(reference)
             return receive(value, job, self.engine.transfer_limit) if isinstance(value, Sent) else value
         except errors.RayTaskError as error:
-            # Not of the cell, whose errors are reports: the task could not begin there.
+            # the task could not begin on its node; errors of the cell itself are reports
             cause = error.cause if isinstance(error.cause, Exception) else error
             return CellReport(Path(job.folder), "failed", error=error_line(cause))
         except errors.RayError as error:
@@ -185,30 +186,30 @@ class RayCluster:
 
 @dataclass(frozen=True)
 class Sent:
-    """A report and the packed run folder it is about; empty where there is none."""
+    """A report with its packed run folder, which is empty where there is none."""
 
     report: CellReport
     content: bytes
 
 
 def send_scene(scene: Path, limit_mb: float) -> tuple[str, bytes]:
-    """A name for the scene's content, and the content.
+    """Pack a scene; return the hash of the content, and the content.
 
     Raises:
-        AwError: more than the limit.
+        AwError: the content is larger than the limit.
     """
     content = pack_folder(scene, limit_mb)
     return hashlib.sha256(content).hexdigest(), content
 
 
 def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> Sent:
-    """On a node: unpack the scene unless it is there, run the job in a folder there, pack that."""
+    """On a node: unpack the scene unless it is cached, run the job in a local folder, and pack that."""
     user = os.getuid() if hasattr(os, "getuid") else "user"
     cache = Path(tempfile.gettempdir()) / f"ambiguous_wild-{user}"
     cache.mkdir(mode=0o700, exist_ok=True)
     if cache.is_symlink() or (hasattr(os, "getuid") and cache.stat().st_uid != os.getuid()):
         raise AwError(f"{cache} belongs to somebody else: remove it, or set TMPDIR on the nodes")
-    # The folder's own name: a plain COLMAP scene is called after it.
+    # the folder keeps its name, because a plain COLMAP scene is called after it
     place = cache / "scenes" / scene_key / Path(job.scene).name
     with patient_lock(place.parent, "aw bench", LOCK_WAIT_S):
         if not place.is_dir():
@@ -222,10 +223,10 @@ def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> Sent:
 
 
 def receive(sent: Sent, job: Job, limit_mb: float) -> CellReport:
-    """On the machine that sent the job: the run folder appears whole, or not at all.
+    """On the machine that sent the job: unpack the run folder, whole or not at all.
 
     Raises:
-        AwError: the archive is no run folder, or somebody works on that folder here.
+        AwError: the archive is no run folder, or another process uses that folder here.
     """
     folder = Path(job.folder)
     if sent.content:

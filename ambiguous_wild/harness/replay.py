@@ -26,10 +26,10 @@ from ambiguous_wild.splat.watchdog import FOLDER, GOOD, REPORT, NonFinite
 
 @dataclass(frozen=True)
 class Replay:
-    """What the run reported, and what the replay found."""
+    """The finding that the run reported, and the one of the replay."""
 
     reported: str
-    found: str  # "" = nothing was found
+    found: str  # "" = the replay met no such value
     started_at: int  # iteration
 
     @property
@@ -44,11 +44,11 @@ def replay(run: Path) -> Replay:
         run: a run folder with `nonfinite/` in it; the first finding is replayed.
 
     Raises:
-        AwError: no finding there, a method or scene that is gone, a damaged file.
+        AwError: the run has no finding, its method or scene is gone, or a file is damaged.
     """
     findings = sorted(p.parent for p in (run / FOLDER).glob(f"*/{REPORT}"))
     if not findings:
-        raise AwError(f"{run} holds no {FOLDER}/*/{REPORT}: its watchdog found nothing; name another run")
+        raise AwError(f"{run} holds no {FOLDER}/*/{REPORT}: all its values were finite; name another run")
     report, config = _read(findings[0] / REPORT), _read(run / "config.yaml")
     try:
         method, train, device = config["method"], config["train"], torch.device(config["device"])
@@ -75,19 +75,19 @@ def replay(run: Path) -> Replay:
         try:
             while trainer.iteration < last:
                 trainer.step()
-            trainer.check_parameters()  # as the loop does before it saves
+            trainer.check_parameters()  # the training loop does so before it saves
         except NonFinite as error:
             return Replay(message, str(error), start)
     return Replay(message, "", start)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> dict[Any, Any]:
     if path.suffix != ".json":
         return plain_yaml.read_mapping(path)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        report = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise AwError(f"cannot read {path}: {error}") from None
-    if not isinstance(found, dict):
+    if not isinstance(report, dict):
         raise AwError(f"{path} is damaged: a mapping was expected")
-    return found
+    return report

@@ -1,7 +1,7 @@
-"""Evidence that needs a render: the residual of a short run of plain 3DGS on small photos.
+"""Find distractors by the residual of a short run of plain 3DGS on small photos.
 
-A render of few iterations lacks detail everywhere, but detail is signed: averaged over a window it vanishes.
-A distractor in front of the scene in one photo is a patch of one sign, and stays.
+A render after few iterations lacks detail everywhere, but errors in detail have both signs and cancel in the
+mean over a window. A distractor in one photo is a patch of one sign, which remains.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.trainer import Trainer
 
-LONGEST = 160  # px of the probe's photos
+LONGEST = 160  # px, longer side of the probe's photos
 ITERATIONS = 300
-SETTLED = 1200  # iterations after which fine texture is learnt and a distractor in one photo still is not
-WINDOW = 1 / 20  # of the longest side: side of the window
-STANDS_OUT = 0.12  # code values of a window's mean residual, in the worst channel
-TIMED_ROUNDS, TIMED_STEPS = 12, 3  # of timing an effect, after a first round
-LARGE = 0.05  # of a photo: a patch above it is more than an instance
+SETTLED = 1200  # iterations after which fine texture is learnt, but a distractor in one photo is not
+WINDOW = 1 / 20  # side of the window, of the photo's longer side
+STANDS_OUT = 0.12  # of the colour range: mean residual of a window in the worst channel
+TIMED_ROUNDS, TIMED_STEPS = 12, 3  # to time an effect, after a first round
+LARGE = 0.05  # of a photo: a larger patch is more than one instance
 
-# Shares of the photos' pixels, see benchmarks/results/presets.md for what the presets give.
+# Limits, as shares of the photos' pixels; benchmarks/results/presets.md lists the values of the presets.
 OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.003, 0.003, 0.05, 0.01
 
 
@@ -46,14 +46,14 @@ class Occlusion:
 
     share: float  # of all pixels
     compact: float  # in patches below LARGE
-    worst: float  # in the tenth of the photos that have most of it
-    # [H, W] bool of every train photo: where the probe cannot explain it, points or not
+    worst: float  # in the tenth of the photos with the largest shares
+    # [H, W] bool of every train photo: unexplained pixels, those near static points included
     patches: tuple[np.ndarray, ...] = field(default=(), repr=False, compare=False)
-    iterations: int = field(default=0, compare=False)  # that it took to find out
+    iterations: int = field(default=0, compare=False)  # of all probes that were needed
 
 
 def small_data(scene: Scene, folder: Path, seed: int = 0) -> TrainData:
-    """The training side with photos of LONGEST px at most."""
+    """Load the training data with photos of at most LONGEST px."""
     data = load_train_data(scene, device=torch.device("cpu"), seed=seed, cache_dir=folder)
     photos, cameras, keeps = [], [], []
     for photo, camera, keep in zip(data.photos, data.cameras, data.user_keep):
@@ -73,11 +73,11 @@ def _smaller(keep: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 
 
 def unexplained(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """[H, W] bool: where a window's mean of photo - render stands out.
+    """Return where a window's mean of photo - render is large, [H, W] bool.
 
     Args:
         photo, render: [H, W, 3] in [0, 1].
-        seen: [H, W] bool, where the model has anything to say.
+        seen: [H, W] bool, pixels that are compared.
     """
     side = max(round(WINDOW * max(photo.shape[:2])), 3)
     weight = uniform_filter(seen.astype(np.float64), side, mode="constant")
@@ -87,10 +87,10 @@ def unexplained(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.n
 
 
 def seen_by_others(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
-    """[H, W] bool: near where a point that three photos see projects, whether or not this photo saw it.
+    """Return the pixels near projections of points with three observations or more, [H, W] bool.
 
-    Elsewhere (the rim of an aerial capture, sky) few photos look and a short run has learnt nothing. All of
-    it where the model has no tracks.
+    Elsewhere (the rim of an aerial capture, sky) few photos look, and a short run has learnt nothing. All
+    pixels are True if the model has no tracks.
     """
     camera = scene.views[index].camera
     well = np.diff(scene.points.track_offsets) >= 3
@@ -101,17 +101,19 @@ def seen_by_others(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarra
     uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     uv = uv * [size[1] / camera.width, size[0] / camera.height]
     columns, rows = uv[((uv >= 0) & (uv < [size[1], size[0]])).all(axis=1)].astype(int).T
-    found = np.zeros(size, bool)
-    found[rows, columns] = True
-    return maximum_filter(found, max(round(WINDOW * max(size)), 3))
+    near = np.zeros(size, bool)
+    near[rows, columns] = True
+    return maximum_filter(near, max(round(WINDOW * max(size)), 3))
 
 
 def supported(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
-    """[H, W] bool: within a window of an SfM point that three photos see, so what stands there stands still.
+    """Return the pixels within a window of an SfM point that this and two other photos see, [H, W] bool.
+
+    What is visible there is static.
 
     Args:
-        scene: with tracks.
-        index: of the view, into Scene.views.
+        scene: a scene with tracks.
+        index: index of the view in Scene.views.
         size: (height, width) of the map.
     """
     points, view = scene.points, scene.views[index]
@@ -119,13 +121,13 @@ def supported(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
     rows = (points.track_views == index) & np.repeat(lengths >= 3, lengths)
     scale = np.array([size[1] / view.camera.width, size[0] / view.camera.height])
     where = (points.track_xy[rows] * scale).astype(int)
-    found = np.zeros(size, bool)
-    found[where[:, 1].clip(0, size[0] - 1), where[:, 0].clip(0, size[1] - 1)] = True
-    return maximum_filter(found, max(round(WINDOW * max(size)), 3))
+    near = np.zeros(size, bool)
+    near[where[:, 1].clip(0, size[0] - 1), where[:, 0].clip(0, size[1] - 1)] = True
+    return maximum_filter(near, max(round(WINDOW * max(size)), 3))
 
 
 def summarise(patches: list[np.ndarray]) -> Occlusion:
-    """Shares of [H, W] bool maps, one a photo."""
+    """Compute the shares of maps [H, W] bool, one for each photo."""
     shares, compact = [], []
     for patch in patches:
         labels, count = label(patch)
@@ -147,8 +149,8 @@ def occlusion(
 
     Args:
         scene: the scene.
-        effects: colour effects that the plan found: a photo's exposure is no distractor.
-        iterations: of the probe.
+        effects: colour effects of the plan, so that another exposure is not taken for a distractor.
+        iterations: length of the probe.
         tick: called after every iteration.
     """
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as folder:
@@ -181,37 +183,36 @@ def persists(
     *,
     bar: Callable[..., AbstractContextManager[Any]],
 ) -> Occlusion:
-    """What the probe cannot explain; where that is much, what one of `SETTLED` iterations cannot.
+    """Measure what a probe of `ITERATIONS` cannot explain and, where that is much, one of `SETTLED`.
 
-    Fine texture is learnt late, and what stands before one photo not even then.
-    Drone photos of fields: 1.5 % after 300 iterations, 0.2 % after 1200; a thin thing before a courtyard 1.5
-    and 1.4 %. The longer run is made only where the short one found something.
+    Fine texture is learnt late, a distractor in one photo never. Example: drone photos of fields have 1.5 %
+    after 300 iterations and 0.2 % after 1200, a thin distractor in a courtyard 1.5 and 1.4 %.
 
     Args:
         scene: the scene.
         effects: see `occlusion`.
-        bar: called with total=iterations, a context whose `update` counts one; tqdm is one.
+        bar: called with total=iterations, returns a context whose `update` counts one, such as tqdm.
     """
     spent = 0
     for iterations in (ITERATIONS, SETTLED):
-        with bar(total=iterations) as shown:
-            found = occlusion(scene, effects, iterations=iterations, tick=shown.update)
+        with bar(total=iterations) as progress:
+            result = occlusion(scene, effects, iterations=iterations, tick=progress.update)
         spent += iterations
-        if found.share <= OCCLUSION:
+        if result.share <= OCCLUSION:
             break
-    return dataclasses.replace(found, iterations=spent)
+    return dataclasses.replace(result, iterations=spent)
 
 
 def effect_costs(scene: Scene) -> dict[str, float]:
-    """ms of CPU time an iteration that each effect adds on this machine, on the probe's photos."""
+    """Measure the ms of CPU time per iteration that each effect adds on this machine, on small photos."""
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
         return step_costs(small_data(scene, Path(name)), ALL, Path(name))
 
 
 def step_costs(data: TrainData, effects: Sequence[str], folder: Path) -> dict[str, float]:
-    """ms of CPU time an iteration that each of the effects adds, alone.
+    """Measure the ms of CPU time per iteration that each of the effects adds when it is on alone.
 
-    All take turns within every round, so that they meet the same machine; the median round counts.
+    All take turns in every round, so that the load of the machine affects them alike; the median is taken.
     """
     config = TrainConfig(iterations=10_000, probes=0)
     trainers = {
@@ -221,7 +222,7 @@ def step_costs(data: TrainData, effects: Sequence[str], folder: Path) -> dict[st
     times: dict[str, list[float]] = {e: [] for e in trainers}
     for turn in range(TIMED_ROUNDS + 1):
         for effect, trainer in trainers.items():
-            begin = time.process_time()  # of the process: other programs do not count
+            begin = time.process_time()  # excludes other programs
             for _ in range(TIMED_STEPS):
                 trainer.step()
             if turn:  # the first round compiles and allocates
@@ -230,8 +231,8 @@ def step_costs(data: TrainData, effects: Sequence[str], folder: Path) -> dict[st
     return {e: round(float(np.median(np.array(t) - plain)), 2) for e, t in times.items() if e}
 
 
-def with_occlusion(plan: Plan, found: Occlusion) -> Plan:
-    """The plan with the lines that the probe answers, first."""
+def with_occlusion(plan: Plan, occlusion: Occlusion) -> Plan:
+    """Return the plan with the lines about masks, which come first."""
 
     def line(
         effect: str, evidence: str, value: float, threshold: float, on: str, off: str, how: str
@@ -241,15 +242,15 @@ def with_occlusion(plan: Plan, found: Occlusion) -> Plan:
         return Decision(effect, evidence, value, threshold, "of the pixels", decision, why, how)
 
     lines = (
-        line("masks", "patches a probe cannot explain", found.share, OCCLUSION,
-             "something stands before the scene", "photos agree", "--mask none where off"),
-        line("masks, local", "of them in patches below 5 % of a photo", found.compact, LOCAL,
-             "distractors as large as instances", "none of an instance's size",
+        line("masks", "patches that a probe cannot explain", occlusion.share, OCCLUSION,
+             "distractors in front of the scene", "all photos agree", "--mask none where off"),
+        line("masks, local", "those in patches below 5 % of a photo", occlusion.compact, LOCAL,
+             "distractors of the size of instances", "no distractor of the size of an instance",
              "--set refinesplat.mask.use_local=false where off"),
-        line("masks, global", "patches in the worst tenth of the photos", found.worst, GLOBAL,
-             "some photos are covered widely", "no photo is covered widely",
+        line("masks, global", "patches in the worst tenth of the photos", occlusion.worst, GLOBAL,
+             "distractors cover large parts of some photos", "no photo is covered in large parts",
              "--set refinesplat.mask.use_global=false where off"),
-        line("entropy density", "patches a probe cannot explain", found.share, ENTROPY,
-             "growth must wait for masks", "nothing to keep growth from", "--density none where off"),
+        line("entropy density", "patches that a probe cannot explain", occlusion.share, ENTROPY,
+             "growth should wait for masks", "growth need not wait for masks", "--density none where off"),
     )  # fmt: skip
     return dataclasses.replace(plan, decisions=(*lines, *plan.decisions), probed=True)

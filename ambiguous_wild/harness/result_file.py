@@ -1,9 +1,9 @@
-"""Records that cross files, and one of them: the result of a run, `metrics.json` or `failed.json`.
+"""The records of a run as they stand in its files, and the reader and writer of its result.
 
-All are plain dicts, with the keys that the files have. A result is checked when written and when read.
-Per-image values are kept, never only their mean. JSON has no infinity: it is written as the string
-"inf" and read back as a number. A missing value is ``null`` in the file, and its reason stands under
-"missing".
+A record is a plain dict with the keys of its file. A result (`metrics.json`, or `failed.json`) is checked
+when it is written and when it is read. It keeps the values of every image, never only their mean. JSON has
+no infinity: it is written as the string "inf" and read back as a number. A missing value is ``null`` in the
+file, and its reason stands under "missing".
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.measures import ImageRow, MetricRecord, measure, remember
+from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, MetricRecord, measure, remember
 from ambiguous_wild.io.files import sha256_file, write_json
 from ambiguous_wild.metrics import stats
 
@@ -28,18 +28,26 @@ NotNegative = Annotated[float, Meta(ge=0.0)]
 Count = Annotated[int, Meta(ge=0, le=10**15)]  # more is no number of anything
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
+Options = dict[str, Any]  # plain values of a method's options: every method has its own keys
+RunFacts = dict[str, Any]  # of a run; beside the keys of `Cell.result`, methods and effects add their own
 
 
 def metrics_of(row: ImageRow) -> dict[str, float | None]:
-    """Every metric of the row, by name."""
+    """Return every metric of the row by name."""
     return {key: cast("float | None", value) for key, value in row.items() if key != "name"}
 
 
 def mean_of(result: RunResult | None, metric: str) -> float:
-    """Mean of an image metric over the test views, of the finite values; NaN where any is missing."""
+    """Return the mean of a metric's finite values over the test views; NaN where a view has no value."""
     rows = [] if result is None else [metrics_of(row) for row in result["per_image"]]
     values = [row.get(metric) for row in rows if metric in row or not measure(metric).partial]
     return stats.mean([math.nan if value is None else value for value in values])
+
+
+def mask_scores(result: RunResult) -> dict[str, float]:
+    """Return the mask scores that a result has, by the keys of `MASK_LABELS`."""
+    scores = result["masks"] or {}
+    return {k: v for k, v in scores.items() if k in MASK_LABELS and isinstance(v, float | int)}
 
 
 class MaskScores(TypedDict, total=False):
@@ -56,7 +64,7 @@ Sample = Annotated[list[NotNegative], Meta(min_length=2, max_length=2)]
 
 
 class TimeRecord(TypedDict, total=False):
-    """How far the time of a run can be trusted, see `timing.py`."""
+    """The evidence of whether the time of a run can be compared, see `timing.py`."""
 
     verdict: Required[Literal["alone", "contended", "unknown"]]
     reason: Required[str]  # empty for "alone"
@@ -69,7 +77,7 @@ class TimeRecord(TypedDict, total=False):
 
 
 class Cost(TypedDict, total=False):
-    """What a run took. What is unknown is absent: an external program may know little."""
+    """Time, memory and size of a run. Unknown values are absent: an external program may report few."""
 
     train_s: float  # wall seconds
     cpu_s: float  # processor seconds of training, child processes included
@@ -77,8 +85,8 @@ class Cost(TypedDict, total=False):
     timing: TimeRecord
     setup_s: float  # features, masks and compilation before the first step
     iterations: Count
-    passes: int  # trainings that all of this counts, where there was more than one
-    first_pass_s: float  # of train_s, that of the first
+    passes: int  # number of trainings that these numbers include, where there was more than one
+    first_pass_s: float  # the part of train_s that the first training took
     ms_per_iteration: float
     ms_parts: dict[str, float]  # by part of an iteration
     gaussians: Count
@@ -107,7 +115,7 @@ class Environment(TypedDict, total=False):
 
 
 class Provenance(TypedDict):
-    """Where a result was made, from which code, and the command that makes it again."""
+    """The machine, the code and the command that made a result."""
 
     environment: Environment
     code_hash: str
@@ -115,7 +123,7 @@ class Provenance(TypedDict):
 
 
 class Rescore(TypedDict):
-    """Metrics that `aw rescore` added to a result, and by which code."""
+    """The metrics that `aw rescore` added to a result, and the code that computed them."""
 
     metrics: list[str]
     version: str
@@ -131,11 +139,11 @@ class RunResult(TypedDict):
     seed: int
     status: Status
     error: str | None
-    options: dict[str, Any]  # of the method
+    options: Options
     per_image: list[ImageRow]
     missing: dict[str, str]  # metric -> why it is missing
     masks: MaskScores | None  # None: no masks, or no exact ones to compare with
-    facts: dict[str, Any]  # of the method, its effects and the watchdog
+    facts: RunFacts  # of the method, its effects and the watchdog
     cost: Cost
     config_hash: str
     scene_hash: str
@@ -145,7 +153,7 @@ class RunResult(TypedDict):
     code_hash: NotRequired[str]
     reproduce: NotRequired[str]
     rescored: NotRequired[list[Rescore]]
-    metrics: NotRequired[dict[str, MetricRecord]]  # that are not of this package
+    metrics: NotRequired[dict[str, MetricRecord]]  # of metrics that are not of this package
     model_sha256: NotRequired[str]  # of point_cloud.ply; also absent where the run has none
 
 
@@ -156,6 +164,20 @@ class SceneConfig(TypedDict):
     sha256: str
     factor: int | None  # of images_N; None = not known
     path: str
+
+
+class TrainRecord(TypedDict):
+    """The fields of `TrainConfig`, as plain values."""
+
+    iterations: int
+    budget_s: float | None
+    seed: int | None  # None in ablation.json, which has several
+    resolution: str
+    max_gaussians: int | None
+    torch_threads: int
+    checkpoint_every_s: float
+    probes: int
+    on_nonfinite: str
 
 
 class UnusualConfig(TypedDict, total=False):
@@ -171,8 +193,8 @@ class RunConfig(UnusualConfig):
 
     method: str
     source: str  # hash of a plugin's file; empty for a method of ours
-    options: dict[str, Any]
-    train: dict[str, Any]  # fields of `TrainConfig`
+    options: Options
+    train: TrainRecord
     scene: SceneConfig
     device: str
     version: str
@@ -184,11 +206,11 @@ RESULT = "metrics.json"
 FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
 
 
-def write_result(path: Path | str, result: Mapping[str, Any]) -> None:
+def write_result(path: Path | str, result: Mapping[str, object]) -> None:
     """Check a result and write it atomically.
 
     Args:
-        path: of the file, by custom RUNS/<scene>/<method>/seed<k>/metrics.json.
+        path: path of the file, usually RUNS/<scene>/<method>/seed<k>/metrics.json.
         result: a `RunResult`; infinite numbers become "inf", NaN becomes null.
 
     Raises:
@@ -207,7 +229,7 @@ def read_result(path: Path | str) -> RunResult:
 
     Raises:
         AwError: no such file, no JSON, another schema version, or a field that is absent or of the wrong
-            type; names the file and the field.
+            type; the error names the file and the field.
     """
     path = Path(path)
     try:
@@ -223,14 +245,14 @@ MODEL = "point_cloud.ply"
 
 
 def model_hash(run: Path) -> dict[str, str]:
-    """`model_sha256` of a run's folder; empty where it has no model."""
+    """Return `model_sha256` for the model in a run's folder; empty where it has no model."""
     return {"model_sha256": sha256_file(run / MODEL)} if (run / MODEL).is_file() else {}
 
 
 def check_model(run: Path, result: RunResult) -> None:
     """Raise AwError if the run's model is not the one that was measured; earlier versions kept no hash."""
-    known = result.get("model_sha256")
-    if known is not None and model_hash(run).get("model_sha256") != known:
+    measured = result.get("model_sha256")
+    if measured is not None and model_hash(run).get("model_sha256") != measured:
         raise AwError(
             f"{run / MODEL} is not the model that was measured (another hash than in {RESULT}): restore it, "
             "or train again with --overwrite always"
@@ -238,7 +260,7 @@ def check_model(run: Path, result: RunResult) -> None:
 
 
 def _checked(data: Any, where: str) -> RunResult:
-    """The result with numbers decoded; AwError where it does not follow `RunResult`."""
+    """Return the result with numbers decoded; raise AwError where it does not follow `RunResult`."""
     try:
         if not isinstance(data, dict):
             raise msgspec.ValidationError("it must hold one JSON object")
@@ -248,16 +270,16 @@ def _checked(data: Any, where: str) -> RunResult:
             )
         data = data | {name: _decode(data[name]) for name in ("per_image", "cost", "masks") if name in data}
         # a number that was not finite is null, and another program may write a count with a point
-        known = data | {name: _plain(data[name]) for name in ("cost", "environment") if name in data}
-        msgspec.convert(known, RunResult)
-        for name, kind in (("cost", Cost), ("masks", MaskScores)):  # what plugins and later versions add
-            more = {k: v for k, v in (known.get(name) or {}).items() if k not in kind.__annotations__}
+        plain = data | {name: _plain(data[name]) for name in ("cost", "environment") if name in data}
+        msgspec.convert(plain, RunResult)
+        for name, kind in (("cost", Cost), ("masks", MaskScores)):  # keys of plugins and later versions
+            more = {k: v for k, v in (plain.get(name) or {}).items() if k not in kind.__annotations__}
             msgspec.convert(more, dict[str, Finite | None])
         rows = {row["name"]: metrics_of(row) for row in data["per_image"]}
         if len(rows) < len(data["per_image"]):
-            raise msgspec.ValidationError("an image is there twice - at `$.per_image`")
+            raise msgspec.ValidationError("an image is listed twice - at `$.per_image`")
         msgspec.convert(rows, dict[str, dict[str, float | None]])  # metrics of plugins and later versions too
-        if any(kernel <= 0.0 for _, kernel in known["cost"].get("timing", {}).get("samples", ())):
+        if any(kernel <= 0.0 for _, kernel in plain["cost"].get("timing", {}).get("samples", ())):
             raise msgspec.ValidationError("a calibration took no time - at `$.cost.timing.samples`")
         remember(data.get("metrics", {}))
         if data["status"] == "failed" and not data["error"]:
@@ -267,13 +289,13 @@ def _checked(data: Any, where: str) -> RunResult:
             str(error)[:300].encode("ascii", "backslashreplace").decode()
         )  # a value may be long or unprintable
         raise AwError(
-            f"{where} is no result file of ours: {why}; run 'aw bench' again to replace it"
+            f"{where} is no result file of this program: {why}; run 'aw bench' again to replace it"
         ) from None
     return cast(RunResult, data)
 
 
 def _plain(value: Any) -> Any:
-    """Without null in objects, and whole numbers as integers."""
+    """Return the value without null in objects, and with whole numbers as integers."""
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items() if v is not None}
     return int(value) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else value

@@ -1,4 +1,4 @@
-"""One method on one scene with one seed: its folder, whether that is ours and finished, and the run."""
+"""Run one cell in its folder: check what the folder holds, train or keep, record a failure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shutil
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import yaml
 
@@ -28,7 +28,14 @@ from ambiguous_wild.harness.cell import (
     provenance,
 )
 from ambiguous_wild.harness.external import run_program
-from ambiguous_wild.harness.result_file import FAILED, RESULT, model_hash, read_result, write_result
+from ambiguous_wild.harness.result_file import (
+    FAILED,
+    RESULT,
+    RunConfig,
+    model_hash,
+    read_result,
+    write_result,
+)
 from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.harness.training import Tick, train_and_measure
 from ambiguous_wild.io import plain_yaml
@@ -41,13 +48,14 @@ ENVIRONMENT = "env.json"
 TRACEBACK = "traceback.txt"
 LOG_FILE = "log.txt"
 EFFECTS = "effects.json"
-# What a run leaves before anything worth keeping exists in its folder.
+# Files that a run writes before there is anything worth keeping in its folder.
 _WORTHLESS = {CONFIG, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK, LOG_FILE}
 LOG = logging.getLogger(__name__)
+Flat = Mapping[str, object]  # a configuration with dotted keys, "train.seed"
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether the folder has a result that can be read; a damaged one is made again."""
+    """Return whether the folder has a result that can be read; a run with a damaged one is made again."""
     if not (folder / RESULT).is_file():
         return False
     try:
@@ -57,40 +65,37 @@ def is_finished(folder: Path) -> bool:
     return True
 
 
-def left_alone(
-    folder: Path, overwrite: Overwrite, config: Mapping[str, Any]
-) -> Literal["kept", "skipped"] | None:
-    """What a run becomes that need not be made: finished before, or to be left as it is; else None."""
+def left_alone(folder: Path, overwrite: Overwrite, config: RunConfig) -> Literal["kept", "skipped"] | None:
+    """Return the outcome of a run that need not be made: "kept" or "skipped"; None if it must be made."""
     if overwrite == "never":
         return "skipped" if folder.exists() else None
     return "kept" if is_finished(folder) and not made_anew(folder, overwrite, config) else None
 
 
-def made_anew(folder: Path, overwrite: Overwrite, config: Mapping[str, Any]) -> bool:
-    """Whether an earlier run of the folder is to be replaced: always, or where the method's file changed."""
+def made_anew(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
+    """Return whether an earlier run in the folder is replaced: always, or where the method's file changed."""
     if overwrite != "changed":
         return overwrite == "always"
-    names = _different(read_config(folder), config)
-    return "source" in names and all(k == "source" or k.startswith("options.") for k in names)
+    keys = _different_keys(flatten(read_config(folder)), flatten(dict(config)))
+    return "source" in keys and all(key == "source" or key.startswith("options.") for key in keys)
 
 
-def _different(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Keys that decide the result and differ between two configurations, the method's file first."""
+def _different_keys(before: Flat, now: Flat) -> list[str]:
+    """Return the keys that decide the result and differ, the method's file ("source") first."""
     ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
-    old, new = flatten(dict(before)), flatten(dict(now))
-    names = [k for k in old.keys() | new.keys() if old.get(k) != new.get(k) and k not in ignored]
-    return sorted(names, key=lambda k: (k != "source", k))
+    keys = [k for k in before.keys() | now.keys() if before.get(k) != now.get(k) and k not in ignored]
+    return sorted(keys, key=lambda k: (k != "source", k))
 
 
 def record_failure(cell: Cell, folder: Path, error: BaseException) -> None:
-    """Write failed.json, and the traceback where the error is a fault of this package."""
+    """Write failed.json, and the traceback unless the error is one that users can mend."""
     if not isinstance(error, (AwError, OSError)):
         write_text(folder / TRACEBACK, "".join(traceback.format_exception(error)))
     write_result(folder / FAILED, {**cell.result(error=error_line(error)), **provenance(cell)})
 
 
 def error_line(error: BaseException) -> str:
-    """One line that says what went wrong, with the line of a method's own file."""
+    """Return the error as one line; where it comes from a user's method, with the line in its file."""
     if isinstance(error, AwError):
         return str(error)
     if isinstance(error, OSError):
@@ -99,18 +104,19 @@ def error_line(error: BaseException) -> str:
 
 
 def refuse_strange_folder(folder: Path) -> None:
-    """Raise AwError if the folder holds files, and no run of this package."""
+    """Raise AwError if the folder holds files but no run of this package."""
     if not folder.is_dir():
         raise AwError(f"{folder} is a file, not a run folder; choose another -o")
     names = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
     if names and not names & {RESULT, FAILED, TRACEBACK} and not _is_our_config(folder / CONFIG):
         raise AwError(
-            f"{folder} is not empty and no run of ours (no config.yaml with a config_hash); choose another -o"
+            f"{folder} holds other files and no run of this program (no config.yaml with a config_hash); "
+            "choose another -o"
         )
 
 
 def _is_our_config(path: Path) -> bool:
-    """Whether it holds the settings of a run; a damaged file may, another program's does not."""
+    """Return whether the file holds the settings of a run; a damaged file may do so."""
     if not path.is_file():
         return False
     try:
@@ -119,106 +125,103 @@ def _is_our_config(path: Path) -> bool:
         return True
 
 
-def _said(key: str, before: Mapping[str, Any], now: Mapping[str, Any], cell: Cell) -> str:
-    """What changed, as the command line writes it: a config leaves out the full protocol."""
+def _describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
+    """Return one difference in words of the command line."""
     if key == "source":
         return f"{getattr(file_of(cell.method), 'name', cell.method.name)} has changed since this run"
-    was, is_now = (str(of.get(key, "full" if key == "protocol" else None)) for of in (before, now))
-    return f"{key} was {was}, is {is_now}"
+    default = "full" if key == "protocol" else None  # a config leaves out the full protocol
+    return f"{key} was {before.get(key, default)}, is {now.get(key, default)}"
 
 
-def _of_weights(cell: Cell, names: Sequence[str], before: Mapping[str, Any]) -> str:
-    """What to do where weights that came or went since then changed a default; empty elsewhere."""
-    for key in (name.removeprefix("options.") for name in names):
+def _hint_for_weights(cell: Cell, keys: Sequence[str], before: Flat) -> str:
+    """Return a hint where weights that were added or removed since then changed a default; else ""."""
+    for key in (name.removeprefix("options.") for name in keys):
         if key in cell.method.by_machine() and f"options.{key}" in before:
             same = f"--set {cell.method.name.partition('@')[0]}.{key}={before[f'options.{key}']}"
-            return f"; the default follows the weights on this machine: as before with {same}"
+            return f"; the default depends on the weights on this machine: {same} keeps the earlier value"
     return ""
 
 
 def refuse_other_config(folder: Path, cell: Cell) -> None:
-    """Raise AwError if the folder was made by another configuration; names the keys that differ."""
+    """Raise AwError if the folder was made by another configuration; the error names what differs."""
     path = folder / CONFIG
     present = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
     if not (folder / WORK / DONE).exists():
-        present -= {WORK, LOGS}  # of an external program that has not finished training
+        present -= {WORK, LOGS}  # left by an external program that has not finished training
     if not path.exists() or present <= _WORTHLESS:
-        return  # it stopped before the first checkpoint: there is nothing to lose
+        return  # the run stopped before its first checkpoint: there is nothing to lose
     try:
-        old = plain_yaml.read_mapping(path)
+        before = flatten(plain_yaml.read_mapping(path))
     except AwError as error:
         raise AwError(f"{error}; start anew with --overwrite always") from None
-    if old.get("config_hash") == cell.identity:
+    if before.get("config_hash") == cell.identity:
         return
-    before, now = flatten(old), flatten(dict(cell.config))
-    names = _different(old, cell.config)
-    shown = ", ".join(_said(k, before, now, cell) for k in names[:4]) or "its hash"
+    now = flatten(dict(cell.config))
+    keys = _different_keys(before, now)
+    changes = ", ".join(_describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
     how = "changed" if made_anew(folder, "changed", cell.config) else "always"
     raise AwError(
-        f"{folder} holds a run of another configuration ({shown}); "
-        f"choose another -o, or replace it with --overwrite {how}{_of_weights(cell, names, before)}"
+        f"{folder} holds a run of another configuration ({changes}); "
+        f"choose another -o, or replace it with --overwrite {how}{_hint_for_weights(cell, keys, before)}"
     )
 
 
 def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = None) -> CellReport:
-    """Train and measure, or find that it is done; an error is a report, so that the next cell can run.
+    """Train and measure a cell, or keep its finished run; an error becomes a report, so that others can run.
 
     Args:
         cell: what to run.
         folder: the run folder.
-        options: how it is made and kept.
+        options: how the run is made and kept.
         tick: called after every iteration.
     """
+    place = Path(os.path.realpath(folder))  # one lock and one folder, whatever links lead to it
     try:
-        return _run(cell, Path(os.path.realpath(folder)), options, tick)
-    except (Exception, SystemExit) as error:  # a method of one's own may call sys.exit
+        if place.exists() and options.overwrite == "never":
+            return CellReport(place, "skipped")
+        with folder_lock(place, f"aw bench --method {cell.method.name}"):
+            if not _prepare_folder(cell, place, options.overwrite):
+                return CellReport(place, "kept")
+            with logged_to(_log_file(place / LOG_FILE)):
+                LOG.debug("%s, configuration %s, version %s", run_name(cell), cell.identity[:12], __version__)
+                try:
+                    if cell.method.program is not None:
+                        result = run_program(cell, place)
+                    else:
+                        result = train_and_measure(cell, place, options, tick)
+                    write_result(place / RESULT, {**result, **model_hash(place), **provenance(cell)})
+                except (Exception, SystemExit) as error:
+                    record_failure(cell, place, error)
+                    LOG.debug("failed: %s", error_line(error))
+                    raise
+                except KeyboardInterrupt as stop:
+                    LOG.debug(str(stop) or "interrupted")
+                    raise
+                report = CellReport(place, "trained", result=result)
+                LOG.debug(outcome_line(report))
+                return report
+    except (Exception, SystemExit) as error:  # a user's method may call sys.exit
         where = "" if isinstance(error, (AwError, OSError)) else f"; traceback: {folder / TRACEBACK}"
         return CellReport(folder, "failed", error=error_line(error) + where)
 
 
-def _run(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> CellReport:
-    # `folder` is resolved: one lock and one place, whatever links lead to it
-    if folder.exists() and options.overwrite == "never":
-        return CellReport(folder, "skipped")
-    with folder_lock(folder, f"aw bench --method {cell.method.name}"):
-        if folder.exists():
-            refuse_strange_folder(folder)
-            if made_anew(folder, options.overwrite, cell.config):
-                shutil.rmtree(folder)
-            else:
-                refuse_other_config(folder, cell)
-                if is_finished(folder):
-                    return CellReport(folder, "kept")
-        _begin(cell, folder)
-        with logged_to(_log_file(folder / LOG_FILE)):
-            LOG.debug("%s, configuration %s, version %s", run_name(cell), cell.identity[:12], __version__)
-            try:
-                if cell.method.program is not None:
-                    result = run_program(cell, folder)
-                else:
-                    result = train_and_measure(cell, folder, options, tick)
-                write_result(folder / RESULT, {**result, **model_hash(folder), **provenance(cell)})
-            except (Exception, SystemExit) as error:
-                record_failure(cell, folder, error)
-                LOG.debug("failed: %s", error_line(error))
-                raise
-            except KeyboardInterrupt as stop:
-                LOG.debug(str(stop) or "interrupted")
-                raise
-            report = CellReport(folder, "trained", result=result)
-            LOG.debug(outcome_line(report))
-    return report
-
-
 def _log_file(path: Path) -> logging.Handler:
-    """Adds records to a file, with the time."""
+    """Return a log handler that appends records with their time to a file."""
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
     return handler
 
 
-def _begin(cell: Cell, folder: Path) -> None:
-    """Make the folder, without what an earlier attempt left half-written, and write the settings."""
+def _prepare_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
+    """Check or empty the folder and write the settings; False where it holds the finished run already."""
+    if folder.exists():
+        refuse_strange_folder(folder)
+        if made_anew(folder, overwrite, cell.config):
+            shutil.rmtree(folder)
+        else:
+            refuse_other_config(folder, cell)
+            if is_finished(folder):
+                return False
     folder.mkdir(parents=True, exist_ok=True)
     sweep(folder)
     for name in (FAILED, TRACEBACK):
@@ -227,3 +230,4 @@ def _begin(cell: Cell, folder: Path) -> None:
     write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
     write_json(folder / ENVIRONMENT, environment(cell.device))
     cell.chosen.write(folder / EFFECTS)
+    return True

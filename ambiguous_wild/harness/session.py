@@ -1,4 +1,4 @@
-"""Where cells run: this process, several processes, or a Ray cluster. Imports nothing heavy by itself."""
+"""Run cells in this process, in several processes, or on a Ray cluster. Imports nothing heavy by itself."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ STOP_S = 5.0  # between asking a process to end and ending it
 
 
 class Session:
-    """An engine in use: connects to Ray when that is needed, and disconnects at the end of the `with`."""
+    """An engine in use; it connects to Ray when needed and disconnects at the end of the `with`."""
 
     def __init__(self, engine: Engine, threads: int | None, callbacks: Callbacks | None = None) -> None:
         """
         Args:
             engine: where cells run.
-            threads: of the CPU kernels of one cell; None = the cores, divided.
-            callbacks: told what happens.
+            threads: threads of the CPU kernels of one cell; None = the cores, shared evenly by the cells.
+            callbacks: called at every event.
         """
         self.engine, self.threads = engine, threads
         self.callbacks = Callbacks() if callbacks is None else callbacks
-        self.gpus: list[str] = []  # of this machine, where its processes share them out
+        self.gpus: list[str] = []  # of this machine; its processes take turns with them
         self.cluster: RayCluster | None = None
 
     def __enter__(self) -> Session:
@@ -48,10 +48,10 @@ class Session:
             self.cluster.close()
 
     def device(self, device: str) -> str:
-        """ "cpu" or "cuda": of a cluster by what its nodes offer, else of this machine.
+        """Return "cpu" or "cuda" for "auto": what the nodes of the cluster offer, or this machine.
 
         Raises:
-            AwError: "cuda" was asked for and cannot be used here; says what is missing.
+            AwError: "cuda" was asked for and cannot be used here; the error says what is missing.
         """
         if self.engine.remote:
             if device == "auto":
@@ -64,7 +64,10 @@ class Session:
         return choose(device, self.callbacks.say)
 
     def in_process(self, cells: Sequence[Cell]) -> bool:
-        """Whether cells run in this process, one by one; else `run` starts others. Each GPU takes a cell."""
+        """Return whether cells run in this process one by one; otherwise `run` starts other processes.
+
+        Where the number of jobs is open, there is one for each GPU.
+        """
         if self.engine.engine != "local":
             return False
         if any(cell.device == "cuda" for cell in cells):
@@ -82,7 +85,7 @@ class Session:
         options: RunOptions,
         sources: tuple[Source, ...] = (),  # code that the runs need
     ) -> list[CellReport]:
-        """Run the cells in processes of this machine or on the cluster; reports in their order."""
+        """Run the cells in processes of this machine or on the cluster; return reports in their order."""
         from ambiguous_wild.harness.grid import checked_folders
         from ambiguous_wild.harness.job import make_job, record_lost
 
@@ -103,18 +106,18 @@ class Session:
         if cluster is not None:
             say(f"Ray: {cluster.describe()}")
             return cluster.run(jobs, lost, ended, say)
-        at_a_time = engine.jobs or 1
-        if self.gpus and min(at_a_time, len(jobs)) > len(self.gpus):
-            have = "1 GPU" if len(self.gpus) == 1 else f"{len(self.gpus)} GPUs"
+        processes = engine.jobs or 1
+        if self.gpus and min(processes, len(jobs)) > len(self.gpus):
+            gpus = "1 GPU" if len(self.gpus) == 1 else f"{len(self.gpus)} GPUs"
             say(
-                f"warning: {at_a_time} cells at a time share {have}, memory and time; "
-                f"--jobs {len(self.gpus)} gives each its own"
+                f"warning: {processes} cells at a time share the memory and the time of {gpus}; "
+                f"--jobs {len(self.gpus)} gives each cell a GPU"
             )
 
         def started(index: int) -> None:
             self.callbacks.started(cells[index], folders[index])
 
-        return run_in_processes(jobs, at_a_time, engine.retries, lost, started, ended, self.gpus)
+        return run_in_processes(jobs, processes, engine.retries, lost, started, ended, self.gpus)
 
     def _connected(self) -> RayCluster:
         if self.cluster is None:
@@ -129,15 +132,16 @@ def _cores() -> int:
 
 
 def visible_gpus(count: int) -> list[str]:
-    """The first `count` GPUs of this process by the names that CUDA_VISIBLE_DEVICES of a child needs.
+    """Return the first `count` GPUs of this process as a child's CUDA_VISIBLE_DEVICES must name them.
 
-    Where that variable is set here, its own entries: numbers of the machine's GPUs, UUIDs (``GPU-...``) or
-    MIG instances. A child that got 0 to `count` - 1 instead would leave what this process was given. Entries
-    after an invalid one do not count, as for CUDA; torch's count says how many that leaves.
+    If that variable is set in this process, its entries are used: numbers of the machine's GPUs, UUIDs
+    (``GPU-...``) or MIG instances. With 0 to `count` - 1 a child would use other GPUs than this process was
+    given. CUDA ignores entries after an invalid one; `count`, which comes from torch, does not include them.
     """
-    given = os.environ.get(VISIBLE)
-    names = [str(i) for i in range(count)] if given is None else [name.strip() for name in given.split(",")]
-    return names[:count]
+    entries = os.environ.get(VISIBLE)
+    if entries is None:
+        return [str(i) for i in range(count)]
+    return [name.strip() for name in entries.split(",")][:count]
 
 
 def run_in_processes(
@@ -149,18 +153,18 @@ def run_in_processes(
     on_end: Callable[[int, CellReport], None] = lambda index, report: None,
     gpus: Sequence[str] = (),
 ) -> list[CellReport]:
-    """Run every job, at most `processes` at a time; a process that dies costs its cell one attempt.
+    """Run every job, at most `processes` at a time; a process that dies costs its job one attempt.
 
-    Not a `ProcessPoolExecutor`: there one killed process ends the others, and running ones cannot be ended.
+    A `ProcessPoolExecutor` does not do: one killed process ends all others, and none can be stopped.
 
     Args:
         jobs: what to run; each writes its own folder.
-        processes: how many at a time.
+        processes: number of processes at a time.
         retries: how often a job is run again whose process died (killed, out of memory).
         lost: makes the report of a job whose process died too often, from its index and the reason.
-        on_start: told the index when a job begins, again when it begins again.
-        on_end: told the index and what became of it.
-        gpus: as CUDA_VISIBLE_DEVICES names them; each process sees one of them, in turns.
+        on_start: called with the index whenever a job begins, also when it is run again.
+        on_end: called with the index and the report of a job that has ended.
+        gpus: names for CUDA_VISIBLE_DEVICES; each process gets one of them, in turns.
 
     Returns:
         Reports in the order of the jobs.
@@ -203,7 +207,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=serve, args=(theirs,))
-        # there from the start: spawn imports the caller's main module first, and CUDA reads it once
+        # set before the start: spawn imports the caller's main module first, and CUDA reads it only once
         before = os.environ.get(VISIBLE)
         if gpu is not None:
             os.environ[VISIBLE] = gpu
@@ -222,7 +226,7 @@ class _Worker:
             self.connection.send(job)
 
     def receive(self) -> tuple[int, CellReport | None]:
-        """The job's index and report; None where the process died."""
+        """Return the job's index and report; None for the report if the process died."""
         assert self.index is not None
         index, self.index = self.index, None
         try:
@@ -231,9 +235,9 @@ class _Worker:
             return index, None
 
     def stop(self) -> str:
-        """End the process if it has not ended; how it did."""
+        """End the process if it has not ended; return how it ended."""
         if self.index is not None:
-            self.process.terminate()  # a run in the middle: its checkpoint is what stays
+            self.process.terminate()  # the run is not finished: its last checkpoint remains
         self.connection.close()
         self.process.join(STOP_S)
         if self.process.is_alive():
@@ -244,8 +248,8 @@ class _Worker:
 
 
 def serve(connection: Connection) -> None:
-    """The loop of a worker process; it ends when the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends us
+    """Run the jobs of the pipe in a worker process until the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends this one
     threading.Thread(target=_follow_parent, daemon=True).start()
     from ambiguous_wild.harness.job import run_job
 
@@ -255,7 +259,7 @@ def serve(connection: Connection) -> None:
 
 
 def _follow_parent() -> None:
-    """End when the parent ends: a worker that outlives a killed parent would keep its folder locked."""
+    """End this process when the parent ends, as its run folder would stay locked otherwise."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])

@@ -1,20 +1,20 @@
-"""Pictures in a grid with captions: sheets of a capture, of masks, and the one that compares runs."""
+"""Sheets of pictures with captions in a grid: of a capture, of masks, and of runs side by side."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import NotRequired, TypedDict, TypeVar
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.harness.models import open_scene
 from ambiguous_wild.harness.regions import true_distractor
 from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.page_parts import jpeg_bytes
@@ -26,13 +26,14 @@ GAP, BAR = 6, 20  # px between cells; height of a caption
 FONT, SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 NAME = "sheet.jpg"
 WIDTH = 320  # px of a photo on the sheets of a capture and of masks
-CAPTURE_COLUMNS, MASK_COLUMNS, MOST_MASKS = 4, 5, 20  # photos in a row; at most
+CAPTURE_COLUMNS, MASK_COLUMNS = 4, 5  # photos in a row
+MOST_MASKS = 20  # photos on a sheet of masks
 
 
 def cell(caption: str, image: np.ndarray, width: int | None = None) -> np.ndarray:
-    """The image [H, W, 3] uint8 under its caption, at another width where one is given.
+    """Draw the image [H, W, 3] uint8 under its caption, resized to `width` px if that is given.
 
-    A caption that is wider than its picture is set smaller, and cut where even that does not do.
+    A caption wider than its picture is set smaller, and cut if it is still too wide.
     """
     if width is not None and image.shape[1] != width:
         size = (width, max(round(image.shape[0] * width / image.shape[1]), 1))
@@ -55,7 +56,7 @@ def _width(text: str, scale: float) -> int:
 
 
 def stack(images: Sequence[np.ndarray], axis: int) -> np.ndarray:
-    """Images below (axis 0) or beside (axis 1) each other, padded with white to a common size."""
+    """Join images below (axis 0) or beside (axis 1) each other, padded with white to a common size."""
     other = 1 - axis
     most = max(image.shape[other] for image in images)
     padded = []
@@ -67,12 +68,12 @@ def stack(images: Sequence[np.ndarray], axis: int) -> np.ndarray:
 
 
 def grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Cells row by row."""
+    """Join cells row by row."""
     return stack([stack(cells[k : k + columns], 1) for k in range(0, len(cells), columns)], 0)
 
 
 def spread(items: Sequence[Item], count: int) -> list[Item]:
-    """At most `count` of the items, evenly chosen, the first and the last among them."""
+    """Return at most `count` of the items, evenly spaced, with the first and the last."""
     if not items:
         return []
     index = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
@@ -90,20 +91,20 @@ def write_capture_sheet(raw: Path, path: Path | None = None) -> Path:
     """Write a JPEG of eight train photos, two with their truth, and four test photos.
 
     Args:
-        raw: a capture of `aw simulate`.
+        raw: folder of a capture of `aw simulate`.
         path: JPEG to write; None: ``RAW/truth/sheet.jpg``, where no builder takes it for a photo.
 
     Returns:
-        What was written.
+        The path written.
 
     Raises:
         AwError: a photo of the capture is missing.
     """
-    facts = json.loads((raw / "truth" / "capture.json").read_text(encoding="utf-8"))
-    train = sorted(facts["photos"])
+    photos = json.loads((raw / "truth" / "capture.json").read_text(encoding="utf-8"))["photos"]
+    train = sorted(photos)
     test = sorted(p.name for p in (raw / "test").iterdir())
     cells = [
-        cell(_caption(name, facts), read_png_rgb(raw / "train" / name), WIDTH)
+        cell(_caption(name, photos[name]), read_png_rgb(raw / "train" / name), WIDTH)
         for name in spread(train, 2 * CAPTURE_COLUMNS)
     ]
     for name in spread(train, 2):
@@ -117,8 +118,14 @@ def write_capture_sheet(raw: Path, path: Path | None = None) -> Path:
     return target
 
 
-def _caption(name: str, facts: dict[str, Any]) -> str:
-    photo = facts["photos"][name]
+class PhotoFacts(TypedDict):
+    """What capture.json says of a photo."""
+
+    occlusion: float  # share of the pixels
+    effects: NotRequired[dict[str, dict[str, object]]]
+
+
+def _caption(name: str, photo: PhotoFacts) -> str:
     words = [f"{Path(name).stem} {100 * photo['occlusion']:.0f} %"]
     for drawn in photo.get("effects", {}).values():
         words += [f"{key} {value:.2g}" for key, value in drawn.items() if isinstance(value, float)]
@@ -144,17 +151,17 @@ def write_contact(
     """Write a JPEG of train photos, the masked region tinted, each with its masked share.
 
     Args:
-        scene: whose train photos.
-        masks: RUN/masks: keep maps by the photo's name, white = keep.
+        scene: the scene with the train photos.
+        masks: RUN/masks, keep maps by the photo's name, white = keep.
         path: JPEG to write.
-        names: photos to show; empty: up to `most`, evenly chosen among those with a mask.
-        most: photos at most.
+        names: photos to show; empty: up to `most`, evenly spaced among those with a mask.
+        most: largest number of photos.
 
     Returns:
-        What was written: nothing where the method masks nothing.
+        The path written; empty if no photo has a mask.
 
     Raises:
-        AwError: a name that is no train photo.
+        AwError: a name is no train photo.
     """
     by_name = {view.name: view for view in scene.train}
     for name in names:
@@ -183,20 +190,20 @@ def _tinted(scene: Scene, view: View, masks: Path) -> np.ndarray:
 
 
 def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int = 3) -> int:
-    """Write the sheet of one scene: a column a method (first seed), `views` test and train rows.
+    """Write the sheet of one scene: a column for each method (first seed), `views` test and train rows.
 
     Args:
-        runs: what `read_runs` found.
-        path: PNG to write, or JPG by its ending.
-        scene: its name; None where the runs are of one scene only.
-        views: rows of each kind.
+        runs: runs from `read_runs`.
+        path: file to write, PNG or JPEG by its ending.
+        scene: name of the scene; None if the runs are of a single scene.
+        views: number of test rows, and of train rows.
 
     Returns:
         The number of methods shown.
 
     Raises:
-        AwError: several scenes and none named, no finished run, the scene folder has moved, or a
-            run lacks its renders.
+        AwError: several scenes and no name, no finished run, the scene folder has been moved, or a run lacks
+            its renders.
     """
     finished = runs.runs[runs.runs["status"] == "ok"]
     names = sorted(finished["scene"].unique())
@@ -222,8 +229,8 @@ def _test_row(view: View, folders: dict[str, Path]) -> list[np.ndarray]:
         path = folder / "renders" / "test" / Path(view.name).with_suffix(".png")
         if not path.is_file():
             raise AwError(
-                f"the run {folder} lacks its render {path.relative_to(folder)}: restore it, or make the run "
-                "again with 'aw bench --overwrite always'"
+                f"the run {folder} lacks its render {path.relative_to(folder)}: restore it, or train again "
+                "with 'aw bench --overwrite always'"
             )
         render = read_png_rgb(path)
         cells.append(cell(f"{method}  {psnr(render, photo):.2f} dB", render))

@@ -1,11 +1,11 @@
-"""Read run folders into tidy tables; a missing value is NaN, and its reason has a row."""
+"""Read run folders into tidy tables. A missing value is NaN, and its reason has a row."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,19 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
-from ambiguous_wild.core.errors import counted
+from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, own
-from ambiguous_wild.harness.result_file import FAILED, RESULT, RunResult, metrics_of, read_result
+from ambiguous_wild.harness.result_file import (
+    FAILED,
+    RESULT,
+    Environment,
+    Options,
+    RunFacts,
+    RunResult,
+    mask_scores,
+    metrics_of,
+    read_result,
+)
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
@@ -28,7 +38,9 @@ TEXT_OF_RUNS = (
     "timing_kernel", "hardware", "effects", "length", "features",
     "test_photos", "start",
 )  # fmt: skip
-FoundResult = tuple[Path, RunResult]  # of this run folder
+FolderResult = tuple[Path, RunResult]  # a run folder and its result
+# config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
+ReadConfig = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -43,15 +55,14 @@ class Incomplete:
 
 @dataclass(frozen=True)
 class Runs:
-    """Every result below a folder, tidy.
+    """All results below a folder, as tidy tables.
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, fit (what was done with test photos, see tables/notes.py), effects, length and features that
-        it was trained with (words; empty features: the method has none), test_photos (what is wrong with
-        them; empty: nothing that is known), device, the numbers of "cost",
-        timing ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
-        mask_precision, mask_recall.
+        version, fit (what was done with test photos, see report/notes.py), effects, length and features of
+        the training (words; features are empty if the method has none), test_photos (a warning about them,
+        or empty), device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason,
+        timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -66,11 +77,11 @@ class Runs:
 
 
 def read_runs(*folders: Path | str) -> Runs:
-    """Every result below folders of runs, at any depth.
+    """Read every result below folders of runs, at any depth.
 
-    A run is a folder with config.yaml, metrics.json or failed.json in it. One without a result (still
-    running, or stopped) and a damaged result are listed under `incomplete`, not dropped. A method that two
-    folders have for one scene and seed is called "METHOD in FOLDER".
+    A run is a folder with config.yaml, metrics.json or failed.json in it. A run without a result (still
+    running, or stopped) or with a damaged one is listed under `incomplete`, not dropped. If two folders have
+    a method for the same scene and seed, it is called "METHOD in FOLDER".
 
     Raises:
         AwError: no such folder, no run in it, or two results in it for the same method, scene and seed.
@@ -78,11 +89,11 @@ def read_runs(*folders: Path | str) -> Runs:
     incomplete: list[Incomplete] = []
     roots = list({Path(folder).resolve(): Path(folder) for folder in folders}.values())
     of_root = [_read_folder(root, incomplete) for root in roots]
-    owners = Counter((r["scene"], r["method"], r["seed"]) for found in of_root for _, r in found)
+    owners = Counter((r["scene"], r["method"], r["seed"]) for members in of_root for _, r in members)
     shared = {method for (_, method, _), count in owners.items() if count > 1}
-    results: list[FoundResult] = []
-    for root, found in zip(roots, of_root):
-        for run, result in found:
+    results: list[FolderResult] = []
+    for root, members in zip(roots, of_root):
+        for run, result in members:
             if result["method"] in shared:
                 result["method"] = f"{result['method']} in {root}"
             results.append((run, result))
@@ -97,13 +108,11 @@ def read_runs(*folders: Path | str) -> Runs:
     )
 
 
-def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FoundResult]:
-    """The results below one folder; runs without one are added to `incomplete`."""
-    if not root.is_dir():
-        raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
-    results: list[FoundResult] = []
+def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FolderResult]:
+    """Read the results below one folder; runs without a result are added to `incomplete`."""
+    results: list[FolderResult] = []
     before = len(incomplete)
-    for run in run_folders(root):
+    for run in find_runs([root]):
         paths = [run / name for name in (RESULT, FAILED) if (run / name).exists()]
         try:
             if not paths:
@@ -112,7 +121,7 @@ def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FoundResult]:
                 )
             result = read_result(paths[0])
             for what, value, why in impossible_values(result):
-                raise AwError(f"{paths[0]} was changed: {what} is {value:g}, and such a number {why}")
+                raise AwError(f"{paths[0]} was changed: {what} is {value:g}, but such a number {why}")
             results.append((run, result))
         except AwError as error:
             incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
@@ -126,7 +135,7 @@ ROUNDING = 1e-9  # by which a share computed in floats may leave its range
 
 
 def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
-    """Numbers that no measurement can give: which, the value, and what such a number is instead."""
+    """Yield each number that no measurement can give: its name, its value, and the rule that it breaks."""
     for row in result["per_image"]:
         for metric, value in metrics_of(row).items():
             about = measure(metric)
@@ -134,17 +143,16 @@ def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
                 continue
             if not about.low - ROUNDING <= value <= about.high + ROUNDING:
                 yield f"{metric} of {row['name']}", value, f"lies between {about.low:g} and {about.high:g}"
-    masks: Mapping[str, Any] = result["masks"] or {}
-    for name in MASK_LABELS:
-        if masks.get(name) is not None and not 0.0 <= masks[name] <= 1.0 + ROUNDING:
-            yield f"masks.{name}", masks[name], "is a share, from 0 to 1"
+    for name, score in mask_scores(result).items():
+        if not 0.0 <= score <= 1.0 + ROUNDING:
+            yield f"masks.{name}", score, "is a share, from 0 to 1"
     for name, amount in result["cost"].items():
         if isinstance(amount, (int, float)) and not (math.isfinite(amount) and amount >= 0):
             yield f"cost.{name}", amount, "is finite and not below 0"
 
 
 def _no_run(root: Path) -> AwError:
-    """The error for a folder without runs; it says what the folder is, where that can be seen."""
+    """Return the error for a folder without runs; it says what the folder holds, where that is clear."""
     within = [root, *(child for child in root.iterdir() if child.is_dir())]
     if (root / "scene.json").exists():
         return AwError(
@@ -152,27 +160,48 @@ def _no_run(root: Path) -> AwError:
         )
     if any(path.suffix.lower() in PHOTO_SUFFIXES for folder in within for path in folder.iterdir()):
         return AwError(
-            f"{root} holds photos, not runs: 'aw build-scene {root} -o scene' makes a scene of them, "
-            "'aw bench --method NAME --scene scene -o runs' the runs"
+            f"{root} holds photos, not runs: 'aw build-scene {root} -o scene' makes a scene of them, and "
+            "'aw bench --method NAME --scene scene -o runs' makes runs"
         )
     return AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {root}' makes one")
 
 
 def run_folders(root: Path) -> Iterator[Path]:
-    """Folders that hold a result or the settings of a run, in the order of their paths.
+    """Yield the folders that hold a result or the settings of a run, in the order of their paths.
 
-    A name alone makes no run: a scene may be called seed1.
+    The name of a folder does not matter: a scene may be called seed1.
     """
     for name, folders, files in os.walk(root):
-        # Caches and half-written folders begin with a dot.
+        # names of caches and half-written folders begin with a dot
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         if not {RESULT, FAILED, CONFIG}.isdisjoint(files):
             folders.clear()
             yield Path(name)
 
 
-def read_config(run: Path) -> dict[str, Any]:
-    """The run's config.yaml; empty where it is absent or damaged."""
+def check_names(kind: str, names: Iterable[str], present: Sequence[str]) -> None:
+    """Raise AwError for the first of the names of methods, scenes or metrics that no run has."""
+    for name in names:
+        if name not in present:
+            raise unknown(kind, name, present)
+
+
+def find_runs(folders: Sequence[Path]) -> list[Path]:
+    """Return the run folders below, each once, as one of the given folders may be inside another.
+
+    Raises:
+        AwError: no such folder.
+    """
+    runs: dict[Path, Path] = {}
+    for root in folders:
+        if not root.is_dir():
+            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+        runs |= {run.resolve(): run for run in run_folders(root)}
+    return list(runs.values())
+
+
+def read_config(run: Path) -> ReadConfig:
+    """Return the run's config.yaml; empty where it is absent or damaged."""
     try:
         return plain_yaml.read_mapping(run / CONFIG)
     except AwError:
@@ -180,30 +209,30 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def known_iterations(root: Path) -> int | None:
-    """The length of the first run below a folder; None where there is none, or it is not known."""
+    """Return the iterations of the first run below a folder; None without a run that says them."""
     for run in run_folders(root):
         train = read_config(run).get("train")
-        known = train.get("iterations") if isinstance(train, dict) else None
-        if isinstance(known, int):
-            return known
+        iterations = train.get("iterations") if isinstance(train, dict) else None
+        if isinstance(iterations, int):
+            return iterations
     return None
 
 
 def _method_and_scene(run: Path) -> tuple[str, str]:
-    """Whose run it is, for one without a result: by its settings, else by its path."""
+    """Return method and scene of a run without a result: from its settings, else from its path."""
     config, method_folder = read_config(run), run.absolute().parent
     scene = config.get("scene")
     name = scene.get("name") if isinstance(scene, dict) else None
     return str(config.get("method") or method_folder.name), str(name or method_folder.parent.name)
 
 
-def _refuse_duplicates(results: list[FoundResult]) -> None:
+def _refuse_duplicates(results: list[FolderResult]) -> None:
     seen: dict[tuple[str, str, int], tuple[Path, str]] = {}
     for run, result in results:
         key = (result["scene"], result["method"], result["seed"])
         if key in seen:
             other, settings = seen[key]
-            # of the same settings they are copies, which `aw cost` refuses too
+            # two runs with the same settings are copies, which `aw cost` refuses too
             both = " ('aw cost' takes both)" if settings != result["config_hash"] else ""
             raise AwError(
                 f"two results for method {key[1]!r} on scene {key[0]!r} with seed {key[2]}: {other} and "
@@ -212,13 +241,16 @@ def _refuse_duplicates(results: list[FoundResult]) -> None:
         seen[key] = run, result["config_hash"]
 
 
-def _key(result: RunResult) -> dict[str, Any]:
+TableRow = dict[str, object]  # by column
+
+
+def _key(result: RunResult) -> TableRow:
     return {"scene": result["scene"], "method": result["method"], "seed": result["seed"]}
 
 
-def _image_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
+def _image_rows(results: list[FolderResult]) -> Iterator[TableRow]:
     for _, result in results:
-        # A metric that one image lacks, or the whole run, has a row of its own: NaN is not "not asked".
+        # a metric that one image or the whole run lacks has a row with NaN; one never measured has no row
         measured = [(row["name"], metrics_of(row)) for row in result["per_image"]]
         metrics = dict.fromkeys(metric for _, values in measured for metric in values)
         metrics |= dict.fromkeys(result["missing"])
@@ -234,8 +266,8 @@ def _image_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
                 }
 
 
-def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
-    masks: Mapping[str, Any] = result["masks"] or {}
+def _run_row(run: Path, result: RunResult) -> TableRow:
+    masks = mask_scores(result)
     cost = {k: v for k, v in result["cost"].items() if not isinstance(v, (dict, list))}
     timing = timing_of(result["cost"])
     return (
@@ -257,44 +289,44 @@ def _run_row(run: Path, result: RunResult) -> dict[str, Any]:
         | cost
         | {"timing": timing.verdict, "timing_reason": timing.reason, "timing_kernel": timing.kernel}
         | {"hardware": _hardware(result)}
-        | {f"mask_{k}": math.nan if masks.get(k) is None else masks[k] for k in MASK_LABELS}
+        | {f"mask_{k}": masks.get(k, math.nan) for k in MASK_LABELS}
     )
 
 
-def effects_of(facts: Mapping[str, Any]) -> str:
-    """The effects that a run was trained with, in words."""
+def effects_of(facts: RunFacts) -> str:
+    """Return the effects that a run was trained with, as text."""
     names = facts.get("effects")
     if facts.get("no_effects"):
         return f"none: {facts['no_effects']}"
     return ", ".join(map(str, names)) if isinstance(names, list) and names else "none"
 
 
-def _length(config: Mapping[str, Any]) -> str:
-    """`asked_length` of a run whose result does not say it yet; empty where config.yaml does not either."""
+def _length(config: ReadConfig) -> str:
+    """Return `asked_length` from config.yaml, for results of earlier versions; empty if it is not there."""
     train = config.get("train")
-    known = train if isinstance(train, dict) else {}
-    if known.get("budget_s") is not None:
-        return f"{known['budget_s']:g} s"
-    return f"{known['iterations']} iterations" if "iterations" in known else ""
+    settings = train if isinstance(train, dict) else {}
+    if settings.get("budget_s") is not None:
+        return f"{settings['budget_s']:g} s"
+    return f"{settings['iterations']} iterations" if "iterations" in settings else ""
 
 
-def _features(options: Mapping[str, Any]) -> str:
-    """Options that are called `features`, whichever part of the method has them."""
-    known = {str(v) for key, v in flatten(options).items() if key.rpartition(".")[2] == "features"}
-    return ", ".join(sorted(known))
+def _features(options: Options) -> str:
+    """Return the values of all options called `features`, whichever part of the method has them."""
+    features = {str(v) for key, v in flatten(options).items() if key.rpartition(".")[2] == "features"}
+    return ", ".join(sorted(features))
 
 
 def _hardware(result: RunResult) -> str:
-    """What times depend on: the GPU, or the processor and the threads; empty where it is not known."""
-    known: Mapping[str, Any] = result.get("environment") or {}
-    if known.get("gpu"):
-        return str(known["gpu"])
+    """Return the GPU, or the processor and the threads; empty where they are not known."""
+    machine: Environment = result.get("environment") or {}
+    if machine.get("gpu"):
+        return machine["gpu"]
     threads = result["cost"].get("threads")
-    return f"{known['cpu']}, {threads} threads" if known.get("cpu") and threads else ""
+    return f"{machine['cpu']}, {threads} threads" if machine.get("cpu") and threads else ""
 
 
-def _fit(facts: Mapping[str, Any]) -> str:
-    """What the method did with test photos, a key of `notes.FITTED`."""
+def _fit(facts: RunFacts) -> str:
+    """Return what the method did with test photos, a key of `notes.FITTED`."""
     if facts.get("protocol", "full") != "half":
         return "full"
     fitted = facts.get("fitted")
@@ -303,19 +335,19 @@ def _fit(facts: Mapping[str, Any]) -> str:
     return "fitted" if fitted.get("steps") else "read" if fitted.get("read_by") else "plain"
 
 
-def _missing_rows(results: list[FoundResult]) -> Iterator[dict[str, Any]]:
+def _missing_rows(results: list[FolderResult]) -> Iterator[TableRow]:
     for _, result in results:
         for metric, reason in result["missing"].items():
             yield _key(result) | {"metric": metric, "reason": reason}
 
 
-def _frame(rows: Iterator[dict[str, Any]], columns: list[str]) -> pd.DataFrame:
+def _frame(rows: Iterator[TableRow], columns: list[str]) -> pd.DataFrame:
     listed = list(rows)
     return pd.DataFrame(listed) if listed else pd.DataFrame(columns=columns)
 
 
 def could_be_measured(results: Iterable[RunResult]) -> list[str]:
-    """Metrics that these results lack and that can be measured now, as weights have come; and own ones."""
+    """Return the metrics that these results lack and that can be measured now, own metrics included."""
     from ambiguous_wild.metrics import lpips  # imports torch
 
     now = {name for name, reason in lpips.available().items() if reason is None}
@@ -325,8 +357,8 @@ def could_be_measured(results: Iterable[RunResult]) -> list[str]:
 
 
 def lacks(result: RunResult, metric: str) -> bool:
-    """Whether it is not measured there, or by another state of its file."""
-    known, mine = result.get("metrics", {}).get(metric), own().get(metric)
-    if mine is not None and known is not None and known["source"] != mine.source:
+    """Return whether the result lacks the metric, or has it from another version of the metric's file."""
+    record, mine = result.get("metrics", {}).get(metric), own().get(metric)
+    if mine is not None and record is not None and record["source"] != mine.source:
         return True
     return all(metrics_of(row).get(metric) is None for row in result["per_image"])

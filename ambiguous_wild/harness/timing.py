@@ -1,7 +1,7 @@
-"""Whether the times of runs can be compared, and in which seconds. Reads records.
+"""Decide from a run's records whether its time can be compared with others, and in which seconds.
 
     timing = timing_of(result["cost"])       # verdict and reason of one run
-    text = seconds_range([c["train_s"] for c in costs])     # shown instead, unranked
+    text = seconds_range([c["train_s"] for c in costs])     # shown where times are not ranked
 
 A run is *alone* where nothing else used its processors, and *contended* otherwise. `reference_s` is the
 training time in seconds of a stated machine: how often the calibration kernel (`splat/calibration.py`) would
@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.result_file import Cost
 
 Verdict = Literal["alone", "contended", "unknown"]
 VERDICTS: tuple[Verdict, ...] = ("alone", "contended", "unknown")
@@ -26,7 +29,7 @@ UNTIMED = "its time was not calibrated (an earlier version, several GPUs, or an 
 
 @dataclass(frozen=True)
 class Timing:
-    """What is known about the time of one run."""
+    """Whether the time of one run can be compared, and the time itself."""
 
     verdict: Verdict
     reason: str  # why it is contended or unknown; empty for a run that was alone
@@ -34,26 +37,26 @@ class Timing:
     reference_s: float  # training in seconds of the reference machine; NaN without calibration
 
 
-def timing_of(cost: Mapping[str, Any]) -> Timing:
-    """The timing in the "cost" of a result; "unknown" where it holds none."""
+def timing_of(cost: Cost) -> Timing:
+    """Return the timing in the "cost" of a result; its verdict is "unknown" where there is no record."""
     record = cost.get("timing")
-    if not isinstance(record, Mapping) or record.get("verdict") not in VERDICTS:
+    if record is None or record["verdict"] not in VERDICTS:
         return Timing("unknown", UNTIMED, "", math.nan)
     seconds = cost.get("reference_s")
     return Timing(
         record["verdict"],
-        str(record.get("reason", "")),
-        str(record.get("kernel", "")),
-        math.nan if seconds is None else float(seconds),
+        record["reason"],
+        record.get("kernel", ""),
+        math.nan if seconds is None else seconds,
     )
 
 
 def seconds_range(values: Sequence[float], digits: int = 0) -> str:
-    """Times that are not ranked: "129 to 230", or one number where they print alike; empty without any."""
-    known = [v for v in values if math.isfinite(v)]
-    if not known:
+    """Return times as a range, "129 to 230", or one number where they print alike; empty without any."""
+    finite = [v for v in values if math.isfinite(v)]
+    if not finite:
         return ""
-    low, high = (f"{v:.{digits}f}" for v in (min(known), max(known)))
+    low, high = (f"{v:.{digits}f}" for v in (min(finite), max(finite)))
     return low if low == high else f"{low} to {high}"
 
 
@@ -62,10 +65,10 @@ def in_reference_seconds(
     reference_s: float,  # of the kernel on the reference machine
     at: Sequence[float],  # seconds of training
 ) -> np.ndarray:
-    """Seconds of training as seconds of the reference machine.
+    """Convert seconds of training to seconds of the reference machine.
 
-    Between two samples the machine's speed is their mean (kernels a second); before the first and after the
-    last it is theirs.
+    Between two samples the machine's speed is their mean (kernels a second); before the first sample it is
+    that of the first, after the last that of the last.
 
     Returns:
         [n] float64, increasing with `at`; NaN without samples.
@@ -76,26 +79,32 @@ def in_reference_seconds(
     begin, kernel = np.asarray(samples, np.float64).reshape(-1, 2).T
     speed = reference_s / kernel  # reference seconds a second
     steps = np.diff(begin) * 0.5 * (speed[1:] + speed[:-1])
-    there = np.concatenate([[begin[0] * speed[0]], begin[0] * speed[0] + np.cumsum(steps)])
-    inside = np.interp(times, begin, there)
+    at_samples = np.concatenate([[begin[0] * speed[0]], begin[0] * speed[0] + np.cumsum(steps)])
+    inside = np.interp(times, begin, at_samples)
     early, late = np.minimum(times - begin[0], 0.0) * speed[0], np.maximum(times - begin[-1], 0.0) * speed[-1]
     return inside + early + late
 
 
 # ms of a step of 3dgs on the reference machine (splat/calibration.py): a constant, a part for every 1000 px
-# and one for every 1000 Gaussians. Of captures of 240x134 to 480x268 with 32 000 to 102 000 Gaussians; a
-# capture's own share is between these:
+# and one for every 1000 Gaussians. Fitted to captures of 240x134 to 480x268 px with 32 000 to 102 000
+# Gaussians, whose times were LEAST to MOST times what the formula gives.
 STEP_MS, PIXELS_MS, GAUSSIANS_MS = 2.2, 0.09, 0.22
 LEAST, MOST = 0.67, 1.5
 
 
 def expected_s(iterations: int, pixels: int, gaussians: int) -> float:
-    """Seconds of so many iterations of 3dgs on the reference machine, to within `LEAST` and `MOST`."""
+    """Return the expected seconds of 3dgs on the reference machine; the true ones are LEAST to MOST times it.
+
+    `pixels` are those of a photo, `gaussians` the number at the end.
+    """
     return 1e-3 * iterations * (STEP_MS + 1e-3 * (PIXELS_MS * pixels + GAUSSIANS_MS * gaussians))
 
 
 def slowness(device: str = "cpu") -> float:
-    """How many times longer than on the reference machine this one takes now; kernels must be compiled."""
+    """Return how many times slower this machine is now than the reference machine.
+
+    The kernels must be compiled.
+    """
     import torch
 
     from ambiguous_wild.splat.calibration import KERNELS, calibration

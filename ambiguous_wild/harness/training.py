@@ -1,4 +1,4 @@
-"""Train the model of a cell, once or twice, write what it renders and masks, and measure that."""
+"""Train the model of a cell, once or twice; write its renders and masks, and measure them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.errors import counted
-from ambiguous_wild.harness import evaluate
-from ambiguous_wild.harness import pictures as pictures_of_training
+from ambiguous_wild.harness import evaluate, pictures
 from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
 from ambiguous_wild.harness.meter import Meter
-from ambiguous_wild.harness.result_file import Cost, RunResult, TimeRecord
+from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult, TimeRecord
 from ambiguous_wild.harness.start import started
 from ambiguous_wild.io.files import atomic_dir, write_json
 from ambiguous_wild.io.images import read_keep_map, write_png
@@ -43,7 +42,7 @@ _NO_MEMORY = ("CUDA out of memory", "CUDA error: out of memory")
 
 
 def reset_peak(device: str = "cpu") -> None:
-    """Forget the peaks so far: of the process where the system can (Linux), and of a GPU."""
+    """Start new peaks of memory: of the process where the system can (Linux), and of a GPU."""
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats(device)
     try:
@@ -53,7 +52,7 @@ def reset_peak(device: str = "cpu") -> None:
 
 
 def peak_memory(device: str = "cpu") -> Cost:
-    """peak_rss_mb, and on a GPU peak_cuda_mb: the most its tensors held at once since `reset_peak`."""
+    """Return peak_rss_mb, and on a GPU peak_cuda_mb, the most that its tensors held since `reset_peak`."""
     rss = peak_rss_mb()
     peaks: Cost = {"peak_rss_mb": rss} if math.isfinite(rss) else {}
     if device.startswith("cuda"):
@@ -62,9 +61,9 @@ def peak_memory(device: str = "cpu") -> Cost:
 
 
 def peak_rss_mb() -> float:
-    """Largest resident memory since `reset_peak` in MB.
+    """Return the largest resident memory in MB since `reset_peak`.
 
-    Elsewhere than on Linux since the process began; NaN on Windows.
+    On macOS it counts from the start of the process; on Windows it is NaN.
     """
     try:
         for line in (_PROC / "status").read_text().splitlines():
@@ -81,30 +80,28 @@ def peak_rss_mb() -> float:
 
 
 def is_out_of_gpu_memory(error: BaseException) -> bool:
-    """Whether a GPU had no memory left; gsplat's kernels say so by a RuntimeError of another name."""
+    """Return whether a GPU had no memory left; gsplat's kernels raise a plain RuntimeError then."""
     if isinstance(error, torch.OutOfMemoryError):
         return True
     return isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
 
 
 def out_of_gpu_memory(error: BaseException, gaussians: int | None, factor: int | None) -> AwError:
-    """The error as one line with what helps.
+    """Return the error as one line that says what helps.
 
     Args:
         error: what torch raised.
-        gaussians: how many the model had then; None = it was not made yet.
-        factor: which images_N it trained on; None = not known.
+        gaussians: number of Gaussians of the model then; None = there was no model yet.
+        factor: N of the folder images_N that it trained on; None = not known.
     """
-    wanted = re.search(r"Tried to allocate [\d.]+ \w+", str(error))
-    asked = f", {wanted[0][0].lower()}{wanted[0][1:]}" if wanted else ""
-    had = f" with {gaussians:,} Gaussians" if gaussians else ""
-    helps = []
-    if gaussians:
-        helps.append(f"--max-gaussians {max(gaussians // 2, 4)}")
-    helps.append(f"--factor {2 * (factor or 1)} (smaller photos, where the scene has them)")
+    match = re.search(r"Tried to allocate [\d.]+ \w+", str(error))
+    request = f", {match[0][0].lower()}{match[0][1:]}" if match else ""
+    size = f" with {gaussians:,} Gaussians" if gaussians else ""
+    remedies = [f"--max-gaussians {max(gaussians // 2, 4)}"] if gaussians else []
+    remedies.append(f"--factor {2 * (factor or 1)} (smaller photos, where the scene has them)")
     return AwError(
-        f"out of GPU memory{had}{asked}; what helps: {', '.join(helps)}, a GPU with more memory, or no other "
-        "program on this one"
+        f"out of GPU memory{size}{request}; what helps: {', '.join(remedies)}, a GPU with more memory, or no "
+        "other program on this one"
     )
 
 
@@ -114,7 +111,7 @@ _PEAKS = ("peak_rss_mb", "peak_cuda_mb")
 
 
 def cost_of(cell: Cell, trainer: Trainer) -> Cost:
-    """Of the training that a trainer has done."""
+    """Return the cost of the training that a trainer has done so far."""
     import numba
 
     n = max(trainer.iteration, 1)
@@ -136,17 +133,17 @@ def cost_of(cell: Cell, trainer: Trainer) -> Cost:
 
 
 def both_passes(first: Cost, second: Cost) -> Cost:
-    """Of two trainings that make one result: sums, means over all iterations, and the higher peaks."""
+    """Return the cost of two trainings that make one result: sums, means over iterations, higher peaks."""
     one, other = (cast("dict[str, float]", dict(cost)) for cost in (first, second))
-    known = {name: one[name] + other[name] for name in _SUMS if name in one and name in other}
-    known |= {name: max(cost[name] for cost in (one, other) if name in cost)
+    total = {name: one[name] + other[name] for name in _SUMS if name in one and name in other}
+    total |= {name: max(cost[name] for cost in (one, other) if name in cost)
               for name in _PEAKS if name in one or name in other}  # fmt: skip
-    share = one["iterations"] / max(known["iterations"], 1)
+    share = one["iterations"] / max(total["iterations"], 1)
 
     def mixed(a: float, b: float) -> float:
         return share * a + (1.0 - share) * b
 
-    known["ms_per_iteration"] = mixed(one["ms_per_iteration"], other["ms_per_iteration"])
+    total["ms_per_iteration"] = mixed(one["ms_per_iteration"], other["ms_per_iteration"])
     parts = {
         name: mixed(first["ms_parts"].get(name, 0.0), second["ms_parts"].get(name, 0.0))
         for name in {**first["ms_parts"], **second["ms_parts"]}
@@ -154,11 +151,11 @@ def both_passes(first: Cost, second: Cost) -> Cost:
     extra: dict[str, object] = {"ms_parts": parts, "passes": 2, "first_pass_s": first["train_s"]}
     if "timing" in first and "timing" in second:
         extra["timing"] = _both_timings(first["timing"], second["timing"], first["train_s"])
-    return cast(Cost, {**second, **known, **extra})
+    return cast(Cost, {**second, **total, **extra})
 
 
 def _both_timings(first: TimeRecord, second: TimeRecord, first_s: float) -> TimeRecord:
-    """The record of both trainings, one after the other: the worse verdict, and all calibrations."""
+    """Join the records of two trainings in a row: the worse verdict, and all calibrations."""
     worse = min((first, second), key=lambda record: _WORST_FIRST.index(record["verdict"]))
     both: TimeRecord = {**second, "verdict": worse["verdict"], "reason": worse["reason"]}
     both["samples"] = [*first["samples"], *([first_s + s, kernel] for s, kernel in second["samples"])]
@@ -168,21 +165,21 @@ def _both_timings(first: TimeRecord, second: TimeRecord, first_s: float) -> Time
     return both
 
 
-FOLDER = "first-pass"  # in the run's; holds a checkpoint while it trains, then masks/ and cost.json
+FOLDER = "first-pass"  # in the run folder; holds a checkpoint while it trains, then masks/ and cost.json
 COST, MASKS = "cost.json", "masks"
 Tick = Callable[[Any], None]  # gets the `Trainer` after every iteration, with its clock stopped
 
 
 @dataclass(frozen=True)
 class FirstPass:
-    """What the second training needs of the first."""
+    """The masks and the cost of the first of two trainings."""
 
-    keeps: list[Tensor]  # of the train views, [H, W], 1 = static
+    keeps: list[Tensor]  # keep map of each train view, [H, W], 1 = static
     cost: Cost
 
 
-def of_one_pass(cell: Cell) -> TrainConfig:
-    """Length of each training: all iterations, but half of a budget, which is what the run may take."""
+def config_of_one_pass(cell: Cell) -> TrainConfig:
+    """Return the settings of each training: all iterations, but its share of a budget for the whole run."""
     budget = cell.train.budget_s
     if cell.method.passes == 1 or budget is None:
         return cell.train
@@ -190,16 +187,16 @@ def of_one_pass(cell: Cell) -> TrainConfig:
 
 
 def check_passes(cell: Cell) -> None:
-    """Raise AwError if the cell trains twice and its method has no masks."""
+    """Raise AwError if the cell trains twice although its method makes no masks."""
     if cell.method.passes > 1:
         refuse_without_masks(cell.method.base, cell.method.build(cell.options))
 
 
 def refuse_without_masks(name: str, parts: Parts) -> None:
-    """Raise AwError if the method's mask policy keeps everything."""
-    policy = parts.mask
-    own = type(policy.mask if isinstance(policy, GraftedPolicy) else policy)
-    if own.keep is MaskPolicy.keep and own.predict is MaskPolicy.predict:
+    """Raise AwError if the method's mask policy keeps every pixel."""
+    policy = parts.mask.mask if isinstance(parts.mask, GraftedPolicy) else parts.mask
+    kind = type(policy)
+    if kind.keep is MaskPolicy.keep and kind.predict is MaskPolicy.predict:
         raise AwError(
             f"--passes 2 trains again with the final masks, and {name} has none: "
             "choose another method, or give it masks with --mask METHOD"
@@ -207,10 +204,10 @@ def refuse_without_masks(name: str, parts: Parts) -> None:
 
 
 def first_pass(cell: Cell, folder: Path, cache_dir: Path, tick: Tick | None) -> FirstPass:
-    """Train the first pass, or go on with it, or read what it left."""
+    """Train the first pass, or resume it; if it is finished, read its masks and cost."""
     place = folder / FOLDER
     if not (place / COST).is_file():
-        _train(cell, place, cache_dir, tick)
+        _train_first_pass(cell, place, cache_dir, tick)
     masks = [place / MASKS / Path(view.name).with_suffix(".png") for view in cell.scene.train]
     size = [(view.camera.height, view.camera.width) for view in cell.scene.train]
     keeps = [torch.from_numpy(read_keep_map(path).astype(np.float32)) for path in masks]
@@ -222,7 +219,7 @@ def first_pass(cell: Cell, folder: Path, cache_dir: Path, tick: Tick | None) -> 
     return FirstPass(keeps, cast(Cost, json.loads((place / COST).read_text(encoding="utf-8"))))
 
 
-def _train(cell: Cell, place: Path, cache_dir: Path, tick: Tick | None) -> None:
+def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | None) -> None:
     trainer = _make_trainer(replace(cell, train=replace(cell.train, probes=0)), place, cache_dir)
     trainer.resume()
     trainer.train(tick=tick)
@@ -236,19 +233,20 @@ def _train(cell: Cell, place: Path, cache_dir: Path, tick: Tick | None) -> None:
             path = temporary / Path(view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, kept.astype(np.uint8) * 255)
-    write_json(place / COST, cost)  # last: with it the pass is done
+    write_json(place / COST, cost)  # written last: this file marks the pass as finished
 
 
-STOPPED = "stopped"  # folder of a run that Ctrl-C stopped: the model as it was then; gone when the run ends
+STOPPED = "stopped"  # folder with the model as it was when Ctrl-C came; removed when the run ends
 
 
 def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> RunResult:
-    """Train the cell, or go on from its checkpoint; write the run's files; measure the test views.
+    """Train the cell, or resume from its checkpoint; write the run's files; measure the test views.
 
     Raises:
-        AwError: the GPU has too little memory; says what helps.
+        AwError: the GPU has too little memory; the error says what helps.
     """
     trainer: Trainer | None = None
+    recorder: pictures.Recorder | None = None
     problem: AwError
     try:
         reset_peak(cell.device)
@@ -257,14 +255,20 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
         if cell.method.passes > 1:
             first = first_pass(cell, folder, options.cache_dir, tick)
         trainer = _make_trainer(cell, folder, options.cache_dir, truth, first)
-        return _train_and_measure(cell, trainer, truth, options, tick, first)
+        trainer.resume()
+        recorder = pictures.Recorder(trainer, folder) if options.pictures else None
+        try:
+            trainer.train(tick=_each(recorder, tick))
+        except Stopped:
+            raise Stopped(_keep_stopped(cell, trainer, truth)) from None
+        return _measure(cell, trainer, truth, recorder, first)
     except Exception as error:
         if not is_out_of_gpu_memory(error):
             raise
         gaussians = None if trainer is None else len(trainer.gaussians)
         problem = out_of_gpu_memory(error, gaussians, cell.scene.info.get("loaded_factor"))
     # Outside of the handler nothing refers to the trainer: its memory is free for the next cell.
-    trainer = None
+    trainer = recorder = None
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
     raise problem
@@ -277,7 +281,7 @@ def _make_trainer(
     truth: Sequence[evaluate.TestPhoto] = (),
     first: FirstPass | None = None,
 ) -> Trainer:
-    """A trainer whose time is measured; without `truth` the test PSNR is not probed on the way."""
+    """Return a trainer whose time is measured; without `truth` the test PSNR is not probed on the way."""
     folder.mkdir(parents=True, exist_ok=True)
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
@@ -292,7 +296,7 @@ def _make_trainer(
 
     LOG.info("finding start points" if "dense" in cell.chosen.effects else "setting up")
     before = time.perf_counter()
-    trainer = Trainer(data, parts, of_one_pass(cell), folder=folder, probe=probe if truth else None)
+    trainer = Trainer(data, parts, config_of_one_pass(cell), folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     trainer.meter = Meter.of(cell.device)
@@ -306,31 +310,29 @@ def _make_trainer(
     return trainer
 
 
-def _train_and_measure(
+def _each(*ticks: Tick | None) -> Tick:
+    """Return a tick that calls all of these that are given."""
+
+    def after_iteration(trainer: Trainer) -> None:
+        for tick in ticks:
+            if tick is not None:
+                tick(trainer)
+
+    return after_iteration
+
+
+def _measure(
     cell: Cell,
     trainer: Trainer,
     truth: list[evaluate.TestPhoto],
-    options: RunOptions,
-    tick: Tick | None,
+    recorder: pictures.Recorder | None,
     first: FirstPass | None,
 ) -> RunResult:
+    """Write the model, renders, masks and pictures of a trained cell; return its result."""
     folder = trainer.folder
-    trainer.resume()
-    recorder = pictures_of_training.Recorder(trainer, folder) if options.pictures else None
-
-    def after_iteration(trainer: Trainer) -> None:
-        if recorder is not None:
-            recorder(trainer)
-        if tick is not None:
-            tick(trainer)
-
-    try:
-        trainer.train(tick=after_iteration)
-    except Stopped:
-        raise Stopped(_keep_stopped(cell, trainer, truth)) from None
     shutil.rmtree(folder / STOPPED, ignore_errors=True)
     trainer.check_taught()
-    cost = cost_of(cell, trainer)  # now: what follows measures, and is no training
+    cost = cost_of(cell, trainer)  # before the measurements below, which are no training
     if first is not None:
         cost = both_passes(first.cost, cost)
     write_splat_ply(
@@ -346,7 +348,7 @@ def _train_and_measure(
     LOG.info("drawing masks and pictures")
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
-        pictures_of_training.draw_all(trainer, recorder, folder)
+        pictures.draw_all(trainer, recorder, folder)
     facts = trainer.parts.mask.facts() | {"skipped_views": trainer.skipped_views} | trainer.watchdog.facts()
     cost |= evaluate.frames_per_second(trainer)
     cost["model_mb"] = (folder / "point_cloud.ply").stat().st_size / 1e6
@@ -360,11 +362,11 @@ def _train_and_measure(
 
 
 def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto]) -> str:
-    """The model as it stood when Ctrl-C came, measured; returns what to tell. Ctrl-C again leaves it out."""
+    """Measure and save the model after Ctrl-C; return a message. A second Ctrl-C leaves that out."""
     folder, train = trainer.folder, cell.train
     of = f" of {train.iterations}" if train.budget_s is None else f", {train.budget_s:g} s were asked for"
     done = f"stopped after {trainer.iteration} iterations{of}"
-    end = "the same command goes on"
+    end = "run the same command again to resume"
     try:
         with atomic_dir(folder / STOPPED) as kept:
             model = {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
@@ -381,9 +383,9 @@ def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto])
     return f"{done}{psnr}; model and renders in {folder / STOPPED}; {end}"
 
 
-def _effect_facts(cell: Cell, trainer: Trainer) -> dict[str, Any]:
-    """Which effects were on and what they learnt; empty without any."""
-    facts: dict[str, Any] = {}
+def _effect_facts(cell: Cell, trainer: Trainer) -> RunFacts:
+    """Return which effects were on and what they learnt; empty without any."""
+    facts: RunFacts = {}
     if cell.protocol == "half":
         nothing = {"effects": [], "steps": 0}
         facts |= {

@@ -1,4 +1,4 @@
-"""From an ablation study's runs to ablation.json, .csv, .md and .png.
+"""Write the report of an ablation study, ablation.json, .csv, .md and .png, and read its tables.
 
 A mean is over images, then over all runs (scene, seed) of the variant; one missing value makes it missing.
 The spread is the sample deviation over those runs. Differences to the default are taken run by run, on the
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.config import Facts, to_plain
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.ablation import (
     DIFFERENCES,
@@ -42,12 +42,12 @@ KEYS = tuple(m.key for m in METRICS)
 
 
 def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
-    """The study as plain data: one entry a row, with its values, differences and runs.
+    """Return the study as plain data: for each variant its values, differences and runs.
 
     Args:
-        study: planned, run or in part run.
+        study: the study; its runs may be unfinished.
         output: the folder of its runs.
-        made_by: the command that makes it again.
+        made_by: the command that makes the report again.
     """
     default = read_outcomes(study.default, output)
     rows = [_row(row, read_outcomes(row.cells, output), default) for row in study.rows]
@@ -80,17 +80,17 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
         "same_as": row.same_as,
         "values": values,
         "differences": differences,
-        "runs": [
-            {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
-            | {"untimed": o.untimed}
-            | {key: o.value(key) for key in KEYS}
-            for o in outcomes
-        ],
+        "runs": [_run_row(outcome) for outcome in outcomes],
     }
 
 
+def _run_row(o: Outcome) -> Facts:
+    row: Facts = {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
+    return row | {"untimed": o.untimed} | {key: o.value(key) for key in KEYS}
+
+
 def _networks(row: Planned) -> list[str]:
-    """Features and instances of a variant that is another method."""
+    """Return the features and instances of a variant that is another method."""
     if not row.variant.method or not row.cells:
         return []
     options = to_plain(row.cells[0].options)
@@ -108,7 +108,7 @@ def _number(value: float) -> float | None:
 
 
 def write_report(data: StudyReport, folder: Path) -> list[Path]:
-    """ablation.json, .csv, .md and, where there is something to draw, .png; returns what was written."""
+    """Write ablation.json, .csv, .md and, if a group has two points, .png; return the paths written."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"ablation.{kind}" for kind in ("json", "csv", "md")]
     write_json(paths[0], data)
@@ -121,10 +121,10 @@ def write_report(data: StudyReport, folder: Path) -> list[Path]:
 
 
 def csv_of(data: StudyReport) -> str:
-    """One line a row of the study; empty cells where a value is missing."""
+    """Return one line for each variant; cells are empty where a value is missing."""
     lines = []
     for row in data["rows"]:
-        line: dict[str, Any] = {
+        line: Facts = {
             "group": row["group"],
             "variant": row["variant"],
             "status": row["status"],
@@ -141,7 +141,7 @@ def csv_of(data: StudyReport) -> str:
 
 
 def markdown_of(data: StudyReport, picture: str = "") -> str:
-    """One table a group: differences to the default, quality and cost of each variant, and what it is."""
+    """Return one table for each group: differences to the default, quality, cost and meaning of variants."""
     lines = [f"# Ablations of {data['method']}", "", _subtitle(data), ""]
     lines += [f"![quality against cost]({picture})", ""] if picture else []
     shown = [m for m in METRICS if any(row["values"][m.key]["mean"] is not None for row in data["rows"])]
@@ -152,7 +152,7 @@ def _subtitle(data: StudyReport) -> str:
     train = data["train"]
     budget = train["budget_s"]
     length = f"{train['iterations']} iterations" if budget is None else f"{budget:g} s of training"
-    base = f"; in every row of the method: {' '.join(data['settings'])}" if data["settings"] else ""
+    base = f"; settings of all rows: {' '.join(data['settings'])}" if data["settings"] else ""
     return (
         f"{', '.join(data['scenes'])}; seeds {', '.join(map(str, data['seeds']))}; {length}{base}. "
         "Differences are to the default, on the same scene with the same seed; ± is the sample deviation "
@@ -168,7 +168,7 @@ def _what(row: VariantRow) -> Cell:
 
 
 def draw(data: StudyReport, path: Path) -> bool:
-    """Draw PSNR against ms per iteration, a panel a group; False where no group has two points."""
+    """Draw PSNR against ms per iteration, a panel for each group; return False if no group has two points."""
     groups = [(g, _points(data, g["name"])) for g in data["groups"]]
     groups = [(g, points) for g, points in groups if len(points) > 1]  # one point compares nothing
     if not groups:
@@ -191,7 +191,7 @@ def draw(data: StudyReport, path: Path) -> bool:
 
 
 def _points(data: StudyReport, group: str) -> list[tuple[str, float, float, float]]:
-    """(variant, ms an iteration, PSNR, its spread), variants of the same runs under one name."""
+    """Return (variant, ms per iteration, PSNR, spread); variants with the same runs share one entry."""
     merged: dict[tuple[float, float], tuple[list[str], float]] = {}
     for row in data["rows"]:
         ms, psnr = row["values"]["ms_per_iteration"]["mean"], row["values"]["psnr"]["mean"]
@@ -216,7 +216,7 @@ def _panel(axes: Any, group: GroupFacts, points: list[tuple[str, float, float, f
 
 
 def _labels(axes: Any, points: list[tuple[str, float, float, float]]) -> None:
-    """Name every point, each at least a line from the next and all of them inside the frame."""
+    """Write the name of every point, each at least one line from the next and inside the frame."""
     axes.margins(0.12)
     low, high = axes.get_ylim()
     middle, line = sum(axes.get_xlim()) / 2, 0.05 * (high - low)
@@ -226,7 +226,7 @@ def _labels(axes: Any, points: list[tuple[str, float, float, float]]) -> None:
     for index in order:
         last = heights[index] = max(points[index][2], last + line)
     above = high + 0.4 * line
-    for index in reversed(order):  # labels that left the frame move down again
+    for index in reversed(order):  # labels above the frame are moved down
         above = heights[index] = min(heights[index], above - line)
     for index, (name, ms, psnr, _) in enumerate(points):
         left = ms <= middle
@@ -246,26 +246,28 @@ SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "
 
 
 def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
-    """The tables of a study: a table a group, a row a variant.
+    """Read the tables of a study: a table for each group, a row for each variant.
 
     Args:
         folder: the output of `aw ablate`.
-        metrics: columns; empty = those of `SHOWN` that any row has.
+        metrics: keys of the columns; empty = those of `SHOWN` that any row has.
 
     Raises:
-        AwError: no study there, a damaged one, or a metric that it does not have.
+        AwError: the folder has no study or a damaged one, or the study lacks a metric.
     """
     path = folder / REPORT
     try:
         data: StudyReport = json.loads(path.read_text(encoding="utf-8"))
-        known = list(dict.fromkeys(key for row in data["rows"] for key in row["values"]))
+        keys = list(dict.fromkeys(key for row in data["rows"] for key in row["values"]))
         for name in metrics:
-            if name not in known:
-                raise AwError(f"{path} has no {name!r}: it has {', '.join(known)}")
-        has = {key for row in data["rows"] for key in known if not math.isnan(_mean(row, "values", key))}
-        ours = {m.key: m for m in METRICS}
-        keys = metrics or [key for key in SHOWN if key in has]
-        return _tables(data, [ours.get(key, measure(key)) for key in keys])
+            if name not in keys:
+                raise AwError(f"{path} has no {name!r}: it has {', '.join(keys)}")
+        with_value = {
+            key for row in data["rows"] for key in keys if not math.isnan(_mean(row, "values", key))
+        }
+        columns = {m.key: m for m in METRICS}
+        shown = metrics or [key for key in SHOWN if key in with_value]
+        return _tables(data, [columns.get(key, measure(key)) for key in shown])
     except FileNotFoundError:
         raise AwError(f"no {REPORT} in {folder}: 'aw ablate -o {folder}' writes it") from None
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
@@ -273,7 +275,10 @@ def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
 
 
 def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool = False) -> list[Table]:
-    """A table a group; with `differences` those to the default stand first, and what a variant is last."""
+    """Return a table for each group.
+
+    With `differences`, the first columns are those to the default, and the last is the meaning of a variant.
+    """
     tables = []
     for group in data["groups"]:
         members = [row for row in data["rows"] if row["group"] == group["name"]]
@@ -333,6 +338,6 @@ def _difference(row: VariantRow, column: Measure) -> Cell:
 
 
 def _mean(row: VariantRow, kind: Literal["values", "differences"], key: str) -> float:
-    """NaN where it is missing."""
+    """Return the mean of a row; NaN if it is missing."""
     value = row[kind][key]["mean"] if key in row[kind] else None
     return math.nan if value is None else float(value)

@@ -1,4 +1,4 @@
-"""Score every train photo; photos are read one at a time."""
+"""Score the ambiguity of every train photo; photos are read one at a time."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from ambiguous_wild.report.ambiguity_sources import Background, Masks, load_mask
 from ambiguous_wild.vision.moving import MOVES, moving_map
 
 KINDS = ("colour", "structure", "features", "motion")
-TOLD = 0.5  # share of a distractor's pixels from which on an evidence tells it
-CORRELATED = 0.5  # with the background; below, the structure at a pixel is another one
+REVEALED_FROM = 0.5  # share of a distractor's pixels at which a kind of evidence reveals it
+CORRELATED = 0.5  # correlation with the background below which the structure at a pixel differs
 
 
 @dataclass(frozen=True)
 class Distractor:
-    """One distractor of a photo; None = this evidence says nothing of it."""
+    """One distractor of a photo, and whether each kind of evidence reveals it; None = not available."""
 
     label: int
     pixels: int  # of the photo as the features see it
-    colour: bool | None  # most of its pixels differ from their background
-    structure: bool | None  # most do in structure
-    motion: bool | None  # most lie where features move
-    features: bool | None = None  # no static region of another photo resembles it as static ones each other
+    colour: bool | None  # most pixels differ from their background in colour
+    structure: bool | None  # most pixels differ from their background in structure
+    motion: bool | None  # most pixels lie where features move
+    features: bool | None = None  # it resembles static regions of other photos less than these each other
 
     @property
     def told_by(self) -> tuple[str, ...]:
-        """The kinds of evidence that tell it."""
+        """The kinds of evidence that reveal it."""
         return tuple(kind for kind in KINDS if getattr(self, kind))
 
 
@@ -50,15 +50,15 @@ def distractors(
     segments: np.ndarray,
     points: MotionPoints | None,
 ) -> list[Distractor]:
-    """Every region of a photo that is not tiny, without what features say.
+    """Return the distractors of a photo that are not tiny, without the evidence of features.
 
     Args:
-        regions: [h, w] int from 1, 0 = none.
+        regions: labels of the distractors, [h, w] int from 1, 0 = none.
         photo: [H, W, 3] in [0, 1].
-        behind: its background, [H, W, 3]; None: unknown.
+        behind: the background, [H, W, 3]; None: unknown.
         known: [H, W] bool, where the background is known; None: everywhere.
-        segments: [h, w] int32, of the photo at the size of `regions`.
-        points: features that move and stay; None: the scene does not say.
+        segments: segments of the photo, [h, w] int32, at the size of `regions`.
+        points: moving and static features; None: the scene has none.
     """
     shape = (regions.shape[1], regions.shape[0])
     differs = unlike = sure = moves = None
@@ -75,12 +75,12 @@ def distractors(
         )
     if points is not None:
         moves = moving_map(points, segments, regions.shape)
-    found = []
+    large = []
     for label, pixels in enumerate(np.bincount(regions.ravel())):
         if label == 0 or pixels < max(sem.MIN_SHARE * regions.size, 1):
             continue
         at = regions == label
-        found.append(
+        large.append(
             Distractor(
                 label,
                 int(pixels),
@@ -89,59 +89,59 @@ def distractors(
                 None if moves is None or bool(np.all(moves[at] == 0.5)) else _most(moves > MOVES, at, None),
             )
         )
-    return found
+    return large
 
 
 def _most(yes: np.ndarray | None, at: np.ndarray, sure: np.ndarray | None) -> bool | None:
     if yes is None:
         return None
     where = at if sure is None else at & sure
-    return bool(yes[where].mean() >= TOLD) if where.any() else None
+    return bool(yes[where].mean() >= REVEALED_FROM) if where.any() else None
 
 
-BINS = np.linspace(0.0, math.sqrt(3.0), 53)  # of the residual; 0.3 is on no edge, so counts are kept apart
-# longer side of the photos that labhog, whose cells are of 4 px, sees: its scores must not hang on the size
+BINS = np.linspace(0.0, math.sqrt(3.0), 53)  # edges of the residual's histogram
+# longer side of the photos for labhog, which has cells of 4 px: scores must not depend on the photos' size
 LOOKS_PX = 240
-FIT_PHOTOS = 24  # features look at so many photos, evenly chosen
+FIT_PHOTOS = 24  # number of evenly spaced photos that features are fitted to
 Bar = Callable[[list[View]], Iterable[View]]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One train photo."""
+    """The measurements of one train photo."""
 
     name: str
     counts: am.ColourCounts
-    histogram: np.ndarray  # [52] int64, residual over the known distractor pixels
+    histogram: np.ndarray  # [52] int64, residual over distractor pixels with a known background
     matches: list[sem.RegionMatch]  # of its distractors
     distractors: list[Distractor]
 
 
 @dataclass(frozen=True)
 class SceneFeatures:
-    """Features of a measurement, for maps: the mean that was subtracted, and each distractor's feature."""
+    """The features of a scene and of its regions, from which maps are drawn."""
 
-    spec: str  # of the features
+    spec: str  # name of the features
     features: Any
     whitened: bool
-    mean: np.ndarray  # [C]
+    mean: np.ndarray  # [C], subtracted if whitened
     whiten: np.ndarray  # [C, C]
-    distractors: list[sem.Regions]  # per photo, whitened where the features are
+    distractors: list[sem.Regions]  # of each photo, whitened if the features are
     statics: list[sem.Regions]
     anchors: sem.Anchors
-    usual: float  # the cosine from which a match is as good as those within the static scene; NaN unknown
-    objects: bool  # compared with static objects that the user named, not with every static region
+    usual: float  # cosine at which a match is as good as those within the static scene; NaN = unknown
+    objects: bool  # compared with the objects of --objects, not with every static region
 
 
 def feature_family(spec: str) -> str:
-    """The name of a back end without size and options: ``labhog``, ``dinov2-small``."""
+    """Return the name of a back end without size and options: ``labhog``, ``dinov2-small``."""
     from ambiguous_wild.vision.backends import parse
 
     return parse(spec).name
 
 
 def weight_free(spec: str) -> bool:
-    """Whether the features carry no pretrained meaning: they are whitened over the scene."""
+    """Return whether the features have no pretrained weights; such features are whitened over the scene."""
     from ambiguous_wild.vision.backends import DINO
 
     return feature_family(spec) not in DINO
@@ -160,16 +160,16 @@ def measure(
     """Score every train photo.
 
     Args:
-        scene: to measure.
-        masks: of its distractors.
-        background: what is behind them.
-        features: a back end's name, see `vision.backends`.
-        objects: masks of the static objects to compare with, white = object; None: every static segment.
-        cache: for features that learn from the scene.
-        progress: wraps the list of views, for a bar.
+        scene: the scene.
+        masks: masks of its distractors.
+        background: the background behind them.
+        features: name of a back end, see `vision.backends`.
+        objects: folder with masks of static objects to compare with, white = object; None: all segments.
+        cache: folder for features that learn from the scene.
+        progress: wraps the list of views, to show a bar.
 
     Raises:
-        AwError: masks, photos or features that cannot be used.
+        AwError: masks, photos or features cannot be used.
     """
     import torch
     from scipy import ndimage
@@ -182,7 +182,7 @@ def measure(
     statistics = sem.ChannelStatistics()
     named = _object_masks(objects, views) if objects is not None else None
     points = read_motion_points(scene.root)
-    moving, static, every, scores, told = [], [], [], [], []
+    moving, static, every, scores, evidence = [], [], [], [], []
     for index, view in enumerate(progress(views)):
         photo, distractor = load_photo(view), masks.load(view)
         behind, known = background.load(index, view)
@@ -202,7 +202,7 @@ def measure(
         if named is not None:
             things = _objects(features, named, view, hidden)
             static[-1] = sem.region_means(grid, things, sem.MIN_SHARE)
-        told.append(distractors(regions, photo, behind, known, whole, points.get(view.name)))
+        evidence.append(distractors(regions, photo, behind, known, whole, points.get(view.name)))
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
     mean, whiten = statistics.whitening()
     whitened = weight_free(features)
@@ -210,28 +210,26 @@ def measure(
         moving = [r.whitened(mean, whiten) for r in moving]
         static = [r.whitened(mean, whiten) for r in static]
         every = [r.whitened(mean, whiten) for r in every]
-    found = sem.matches(moving, static)
+    matches = sem.matches(moving, static)
     anchors, usual = sem.anchors(static, every), sem.usual_match(every)
     look = SceneFeatures(
         features, backend, whitened, mean, whiten, moving, static, anchors, usual, objects is not None
     )
     measured = []
-    for score, matches, found_in_photo in zip(scores, found, told):
-        cosines = {match.label: match.cosine for match in matches}
-        sure = not math.isnan(usual)
-        regions_of_photo = [
-            replace(d, features=cosines[d.label] < usual if sure and d.label in cosines else None)
-            for d in found_in_photo
+    for score, of_photo, in_photo in zip(scores, matches, evidence):
+        cosines = {} if math.isnan(usual) else {match.label: match.cosine for match in of_photo}
+        in_photo = [
+            replace(d, features=cosines[d.label] < usual if d.label in cosines else None) for d in in_photo
         ]
-        measured.append(Measured(*score, matches, regions_of_photo))
+        measured.append(Measured(*score, of_photo, in_photo))
     return measured, look
 
 
 def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
-    """The features by name, fitted to the scene's train photos.
+    """Make features by name and fit them to the scene's train photos.
 
     Raises:
-        AwError: unknown, without weights, or no folder for what they learn.
+        AwError: the features are unknown, lack weights, or have no folder for what they learn.
     """
     import torch
 
@@ -245,14 +243,13 @@ def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
         photos = [torch.from_numpy(seen_by(spec, load_photo(v))) for v in views]
         backend.fit_scene(photos, train_tracks(scene), cache)
         return backend
-    # fitted to the photos it will be applied to
     chosen = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(FIT_PHOTOS, len(views)))})
     backend.fit([torch.from_numpy(seen_by(spec, load_photo(views[i]))) for i in chosen])
     return backend
 
 
 def cosine_map(look: SceneFeatures, index: int, photo: np.ndarray) -> np.ndarray | None:  # [h, w] in [-1, 1]
-    """How like the photo's largest distractor each cell of it is; None where it has no distractor."""
+    """Return the cosine of each cell with the photo's largest distractor; None if it has no distractor."""
     import torch
 
     regions = look.distractors[index]
@@ -268,12 +265,12 @@ def cosine_map(look: SceneFeatures, index: int, photo: np.ndarray) -> np.ndarray
 
 
 def load_photo(view: View) -> np.ndarray:  # [H, W, 3] float32 in [0, 1]
-    """The photo as measured."""
+    """Read the photo in the form that is measured."""
     return load_image_float(view.image_path)
 
 
 def seen_by(features: str, photo: np.ndarray) -> np.ndarray:  # [h, w, 3]
-    """The photo as the features see it: labhog no larger than `LOOKS_PX`, others as it is."""
+    """Return the photo as the features see it: for labhog at most `LOOKS_PX` large, else unchanged."""
     import cv2
 
     size = _size(features, photo.shape)
@@ -281,7 +278,7 @@ def seen_by(features: str, photo: np.ndarray) -> np.ndarray:  # [h, w, 3]
 
 
 def small_mask(features: str, mask: np.ndarray) -> np.ndarray:  # [h, w] bool
-    """A mask [H, W] at the size of `seen_by`."""
+    """Return a mask [H, W] at the size of `seen_by`."""
     import cv2
 
     size = _size(features, mask.shape)
@@ -291,7 +288,7 @@ def small_mask(features: str, mask: np.ndarray) -> np.ndarray:  # [h, w] bool
 
 
 def _size(features: str, shape: tuple[int, ...]) -> tuple[int, int] | None:
-    """(width, height) to be made; None: as it is."""
+    """Return the (width, height) that the features see; None: unchanged."""
     scale = LOOKS_PX / max(shape[:2])
     if feature_family(features) != "labhog" or scale >= 1:
         return None
@@ -301,9 +298,9 @@ def _size(features: str, shape: tuple[int, ...]) -> tuple[int, int] | None:
 def _objects(
     features: str, named: dict[str, Path], view: View, distractor: np.ndarray
 ) -> np.ndarray:  # [h, w] int
-    """The static objects of a photo from 1, without what distractors hide; 0 throughout without a mask.
+    """Return labels of the static objects of a photo from 1, 0 elsewhere and on distractors.
 
-    Distractors and objects are at the size of `seen_by`.
+    Without a mask for the photo all are 0. The size is that of `seen_by`.
     """
     from scipy import ndimage
 
@@ -316,9 +313,9 @@ def _objects(
 def _object_masks(folder: Path, views: list[View]) -> dict[str, Path]:
     if not folder.is_dir():
         raise AwError(f"there is no folder {folder} of object masks (--objects)")
-    found = {v.name: folder / f"{stem(v)}.png" for v in views if (folder / f"{stem(v)}.png").is_file()}
-    if not found:
+    masks = {v.name: folder / f"{stem(v)}.png" for v in views if (folder / f"{stem(v)}.png").is_file()}
+    if not masks:
         raise AwError(
             f"{folder} holds no mask of a train photo: name them as the photos, {stem(views[0])}.png"
         )
-    return found
+    return masks

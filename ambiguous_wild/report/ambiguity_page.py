@@ -1,4 +1,4 @@
-"""The report's folder: one page that needs no other file, the picture, CSV and JSON."""
+"""Write the ambiguity report's folder: one page that needs no other file, the picture, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
 from ambiguous_wild.report.ambiguity_measure import BINS, Measured, SceneFeatures, cosine_map, load_photo
 from ambiguous_wild.report.ambiguity_sources import Background, Masks
-from ambiguous_wild.report.ambiguity_summary import NO_DISTRACTORS, cosine_column, describe, row
+from ambiguous_wild.report.ambiguity_summary import (
+    NO_DISTRACTORS,
+    PhotoRow,
+    Summary,
+    cosine_column,
+    describe,
+    row,
+)
 from ambiguous_wild.report.plain_formats import to_csv
 from ambiguous_wild.report.table import text_table
 from ambiguous_wild.report.typeset import html_table
@@ -28,20 +35,20 @@ SIDE = 480  # px a picture in the figure at most
 
 
 def chosen(measured: list[Measured], most: int = PHOTOS) -> list[int]:
-    """Indices spread over the range of occlusion rather than the first few: what is easy and what is hard."""
+    """Return indices of photos spread evenly over the range of occlusion, from little to much."""
     order = sorted(range(len(measured)), key=lambda i: measured[i].counts.occlusion)
     return [order[round(k)] for k in np.linspace(0, len(order) - 1, min(most, len(order)))]
 
 
 def overlay(photo: np.ndarray, distractor: np.ndarray) -> np.ndarray:
-    """The photo [H, W, 3] in [0, 1] with its distractors tinted, uint8."""
+    """Return the photo [H, W, 3] in [0, 1] with its distractors tinted, as uint8."""
     return tint((255 * photo + 0.5).astype(np.uint8), distractor, MASKED)
 
 
 def residual_picture(
     photo: np.ndarray, behind: np.ndarray | None, known: np.ndarray | None, distractor: np.ndarray
 ) -> np.ndarray:
-    """Residual of the distractors in the palette from 0 to 1 on the faded photo; dark grey = unknown."""
+    """Draw the residual of the distractors from 0 to 1 on the faded photo; dark grey = unknown."""
     shown = faded((255 * photo + 0.5).astype(np.uint8))
     use = np.zeros_like(distractor) if behind is None else distractor & (True if known is None else known)
     residual = np.full(distractor.shape, np.nan)
@@ -54,7 +61,7 @@ def residual_picture(
 def cosine_picture(
     look: SceneFeatures, index: int, photo: np.ndarray, distractor: np.ndarray
 ) -> np.ndarray | None:
-    """Cosine of every cell to the photo's largest distractor in the palette, the distractors outlined."""
+    """Draw the cosine of every cell with the photo's largest distractor; distractors are outlined."""
     import cv2
 
     cosines = cosine_map(look, index, photo)
@@ -74,7 +81,7 @@ def write_figure(
     look: SceneFeatures,
     path: Path,
 ) -> None:
-    """Write the picture as PNG."""
+    """Write the figure with photos, maps and histograms as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -112,7 +119,7 @@ def _panel(axes: Any, picture: np.ndarray | None, caption: str) -> None:
 
     axes.set_xticks([])
     axes.set_yticks([])
-    # A scene's photo may be called $x$: not to be read as a formula.
+    # a photo may be called $x$, which is no formula
     axes.set_title(caption, fontsize=9, parse_math=False)
     if picture is None:
         why = "background unknown" if "residual" in caption else "no distractor to compare"
@@ -170,14 +177,14 @@ WIDTH = 420  # px of a picture on the page
 
 
 def check_folder(folder: Path) -> None:
-    """Raise AwError where the path is a file, or a folder with files that are no report."""
+    """Raise AwError if the path is a file, or a folder with other files than a report."""
     refuse_file(folder)
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     strange = sorted(p.name for p in folder.iterdir() if p.name not in FILES)
     if strange or not (folder / FILES[0]).is_file():
         raise AwError(
-            f"{folder} holds something else than a report ({strange[0] if strange else 'half of one'}); "
+            f"{folder} holds {strange[0] if strange else 'an incomplete report'} and cannot be replaced; "
             "choose another -o"
         )
 
@@ -188,10 +195,10 @@ def write_report(
     background: Background,
     measured: list[Measured],
     look: SceneFeatures,
-    summary: dict[str, Any],
+    summary: Summary,
     out: Path,
 ) -> None:
-    """Write the report into `out`, whole or not at all; an earlier report is replaced."""
+    """Write the report into `out`, complete or not at all; an earlier report is replaced."""
     metric = cosine_column(summary["features"])
     rows = [row(m, metric) for m in measured]
     with atomic_dir(out) as folder:
@@ -207,7 +214,7 @@ def write_report(
 def _pictures(
     scene: Scene, masks: Masks, background: Background, measured: list[Measured], look: SceneFeatures
 ) -> Iterator[tuple[str, list[tuple[str, bytes]]]]:
-    """Name and JPEGs (photo, overlay, residual, cosine) of the photos on the page, by name."""
+    """Yield the name and JPEGs (photo, overlay, residual, cosine) of each photo on the page."""
     for index in sorted(chosen(measured, SHOWN)):
         view = scene.train[index]
         photo, distractor = load_photo(view), masks.load(view)
@@ -251,17 +258,17 @@ _HEADS = {
     "distractor_px": "distractor px",
     "unknown_px": "unknown px",
     "regions": "distractors",
-    "told_by": "each told by",
+    "told_by": "each revealed by",
 }
 
 
 def page(
-    summary: dict[str, Any],
-    rows: list[dict[str, Any]],
+    summary: Summary,
+    rows: list[PhotoRow],
     picture: bytes,
     photos: list[tuple[str, list[tuple[str, bytes]]]],
 ) -> str:
-    """The page; every text of the scene is escaped, every picture is in it."""
+    """Return the page, with every text of the scene escaped and every picture included."""
     title = html.escape(f"Ambiguity of {summary['scene']}")
     verdict = _CLASSES.get(summary["class"], f"class: {summary['class']}")
     lines = "".join(f"<li>{html.escape(line)}</li>" for line in describe(summary))

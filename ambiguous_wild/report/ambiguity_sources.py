@@ -1,10 +1,10 @@
-"""Where the report's masks and backgrounds come from: the truth, the user, or a trained run."""
+"""Find the masks and backgrounds for the ambiguity report: from the truth, the user, or a trained run."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -16,42 +16,42 @@ from ambiguous_wild.io.images import load_image_float, read_mask
 if TYPE_CHECKING:
     from ambiguous_wild.splat.gaussians import Gaussians
 
-# of a background that a run renders
-OPAQUE = 0.9  # accumulated alpha from which something stands there
-SEEN_BY = 2  # other photos that must see the surface unmasked
-DEPTH_SLACK = 0.05  # relative difference of depth up to which two photos see the same surface
+# limits for a background that a run renders
+OPAQUE = 0.9  # accumulated alpha of a surface
+SEEN_BY = 2  # number of other photos that must see the surface unmasked
+DEPTH_SLACK = 0.05  # largest relative difference of depth at which two photos see the same surface
 
 
 @dataclass(frozen=True)
 class Masks:
     """Masks of the train photos, by the photo's name."""
 
-    source: str  # truth, scene, run or folder: as recorded
+    source: str  # truth, scene, run or folder; kept in the report
     paths: dict[str, Path]
     keep: bool  # white = static; else white = distractor
 
     def load(self, view: View) -> np.ndarray:  # [H, W] bool
-        """True on distractors, at the photo's size.
+        """Return the mask of a photo at its size, True on distractors.
 
         Raises:
-            AwError: unreadable, no mask, or of another shape than the photo.
+            AwError: the mask is unreadable, or its shape differs from the photo's.
         """
         white = load_mask(self.paths[view.name], view)
         return ~white if self.keep else white
 
 
 def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool = False) -> Masks:
-    """Distractor masks of the train photos.
+    """Find the distractor masks of the train photos.
 
     Args:
-        scene: whose photos.
-        choice: "truth", "scene" (masks/train), "run" or a folder; None takes the first of truth, run and
-            scene that is there.
+        scene: the scene.
+        choice: "truth", "scene" (masks/train), "run" or a folder; None = the first of truth, run and scene
+            that exists.
         run: folder of a run with masks/.
-        keep: the choice is a folder where white means keep; else it means distractor.
+        keep: in the chosen folder white means keep; else it means distractor.
 
     Raises:
-        AwError: there is none, or photos lack theirs.
+        AwError: there are no masks, or some photos have none.
     """
     truth = scene.root / "truth" / "distractor"
     if choice is None:
@@ -85,21 +85,21 @@ def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
         raise AwError(
             f"there is no mask folder {folder} for {scene.name}: give --distractor-masks truth|scene|run|DIR"
         )
-    found = {v.name: folder / f"{stem(v)}.png" for v in scene.train}
-    missing = [name for name, path in found.items() if not path.is_file()]
+    paths = {v.name: folder / f"{stem(v)}.png" for v in scene.train}
+    missing = [name for name, path in paths.items() if not path.is_file()]
     if missing:
         raise AwError(
-            f"{len(missing)} of {len(found)} train photos have no mask in {folder}: {shortlist(missing)}; "
+            f"{len(missing)} of {len(paths)} train photos have no mask in {folder}: {shortlist(missing)}; "
             + advice
         )
-    return found
+    return paths
 
 
 def load_mask(path: Path, view: View) -> np.ndarray:
-    """White of a mask, see `read_mask`, at the photo's size, [H, W] bool; another size is resampled.
+    """Return where a mask is white, [H, W] bool, resampled to the photo's size; see `read_mask`.
 
     Raises:
-        AwError: unreadable, or of another shape than the photo.
+        AwError: the mask is unreadable, or its shape differs from the photo's.
     """
     import cv2
 
@@ -116,18 +116,18 @@ def load_mask(path: Path, view: View) -> np.ndarray:
 
 
 class Background(Protocol):
-    """What is behind the distractors."""
+    """The background behind the distractors."""
 
     source: str
 
     def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Of train photo `index`: [H, W, 3] float32 in [0, 1] or None, and where it is known, [H, W] bool
-        (None: everywhere)."""
+        """Return the background of train photo `index`, [H, W, 3] float32 in [0, 1] or None, and where it is
+        known, [H, W] bool (None: everywhere)."""
         ...
 
 
 class CleanBackground:
-    """Clean versions of the photos; a photo without one is of unknown background."""
+    """The clean versions of the photos; a photo without one has an unknown background."""
 
     source = "clean"
 
@@ -138,7 +138,7 @@ class CleanBackground:
         """See `Background`.
 
         Raises:
-            AwError: it is of another size than the photo.
+            AwError: the clean version differs from the photo in size.
         """
         path = self.folder / f"{stem(view)}.png"
         if not path.is_file():
@@ -155,8 +155,8 @@ class CleanBackground:
 class RunBackground:
     """Renders of a run's Gaussians at the train cameras.
 
-    A render says something about every pixel; it *knows* only what other photos saw. A pixel counts as known
-    where the render is opaque and its surface is seen by two other photos outside their masks.
+    A render has a colour at every pixel, but not every pixel is known: a pixel counts as known where the
+    render is opaque and two other photos see its surface outside of their masks.
     """
 
     source = "run"
@@ -164,7 +164,7 @@ class RunBackground:
     def __init__(self, scene: Scene, run: Path, masks: Masks) -> None:
         """
         Raises:
-            AwError: no finished run, or one of another scene or size.
+            AwError: the run is not finished, or of another scene or size.
         """
         check_run(scene, run)
         self.views, self.masks = list(scene.train), masks
@@ -195,20 +195,20 @@ class RunBackground:
         return drawn.image.numpy().clip(0.0, 1.0), alpha, depth
 
     def _coarse(self, view: View) -> tuple[Camera, np.ndarray, np.ndarray]:
-        """A camera of about a quarter of the size, its depth, and where it sees the static scene."""
+        """Return a camera of about a quarter of the size, its depth, and where it sees the static scene."""
         import cv2
 
         width, height = max(view.camera.width // 4, 16), max(view.camera.height // 4, 16)
         camera = view.camera.resized(width, height)
         _, alpha, depth = self._render(camera)
-        # Any masked pixel masks the coarse one: it must not vouch for what it half sees.
+        # a coarse pixel is static only if none of its pixels is masked
         masked = self.masks.load(view).astype(np.uint8)
         static = cv2.resize(masked * 255, (width, height), interpolation=cv2.INTER_AREA) == 0
         return camera, depth, static & (alpha >= OPAQUE)
 
 
 class NoBackground:
-    """Nothing is known behind distractors: colour has no score."""
+    """An unknown background: colour has no score."""
 
     source = "none"
 
@@ -218,16 +218,16 @@ class NoBackground:
 
 
 def find_background(scene: Scene, choice: str | None, run: Path | None, masks: Masks) -> Background:
-    """What to compare distractors with: clean versions where there are any, else the render of a run.
+    """Find the background to compare with: clean versions if there are any, else the render of a run.
 
     Raises:
-        AwError: there is neither, or the one asked for is not there.
+        AwError: there is neither, or not the chosen one.
     """
     clean = scene.root / "truth" / "clean"
-    there = any((clean / f"{stem(v)}.png").is_file() for v in scene.train)
+    has_clean = any((clean / f"{stem(v)}.png").is_file() for v in scene.train)
     if choice is None:
-        choice = "clean" if there else "run" if run is not None else ""
-    if choice == "clean" and there:
+        choice = "clean" if has_clean else "run" if run is not None else ""
+    if choice == "clean" and has_clean:
         return CleanBackground(scene)
     if choice == "run" and run is not None:
         return RunBackground(scene, run, masks)
@@ -236,21 +236,21 @@ def find_background(scene: Scene, choice: str | None, run: Path | None, masks: M
     if choice == "run":
         raise AwError("--background run needs --run RUN, a folder of 'aw bench'")
     raise AwError(
-        f"{scene.name} has no clean versions in {clean}: nothing is known behind its distractors; give "
+        f"{scene.name} has no clean versions in {clean}: the background of its distractors is unknown; give "
         "--run RUN of a trained run, or --background none to leave colour out"
     )
 
 
 def stem(view: View) -> str:
-    """The photo's name without its suffix, as its mask is called."""
+    """Return the photo's name without its suffix, which is also the name of its mask."""
     return str(PurePosixPath(view.name).with_suffix(""))
 
 
 def check_run(scene: Scene, run: Path) -> None:
-    """Make sure that the run is finished and of this scene.
+    """Check that the run is finished and of this scene.
 
     Raises:
-        AwError: what is wrong, and what to do.
+        AwError: it is not; the error says what to do.
     """
     from ambiguous_wild.harness.cell import scene_identity
 
@@ -262,10 +262,10 @@ def check_run(scene: Scene, run: Path) -> None:
         )
     try:
         config = plain_yaml.read_mapping(path)
-        known, name = config["scene"]["sha256"], config["scene"]["name"]
+        identity, name = config["scene"]["sha256"], config["scene"]["name"]
     except (AwError, KeyError, TypeError) as error:
         raise AwError(f"{path} is damaged ({' '.join(str(error).split())}); train the run again") from None
-    if known != scene_identity(scene):
+    if identity != scene_identity(scene):
         raise AwError(
             f"{run} was trained on scene {name!r} with other photos, split or size than {scene.root}; "
             "train on this one: 'aw bench --scene'"
@@ -278,7 +278,7 @@ def unproject(
     cols: np.ndarray,  # [P]
     depth: np.ndarray,  # [P] z
 ) -> np.ndarray:  # [P, 3] world
-    """World points of pixel centres at a depth."""
+    """Return the world points of pixel centres at a depth."""
     x = (cols + 0.5 - camera.cx) / camera.fx * depth
     y = (rows + 0.5 - camera.cy) / camera.fy * depth
     rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
@@ -291,7 +291,7 @@ def sees(
     static: np.ndarray,  # [h, w] bool: opaque and outside the mask
     points: np.ndarray,  # [P, 3] world
 ) -> np.ndarray:  # [P] bool
-    """Whether the camera sees each point: inside the picture, at its surface, outside the mask."""
+    """Return whether the camera sees each point: inside the picture, at its surface, outside the mask."""
     local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     z = np.maximum(local[:, 2], 1e-9)
     cols = np.floor(np.clip(camera.fx * local[:, 0] / z + camera.cx, -1, camera.width)).astype(int)
@@ -308,5 +308,5 @@ def _load(run: Path) -> Gaussians:
     from ambiguous_wild.splat.gaussians import Gaussians
 
     arrays = read_splat_ply(run / "point_cloud.ply")
-    found: dict[str, Any] = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
-    return Gaussians(**found)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
+    return Gaussians(**tensors)  # type: ignore[arg-type]

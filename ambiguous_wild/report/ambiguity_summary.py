@@ -1,4 +1,4 @@
-"""From measured photos to the scene's scores, its class, and the sentences that say so."""
+"""Summarise measured photos: the scene's scores, its class, and the sentences that describe them."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ambiguous_wild.report.ambiguity_measure import (
 )
 
 LOOKS = (
-    "weight-free features see looks, not meaning: a distractor in the texture of something static counts as "
-    "like it, and a statue painted red as unlike a statue of stone; --objects names the static objects to "
-    "compare with, --features dinov2-small sees kinds of things"
+    "weight-free features compare looks, not meaning: a distractor with the texture of a static object "
+    "counts as similar to it, and a red statue as different from a stone statue; --objects names the static "
+    "objects to compare with, --features dinov2-small compares kinds of objects"
 )
-NAMED = "weight-free features see looks, not meaning; compared with the objects named"
+NAMED = "weight-free features compare looks, not meaning; compared with the objects of --objects"
 NO_DISTRACTORS = "no distractors"  # the class of a scene whose masks are empty
-REAL = "raw cosine, as the paper's"
+REAL = "raw cosine, as in the paper"
 
 
 class Scored(TypedDict):
@@ -54,15 +54,20 @@ class ColourScore(Scored):
     unknown_px: int  # with an unknown background
 
 
-class Told(TypedDict):
-    """Distractors by the evidence that tells them; None = no distractor could be asked."""
+class EvidenceCounts(TypedDict):
+    """Number of distractors that each kind of evidence reveals; None = the evidence is not available."""
 
     distractors: int
     colour: int | None
     structure: int | None
     features: int | None
     motion: int | None
-    nothing: int  # told by none of them
+    nothing: int  # number that no evidence reveals
+
+
+# The content of ambiguity.json. Two keys are names of metrics, so that the type cannot list them.
+Summary = dict[str, Any]
+PhotoRow = dict[str, str | float | None]  # a row of photos.csv, by column
 
 
 class SemanticScore(Scored):
@@ -82,13 +87,13 @@ class SemanticScore(Scored):
 
 
 def semantic_metric(features: str) -> str:
-    """The score's name with its variant: ``semantic_cosine_dinov2_small``, ``semantic_lookalike_labhog``."""
+    """Return the score's name with its variant: semantic_cosine_dinov2_small, semantic_lookalike_labhog."""
     kind = "lookalike" if weight_free(features) else "cosine"
     return f"semantic_{kind}_{_family(features)}"
 
 
 def cosine_column(features: str) -> str:
-    """The photos' column: the cosine of a photo's most similar distractor."""
+    """Return the column's name for the cosine of a photo's most similar distractor."""
     return f"semantic_cosine_{_family(features)}"
 
 
@@ -105,8 +110,8 @@ def summarise(
     masks: str = "truth",
     background: str = "clean",
     seed: int = 0,
-) -> dict[str, Any]:
-    """The scene's scores with 95 % intervals over photos; what is undefined is None."""
+) -> Summary:
+    """Compute the scene's scores with 95 % intervals over photos; undefined scores are None."""
     colour, semantic = _colour(measured, seed), _semantic(measured, look, features, seed)
     counts = [m.counts for m in measured]
     covered = am.ratio_interval([c.distractor for c in counts], [c.pixels for c in counts], seed=seed)
@@ -122,18 +127,18 @@ def summarise(
         "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
         am.COLOUR_METRIC: colour,
         semantic_metric(features): semantic,
-        "told": _told(measured),
+        "told": _count_evidence(measured),
     }
 
 
 def classify(colour: bool | None, semantic: bool | None) -> str:
-    """colour, semantic, both or neither; where a verdict is missing, what is known, and "unknown"."""
+    """Return colour, semantic, both or neither; with a missing verdict also "unknown"."""
     if colour is None or semantic is None:
-        known = "colour" if colour else "semantic" if semantic else ""
-        return f"{known}, rest unknown" if known else "unknown"
-    return {(1, 1): "both", (1, 0): "colour", (0, 1): "semantic", (0, 0): "neither"}[
-        (int(colour), int(semantic))
-    ]
+        name = "colour" if colour else "semantic" if semantic else ""
+        return f"{name}, rest unknown" if name else "unknown"
+    if colour and semantic:
+        return "both"
+    return "colour" if colour else "semantic" if semantic else "neither"
 
 
 def _colour(measured: list[Measured], seed: int) -> ColourScore:
@@ -153,13 +158,13 @@ def _colour(measured: list[Measured], seed: int) -> ColourScore:
 
 def _semantic(measured: list[Measured], look: SceneFeatures, features: str, seed: int) -> SemanticScore:
     photos = [m.matches for m in measured if m.matches]
-    # A mean is a ratio to the number of photos; without any it is missing, and not an error.
+    # a mean as a ratio to the number of photos, so that it is missing, and no error, without any
     best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
     score, limit = best, sem.AMBIGUOUS_ABOVE
     if look.whitened:
         alike = [sum(m.pixels for m in p if m.cosine >= look.usual) for p in photos]
-        known = [sum(m.pixels for m in p) for p in photos] if not math.isnan(look.usual) else []
-        score, limit = am.ratio_interval(alike[: len(known)], known, seed=seed), sem.LOOKALIKE_ABOVE
+        pixels = [sum(m.pixels for m in p) for p in photos] if not math.isnan(look.usual) else []
+        score, limit = am.ratio_interval(alike[: len(pixels)], pixels, seed=seed), sem.LOOKALIKE_ABOVE
     note = REAL if not look.whitened else NAMED if look.objects else LOOKS
     return {
         **_interval(score),
@@ -177,7 +182,7 @@ def _semantic(measured: list[Measured], look: SceneFeatures, features: str, seed
     }
 
 
-def _told(measured: list[Measured]) -> Told:
+def _count_evidence(measured: list[Measured]) -> EvidenceCounts:
     every = [d for m in measured for d in m.distractors]
 
     def count(kind: str) -> int | None:
@@ -194,16 +199,16 @@ def _told(measured: list[Measured]) -> Told:
     }
 
 
-def _told_line(told: Told) -> str:
-    known = {kind: told[kind] for kind in KINDS if told[kind] is not None}  # type: ignore[literal-required]
-    parts = ", ".join(f"{kind} tells {count}" for kind, count in known.items())
-    text = f"distractors: {told['distractors']}; {parts or 'no evidence tells any'}; "
-    text += f"told by nothing: {told['nothing']}"
-    return text if told["motion"] is not None else f"{text} (the scene does not say what moves)"
+def _evidence_line(counts: EvidenceCounts) -> str:
+    known = {kind: counts[kind] for kind in KINDS if counts[kind] is not None}  # type: ignore[literal-required]
+    parts = ", ".join(f"{kind} reveals {count}" for kind, count in known.items())
+    text = f"distractors: {counts['distractors']}; {parts or 'no evidence is available'}; "
+    text += f"no evidence reveals {counts['nothing']}"
+    return text if counts["motion"] is not None else f"{text} (the scene has no points that move)"
 
 
-def row(m: Measured, metric: str) -> dict[str, Any]:
-    """One line of the table of photos."""
+def row(m: Measured, metric: str) -> PhotoRow:
+    """Return one row of the table of photos."""
     return {
         "photo": m.name,
         "occlusion": _number(m.counts.occlusion),
@@ -217,14 +222,13 @@ def row(m: Measured, metric: str) -> dict[str, Any]:
     }
 
 
-def describe(summary: dict[str, Any]) -> list[str]:
-    """The scores as sentences, for the terminal and the page."""
+def describe(summary: Summary) -> list[str]:
+    """Return the scores as sentences, for the terminal and the page."""
     colour: ColourScore = summary[am.COLOUR_METRIC]
     covered: OcclusionScore = summary["occlusion"]
     if summary["class"] == NO_DISTRACTORS:
         return [
-            f"the masks of all {summary['photos']} photos are empty: no distractor, so nothing that could be "
-            "ambiguous"
+            f"the masks of all {summary['photos']} photos are empty: without distractors nothing is ambiguous"
         ]
     look: SemanticScore = summary[semantic_metric(summary["features"])]
     lines = [
@@ -238,20 +242,21 @@ def describe(summary: dict[str, Any]) -> list[str]:
             f"with {summary['features']}, a static region scores {look['same_surface']:.2f} against other "
             f"photos of itself and {look['unrelated']:.2f} against unrelated ones; {look['note']}"
         )
-    told: Told | None = summary.get("told")  # absent from older reports
-    if told and told["distractors"]:
-        lines.append(_told_line(told))
+    counts: EvidenceCounts | None = summary.get("told")  # absent from older reports
+    if counts and counts["distractors"]:
+        lines.append(_evidence_line(counts))
     if colour["unknown_px"]:
         share = 100 * colour["unknown_px"] / colour["distractor_px"]
         lines.append(
-            f"the background of {share:.0f} % of the distractor pixels is unknown: left out of colour"
+            f"the background of {share:.0f} % of the distractor pixels is unknown; the colour score leaves "
+            "them out"
         )
     return lines
 
 
 def _colour_line(colour: ColourScore) -> str:
     if colour["value"] is None:
-        return "colour: no verdict, for no distractor's background is known"
+        return "colour: no verdict, because no background of a distractor is known"
     return (
         f"colour: {_percent(colour)} of the distractor pixels are within {am.COLOUR_THRESHOLD} of their "
         f"background: {_word(colour)} (limit {100 * am.COLOUR_AMBIGUOUS_ABOVE:.0f} %)"
@@ -260,7 +265,7 @@ def _colour_line(colour: ColourScore) -> str:
 
 def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
     if look["value"] is None:
-        return f"semantic: no verdict, for no distractor could be compared with the {look['compared_with']}"
+        return f"semantic: no verdict, because no distractor is comparable with the {look['compared_with']}"
     if lookalike:
         return (
             f"semantic: {_percent(look)} of the distractor pixels lie in regions that resemble a "

@@ -1,4 +1,4 @@
-"""Contradictions, exchanged numbers, means, ranks, digits and units; and what `aw audit` prints."""
+"""Audit reported numbers: contradictions, means, ranks, digits and units; write what `aw audit` finds."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from ambiguous_wild.report.plain_formats import markdown_text, plain, to_csv
 
 LOWER = ("lpips", "flip", "memory", "gpu_hours", "train_s", "ms", "model_mb", "peak", "gaussians")
 HIGHER = ("psnr", "ssim", "fps", "mask_", "iou")
-UNITLESS = ("memory", "time", "size")  # metrics that mean nothing without a unit and what was counted
+UNITLESS = ("memory", "time", "size")  # metrics that need a unit and a definition
 
 
 def contradictions(numbers: list[Number]) -> list[Finding]:
-    """The same method, setting, scene and metric with numbers that rounding does not explain."""
+    """Find different numbers, beyond rounding, for the same method, setting, scene and metric."""
     clashes: dict[tuple[str, ...], list[tuple[Number, Number]]] = defaultdict(list)
     groups: dict[tuple[str, ...], list[Number]] = defaultdict(list)
     for n in numbers:
@@ -40,7 +40,7 @@ def contradictions(numbers: list[Number]) -> list[Finding]:
             if same_variant and abs(a.value - b.value) > a.half + b.half + 1e-12:
                 clashes[(*a.identity, a.table, b.table)].append((a, b))
     exchanged = _exchanged([p for pairs in clashes.values() for p in pairs])
-    found = [f for f, _ in exchanged]
+    findings = [f for f, _ in exchanged]
     explained = {id(n) for _, pairs in exchanged for p in pairs for n in p}
     for pairs in clashes.values():
         left = [(a, b) for a, b in pairs if id(a) not in explained]
@@ -48,15 +48,15 @@ def contradictions(numbers: list[Number]) -> list[Finding]:
             a, b = left[0]
             words = ", ".join(f"{x.metric} {x.text} against {y.text}" for x, y in left)
             text = f"{method_name(a)} on {place_name(a)}: {words} ({a.table}, {b.table})"
-            found.append(finding("contradiction", text, [n for p in left for n in p]))
-    return found
+            findings.append(finding("contradiction", text, [n for p in left for n in p]))
+    return findings
 
 
 def _exchanged(
     clashes: list[tuple[Number, Number]],
 ) -> list[tuple[Finding, list[tuple[Number, Number]]]]:
-    """Two methods whose numbers are exchanged between two tables."""
-    found = []
+    """Find pairs of methods whose numbers are exchanged between two tables."""
+    findings = []
     for (a, a2), (b, b2) in combinations(clashes, 2):
         alike = (a.place, a.metric, a.table, a2.table) == (b.place, b.metric, b.table, b2.table)
         if alike and a.method != b.method and a.value == b2.value and b.value == a2.value:
@@ -64,12 +64,12 @@ def _exchanged(
                 f"{a.method} and {b.method} on {place_name(a)}: {a.metric} {a.text} and {b.text} in "
                 f"{a.table} are exchanged in {a2.table}"
             )
-            found.append((finding("swapped", text, (a, b, a2, b2)), [(a, a2), (b, b2)]))
-    return found
+            findings.append((finding("swapped", text, (a, b, a2, b2)), [(a, a2), (b, b2)]))
+    return findings
 
 
 def means(numbers: list[Number]) -> list[Finding]:
-    """Means over scenes, and over datasets, that rounding does not explain."""
+    """Find means over scenes, and over datasets, that differ from their parts by more than rounding."""
     wrong: dict[tuple[str, ...], list[tuple[Number, float, list[Number]]]] = defaultdict(list)
     for n in numbers:
         if n.scene != MEAN or n.setting:
@@ -87,14 +87,14 @@ def _mean(cases: list[tuple[Number, float, list[Number]]]) -> Finding:
     first, _, parts = cases[0]
     what = "datasets" if first.dataset == ALL else f"scenes of {first.dataset}"
     words = ", ".join(
-        f"{n.metric} {n.text} where they give {value:.{n.digits + 1}f}" for n, value, _ in cases
+        f"{n.metric} {n.text}, but the parts give {value:.{n.digits + 1}f}" for n, value, _ in cases
     )
     text = f"{first.method}, mean over the {len(parts)} {what}: {words} ({first.table})"
     return finding("mean", text, [m for n, _, parts in cases for m in (n, *parts)])
 
 
 def _of_datasets(mean: Number, numbers: list[Number]) -> list[Number]:
-    """The means of the same line of the same table."""
+    """Return the means over single datasets in the same line of the same table."""
     return [
         n
         for n in numbers
@@ -105,7 +105,7 @@ def _of_datasets(mean: Number, numbers: list[Number]) -> list[Number]:
 
 
 def _of_scenes(mean: Number, numbers: list[Number]) -> list[Number]:
-    """The method's numbers on every scene of the dataset; none where one is missing."""
+    """Return the method's numbers on every scene of the dataset; empty if one is missing."""
     of_dataset = [
         n
         for n in numbers
@@ -116,7 +116,7 @@ def _of_scenes(mean: Number, numbers: list[Number]) -> list[Number]:
     size = Counter(n.table for n in of_dataset)
     best: dict[str, Number] = {}
     for n in of_dataset:
-        # An ablation repeats one scene of the main table: the larger table is where means come from.
+        # an ablation repeats one scene of the main table; means come from the larger table
         if n.method == mean.method and (n.scene not in best or size[n.table] > size[best[n.scene].table]):
             best[n.scene] = n
     scenes = {n.scene for n in of_dataset}
@@ -128,12 +128,12 @@ def _one_scene(n: Number) -> bool:
 
 
 def ranks(numbers: list[Number]) -> list[Finding]:
-    """Marks for first, second and third that the numbers of the column do not give."""
+    """Find marks for first, second and third that contradict the numbers of the column."""
     columns: dict[tuple[str, ...], list[Number]] = defaultdict(list)
     for n in numbers:
         if not n.setting:
             columns[(n.table, *n.place, n.metric)].append(n)
-    found = []
+    findings = []
     for column in columns.values():
         better = _sign(column[0].metric)
         if better is None or not any(n.mark for n in column):
@@ -142,14 +142,14 @@ def ranks(numbers: list[Number]) -> list[Finding]:
         if wrong:
             order = sorted(column, key=lambda n: -better * n.value)
             right = ", ".join(f"{i} {n.method} {n.text}" for i, n in enumerate(order[:3], start=1))
-            said = ", ".join(f"{n.method} {n.text} as {n.mark}" for n in wrong)
-            text = f"{column[0].metric} on {place_name(column[0])}: marks {said}, but it is {right}"
-            found.append(finding("rank", text, wrong))
-    return found
+            marks = ", ".join(f"{n.method} {n.text} as {n.mark}" for n in wrong)
+            text = f"{column[0].metric} on {place_name(column[0])}: marks {marks}, but the order is {right}"
+            findings.append(finding("rank", text, wrong))
+    return findings
 
 
 def _places(n: Number, column: list[Number], better: int) -> range:
-    """The ranks it may be marked as; equal numbers may share one or take several."""
+    """Return the ranks that a number may be marked as; equal numbers may share a rank or take several."""
     ahead = {m.value for m in column if better * (m.value - n.value) > 0}
     before = sum(better * (m.value - n.value) > 0 for m in column)
     return range(1 + len(ahead), 1 + before + sum(m.value == n.value for m in column))
@@ -162,7 +162,7 @@ def _sign(metric: str) -> int | None:
 
 
 def digits(numbers: list[Number]) -> list[Finding]:
-    """Quality metrics printed with other digits than nearly all of their column."""
+    """Find quality metrics printed with another number of digits than most of their column."""
     columns: dict[tuple[str, str], list[Number]] = defaultdict(list)
     for n in numbers:
         if n.metric.startswith(("psnr", "ssim", "lpips")):
@@ -180,15 +180,15 @@ def _odd_digits(column: list[Number]) -> Iterator[Finding]:
 
 
 def units(numbers: list[Number]) -> list[Finding]:
-    """Quantities without a unit, one finding a metric."""
-    found = []
+    """Find quantities without a unit, one finding for each metric."""
+    findings = []
     for metric in sorted({n.metric for n in numbers if n.metric in UNITLESS}):
         bare = [n for n in numbers if n.metric == metric and n.variant == UNKNOWN]
         if bare:
             tables = ", ".join(dict.fromkeys(n.table for n in bare))
-            text = f"{len(bare)} values of {metric} carry no unit, nor what was counted ({tables})"
-            found.append(finding("unit", text, bare))
-    return found
+            text = f"{len(bare)} values of {metric} have neither unit nor definition ({tables})"
+            findings.append(finding("unit", text, bare))
+    return findings
 
 
 CHECKS = (
@@ -198,14 +198,14 @@ CHECKS = (
 
 
 def audit(numbers: list[Number]) -> list[Finding]:
-    """Everything that cannot be right, by kind; the same numbers give the same findings."""
-    found = [f for check in CHECKS for f in check(numbers)]
+    """Run all checks; return the findings by kind. The same numbers give the same findings."""
+    findings = [f for check in CHECKS for f in check(numbers)]
     order = list(KINDS)
-    return sorted(found, key=lambda f: order.index(f.kind))
+    return sorted(findings, key=lambda f: order.index(f.kind))
 
 
 def text_of(findings: list[Finding]) -> str:
-    """Grouped by kind, for a terminal."""
+    """Return the findings by kind, as text for a terminal."""
     lines = []
     for kind, meaning in KINDS.items():
         of_kind = [f for f in findings if f.kind == kind]
@@ -215,7 +215,7 @@ def text_of(findings: list[Finding]) -> str:
 
 
 def markdown_of(findings: list[Finding]) -> str:
-    """A list by kind."""
+    """Return the findings by kind, as Markdown lists."""
     lines = []
     for kind, meaning in KINDS.items():
         of_kind = [f for f in findings if f.kind == kind]
@@ -225,6 +225,6 @@ def markdown_of(findings: list[Finding]) -> str:
 
 
 def csv_of(findings: list[Finding]) -> str:
-    """One finding a row."""
+    """Return the findings as CSV, one per row."""
     rows = ((f.kind, f.text, "; ".join(f.tables), "; ".join(f.where)) for f in findings)
     return to_csv(("kind", "finding", "tables", "where"), rows)

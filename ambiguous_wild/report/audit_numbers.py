@@ -1,9 +1,8 @@
-"""Unlikely numbers: repeated more often than by chance, impossible, exchanged, unlike their table.
+"""Read tables of reported numbers, and find unlikely ones: repeated, impossible, exchanged or out of line.
 
-How often two numbers agree to the digit by chance depends on how densely they lie, which is measured: pairs
-that are nearly equal (within `NEAR` units of the last digit) say how many exactly equal ones to expect.
-
-Tables of reported numbers: one number a line, in CSV.
+A table is a CSV file with one number per line. How often two numbers agree to the digit by chance depends on
+how densely they lie. This is measured: pairs that are nearly equal (within `NEAR` units of the last digit)
+give the expected number of exactly equal ones.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from ambiguous_wild.report.plain_formats import read_csv
 REQUIRED = ("method", "scene", "metric", "value")
 OPTIONAL = ("table", "setting", "dataset", "variant", "mark", "printed")
 UNKNOWN = "unknown"
-MEAN, ALL = "mean", "all"  # of scenes, and of datasets
+MEAN, ALL = "mean", "all"  # in place of a scene: the mean over scenes; in place of a dataset: over datasets
 LARGEST = 50_000_000  # bytes
 REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables, see docs/tables.md
 
@@ -34,16 +33,16 @@ REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables,
 class Number:
     """One number as printed."""
 
-    table: str  # which table it stands in
+    table: str  # name of the table
     method: str
-    setting: str  # how it differs from the method as published; empty: as published
+    setting: str  # the difference from the published method; empty: none
     dataset: str
-    scene: str  # MEAN for a mean over the dataset's scenes, UNKNOWN where the table does not say
+    scene: str  # MEAN for a mean over the dataset's scenes, UNKNOWN if the table does not say
     metric: str
-    variant: str  # of the metric, or its unit; UNKNOWN where the table does not say
+    variant: str  # variant or unit of the metric; UNKNOWN if the table does not say
     value: float
-    digits: int  # behind the point
-    mark: int | None  # rank the table marks it as: 1, 2, 3
+    digits: int  # after the decimal point
+    mark: int | None  # rank that the table gives it: 1, 2, 3
     where: str  # file and line
 
     @property
@@ -56,7 +55,7 @@ class Number:
 
     @property
     def half(self) -> float:
-        """Half a unit of the last printed digit."""
+        """Half a unit of the last printed digit: the rounding error."""
         return 0.5 * 10.0**-self.digits
 
     @property
@@ -65,15 +64,15 @@ class Number:
 
     @property
     def known(self) -> bool:
-        """Whether it is said what it was measured on."""
+        """True if the table says on what it was measured."""
         return UNKNOWN not in self.place
 
 
 def read_tables(paths: Sequence[Path]) -> list[Number]:
-    """Read CSV files; a folder stands for the *.csv in it. Cells without a value are left out.
+    """Read CSV files, or all *.csv in a folder; rows without a value are left out.
 
     Raises:
-        AwError: no file, or one that is unreadable, lacks a column or holds what is no number.
+        AwError: there is no file, or one is unreadable, lacks a column or has an invalid number.
     """
     files: list[Path] = []
     for path in paths:
@@ -81,10 +80,10 @@ def read_tables(paths: Sequence[Path]) -> list[Number]:
         if not inside:
             raise AwError(f"no *.csv in {path}: give tables as docs/tables.md describes them")
         files += inside
-    found = [n for path in dict.fromkeys(files) for n in _read(path)]
-    if not found:
+    numbers = [n for path in dict.fromkeys(files) for n in _read(path)]
+    if not numbers:
         raise AwError(f"no number in {shortlist(map(str, files))}: nothing to audit")
-    return found
+    return numbers
 
 
 def _read(path: Path) -> list[Number]:
@@ -128,29 +127,31 @@ def _digits(text: str) -> int:
     return len(text.partition(".")[2])
 
 
-# kind -> what it means, in the order they are listed
+# kind -> its meaning, in the order of the report
 KINDS = {
-    "repeated": "numbers equal to the digit where they must not be",
-    "contradiction": "the same thing with another number elsewhere",
+    "repeated": "different results with equal digits",
+    "contradiction": "another number for the same result in another place",
     "swapped": "numbers or columns that look exchanged",
-    "mean": "a mean that does not follow from what it is the mean of",
-    "out of place": "a number its metric, or its neighbours, do not allow",
-    "rank": "a marked rank that the numbers do not give",
-    "digits": "another number of digits than the rest of its column",
-    "unit": "it is not said what was counted",
+    "mean": "a mean that differs from the mean of its parts",
+    "out of place": "a number outside the range of its metric or of its neighbours",
+    "rank": "a marked rank that contradicts the numbers",
+    "digits": "another number of digits than in the rest of the column",
+    "unit": "the unit, or what was counted, is not given",
 }
 
 
 @dataclass(frozen=True)
 class Finding:
-    kind: str  # of `KINDS`
+    """Something that is unlikely or wrong in reported numbers."""
+
+    kind: str  # a key of `KINDS`
     text: str  # one line
     tables: tuple[str, ...]
     where: tuple[str, ...]  # file:line of every number involved
 
 
 def finding(kind: str, text: str, numbers: Iterable[Number]) -> Finding:
-    """A finding about these numbers."""
+    """Make a finding about these numbers."""
     involved = list(numbers)
     return Finding(
         kind,
@@ -161,7 +162,7 @@ def finding(kind: str, text: str, numbers: Iterable[Number]) -> Finding:
 
 
 def place_name(number: Number) -> str:
-    """Where it was measured, for people."""
+    """Return where the number was measured, as text."""
     if number.scene == "mean":
         return f"the mean of {number.dataset}"
     if number.scene == "all":
@@ -173,28 +174,28 @@ def method_name(number: Number) -> str:
     return f"{number.method} ({number.setting})" if number.setting else number.method
 
 
-NEAR, CLOSE = 25, 5  # units of the last digit; the narrower where numbers lie in heaps
-ODDS = 0.005  # of an accident, over everything looked at; above it nothing is said
+NEAR, CLOSE = 25, 5  # units of the last digit; CLOSE is for numbers that lie in clusters
+ODDS = 0.005  # largest probability of a coincidence, over all comparisons, at which something is reported
 Key = tuple[str, ...]
 Line = dict[Key, Number]
 
 
 def repeated(numbers: list[Number]) -> list[Finding]:
-    """Scenes and methods whose lines repeat, then single entries (all metrics of a method on a scene)."""
+    """Find scenes and methods whose lines repeat, then entries (all metrics of a method on a scene)."""
     plain = [n for n in numbers if n.known and n.scene != MEAN and "+" not in n.scene]
     by_scene = _lines(plain, lambda n: n.place, lambda n: (n.method, n.setting, n.metric))
     by_method = _lines(plain, lambda n: (n.method, n.setting), lambda n: (*n.place, n.metric))
-    found, covered = [], set[frozenset[str]]()
+    findings, covered = [], set[frozenset[str]]()
     for lines, kind in ((by_scene, "scenes"), (by_method, "methods")):
         for pairs in _repeating(lines):
             involved = [n for pair in pairs for n in pair]
             covered |= {frozenset((a.where, b.where)) for a, b in pairs}
-            found.append(finding("repeated", _words(kind, pairs), involved))
-    # A mean stands in several tables: what repeats it is said once.
-    said: dict[str, Finding] = {}
+            findings.append(finding("repeated", _words(kind, pairs), involved))
+    # a mean is printed in several tables, but its repetition is reported once
+    by_text: dict[str, Finding] = {}
     for f in _entries(numbers, covered):
-        said.setdefault(f.text, f)
-    return found + list(said.values())
+        by_text.setdefault(f.text, f)
+    return findings + list(by_text.values())
 
 
 def _lines(
@@ -207,7 +208,7 @@ def _lines(
 
 
 def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[Number, Number]]]:
-    """Pairs of lines that share too many numbers in the same cells; metric by metric."""
+    """Yield pairs of numbers of two lines that share too many, compared metric by metric."""
     from scipy.stats import poisson
 
     trials = []
@@ -221,7 +222,7 @@ def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[Number, Number]]]:
         equal = []
         for pairs in metrics:
             same = [(a, b) for a, b in pairs if a.value == b.value]
-            # Several methods at the same value (0.99 for all) are one coincidence, not several.
+            # several methods with the same value (0.99 for all) are a single coincidence
             distinct = len({a.value for a, _ in same})
             if distinct < 3:
                 continue
@@ -251,7 +252,7 @@ def _entries(numbers: list[Number], covered: set[frozenset[str]]) -> Iterator[Fi
     for n in numbers:
         entries[(n.table, *n.identity)].setdefault(n.metric, n)
     wide = [e for e in entries.values() if len(e) >= 2]
-    # By how they are related: chance is rarer where fewer pairs are looked at.
+    # related pairs are tested apart, because a coincidence is less likely among fewer pairs
     families: dict[str, list[tuple[dict[str, Number], dict[str, Number]]]] = defaultdict(list)
     for i, j in _near_pairs(wide):
         a, b = wide[i], wide[j]
@@ -266,13 +267,13 @@ def _entries(numbers: list[Number], covered: set[frozenset[str]]) -> Iterator[Fi
         for a, b in equal:
             shared = sorted(a.keys() & b.keys())
             odds = max((near + 3) / (2 * NEAR + 1) ** len(shared), close / (2 * CLOSE + 1) ** len(shared))
-            known = all(frozenset((a[m].where, b[m].where)) in covered for m in shared)
-            if odds < ODDS and not known:
+            reported = all(frozenset((a[m].where, b[m].where)) in covered for m in shared)
+            if odds < ODDS and not reported:
                 yield _entry(a, b, shared)
 
 
 def _near_pairs(entries: list[dict[str, Number]]) -> list[tuple[int, int]]:
-    """Pairs that share three metrics or more and are near in all they share."""
+    """Return pairs of entries that share three metrics or more and are near in all of them."""
     metrics = sorted({m for e in entries for m in e})
     value, unit = (np.full((len(entries), len(metrics)), np.nan) for _ in range(2))
     for i, e in enumerate(entries):
@@ -301,7 +302,7 @@ def _of(entry: dict[str, Number], metrics: Iterable[str]) -> list[Number]:
 
 
 def _may_be_one(a: Number, b: Number) -> bool:
-    """The same thing, as far as the tables say: then equality is as it should be."""
+    """Return whether both may be the same result, as far as the tables say; then equality is expected."""
     if (a.method, a.setting) != (b.method, b.setting):
         return False
     return all(x == y or UNKNOWN in (x, y) for x, y in zip(a.place, b.place))
@@ -315,32 +316,32 @@ def _near(a: Number, b: Number, units: int) -> bool:
     return abs(a.value - b.value) <= units * 10.0 ** -max(a.digits, b.digits) + 1e-12
 
 
-# metric family -> what a value can be; LPIPS has no upper limit, but none above 1.5 was ever printed rightly
+# metric family -> smallest and largest value; LPIPS has no upper limit, but no right value was above 1.5
 LIMITS = {"psnr": (2.0, 100.0), "ssim": (-1.0, 1.0), "lpips": (0.0, 1.5)}
-MARGIN = 0.5  # of the others' range: how far from them is still among them
-OTHERS = 4  # methods a scene needs besides, before one is called unlike them
-CLEARLY = 3.0  # times nearer to the others when exchanged
+MARGIN = 0.5  # of the others' range: a value within this distance is not unusual
+OTHERS = 4  # other methods that a scene needs, before one is compared with them
+CLEARLY = 3.0  # an exchange must bring values this many times nearer to the others
 FAR = 8.0  # robust deviations of a residual; in normal noise once in 10^15
-USUAL = 4.0  # what the other two metrics may be off
-FINEST = 0.0125  # of a spread: nothing below FAR times it is called a misprint
-SMALLEST = 4  # methods and scenes a table needs to say what fits
+USUAL = 4.0  # robust deviations that the other two metrics may have
+FINEST = 0.0125  # smallest robust deviation that is used
+SMALLEST = 4  # methods and scenes that a table needs for a fit
 Entry = dict[str, Number]  # family -> number
 Scenes = dict[tuple[str, str, str], dict[str, Entry]]  # (table, dataset, scene) -> method -> entry
 
 
 def out_of_place(numbers: list[Number]) -> list[Finding]:
-    """Values outside what the metric allows."""
-    found = []
+    """Find values outside the range of the metric."""
+    findings = []
     for n in numbers:
         low, high = LIMITS.get(_family(n), (-np.inf, np.inf))
         if not low <= n.value <= high:
-            text = f"{n.method} on {place_name(n)}: {n.metric} {n.text} cannot be ({low:g} to {high:g})"
-            found.append(finding("out of place", text, [n]))
-    return found
+            text = f"{n.method} on {place_name(n)}: {n.metric} {n.text} is impossible ({low:g} to {high:g})"
+            findings.append(finding("out of place", text, [n]))
+    return findings
 
 
 def exchanged(numbers: list[Number]) -> list[Finding]:
-    """SSIM and LPIPS exchanged: for one method, or for a whole scene of a table."""
+    """Find exchanges of SSIM and LPIPS, for one method or for a whole scene of a table."""
     scenes = _scenes(numbers)
     columns = list(_columns(scenes))
     done = {n for f in columns for n in f.where}
@@ -351,7 +352,7 @@ def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[Finding]:
     entries = scenes[place]
     for method, entry in entries.items():
         if _unusual(scenes, place, method) is False:
-            continue  # as the method is elsewhere: weak, not exchanged
+            continue  # the method has similar values on other scenes: it is weak, not exchanged
         others = [e for m, e in entries.items() if m != method]
         if len(others) < OTHERS:
             continue
@@ -361,7 +362,7 @@ def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[Finding]:
         printed = abs(s - usual[0]) + abs(d - usual[1])
         turned = abs(d - usual[0]) + abs(s - usual[1])
         among = _among(s, ssim) or _among(d, lpips)
-        # A method that failed here has a bad PSNR too: then both may be outside rightly.
+        # a method that failed on this scene has a bad PSNR too; then both may be unusual
         worst = psnr.min() - MARGIN * (psnr.max() - psnr.min())
         if not among and CLEARLY * turned < printed and entry["psnr"].value >= worst:
             text = (
@@ -373,7 +374,7 @@ def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[Finding]:
 
 
 def _unusual(scenes: Scenes, place: tuple[str, str, str], method: str) -> bool | None:
-    """Whether SSIM and LPIPS, exchanged, are nearer to the method's elsewhere; None: it is nowhere else."""
+    """Return whether SSIM and LPIPS, exchanged, fit the method's other scenes better; None without any."""
     rest = [e[method] for p, e in scenes.items() if p != place and method in e]
     if not rest:
         return None
@@ -399,16 +400,16 @@ def _columns(scenes: Scenes) -> Iterator[Finding]:
 
 
 def unlike(numbers: list[Number]) -> list[Finding]:
-    """SSIM or LPIPS far from what method and scene together let expect, where PSNR and the other are not.
+    """Find SSIM or LPIPS far from the value predicted from method and scene, while the other metrics are not.
 
-    A method that failed on a scene is bad in all three: that is a result, not a misprint.
+    A method that failed on a scene is bad in all three metrics, which is no misprint.
     """
-    known = {n for f in exchanged(numbers) for n in f.where}
+    reported = {n for f in exchanged(numbers) for n in f.where}
     grids: dict[str, dict[tuple[str, str], Entry]] = defaultdict(dict)
     for (_, dataset, scene), entries in _scenes(numbers).items():
         for method, entry in entries.items():
             grids[dataset].setdefault((method, scene), entry)
-    found = []
+    findings = []
     for grid in grids.values():
         rests = {family: _residuals(grid, family) for family in LIMITS}
         for key, entry in grid.items():
@@ -416,15 +417,15 @@ def unlike(numbers: list[Number]) -> list[Finding]:
             for family in ("ssim", "lpips"):
                 others = [v for f, v in far.items() if f != family]
                 n = entry[family]
-                if far and far[family] > FAR and max(others) < USUAL and n.where not in known:
+                if far and far[family] > FAR and max(others) < USUAL and n.where not in reported:
                     fits = rests[family][key][1]
                     text = f"{n.method} on {place_name(n)}: {family.upper()} {n.text}, {fits:.2f} would fit"
-                    found.append(finding("out of place", text, [n]))
-    return found
+                    findings.append(finding("out of place", text, [n]))
+    return findings
 
 
 def _residuals(grid: dict[tuple[str, str], Entry], family: str) -> dict[tuple[str, str], tuple[float, float]]:
-    """(residual in robust deviations, expected value) by method and scene; empty for a small table."""
+    """Return (residual in robust deviations, expected value) by method and scene; empty for a small table."""
     methods, scenes = (sorted({key[i] for key in grid}) for i in (0, 1))
     table = np.full((len(methods), len(scenes)), np.nan)
     for (method, scene), entry in grid.items():
@@ -436,10 +437,10 @@ def _residuals(grid: dict[tuple[str, str], Entry], family: str) -> dict[tuple[st
         fit += np.nanmedian(table - fit, axis=1, keepdims=True)
         fit += np.nanmedian(table - fit, axis=0, keepdims=True)
     rest = table - fit
-    # The mean, not the median: many residuals of a polished table are zero by construction. The largest is
-    # left out, or it would hide itself.
+    # The mean, not the median, as many residuals of a polished table are zero by construction. The largest
+    # is left out, because it would raise the limit that it is compared with.
     spread = 1.2533 * np.mean(np.sort(np.abs(rest[~np.isnan(rest)]))[:-1])
-    # What the fit takes up: a row and a column of freedom; and three digits are never known better than this.
+    # The fit uses the degrees of freedom of a row and a column. Numbers with three digits allow no less.
     typical = max(spread * np.sqrt(table.size / ((len(methods) - 1) * (len(scenes) - 1))), FINEST)
     return {
         (m, s): (float(rest[i, j] / typical), float(fit[i, j]))
@@ -450,12 +451,12 @@ def _residuals(grid: dict[tuple[str, str], Entry], family: str) -> dict[tuple[st
 
 
 def _scenes(numbers: list[Number]) -> Scenes:
-    """PSNR, SSIM and LPIPS of every method on every scene, where all three are."""
-    found: dict[tuple[str, str, str], dict[str, Entry]] = defaultdict(lambda: defaultdict(dict))
+    """Return PSNR, SSIM and LPIPS of every method on every scene that has all three."""
+    scenes: dict[tuple[str, str, str], dict[str, Entry]] = defaultdict(lambda: defaultdict(dict))
     for n in numbers:
         if n.known and not n.setting and _family(n) in LIMITS:
-            found[n.table, n.dataset, n.scene][n.method].setdefault(_family(n), n)
-    return {k: {m: e for m, e in v.items() if len(e) == len(LIMITS)} for k, v in found.items()}
+            scenes[n.table, n.dataset, n.scene][n.method].setdefault(_family(n), n)
+    return {k: {m: e for m, e in v.items() if len(e) == len(LIMITS)} for k, v in scenes.items()}
 
 
 def _family(n: Number) -> str:

@@ -1,4 +1,7 @@
-"""CSV that spreadsheets take for text, and that reads back as what was written."""
+"""The leaderboard as CSV files: its rows, the hashes that protect them, reading and writing.
+
+Texts are escaped so that spreadsheets do not calculate them, and read back unchanged.
+"""
 
 from __future__ import annotations
 
@@ -26,36 +29,36 @@ CsvValue = str | int | float | None
 
 
 def guard(text: str) -> str:
-    """The text with an apostrophe in front where a spreadsheet would calculate it.
+    """Return the text, with an apostrophe in front if a spreadsheet would calculate it.
 
-    A text that begins with an apostrophe gets one too, so that `unguard` knows ours from its own.
+    A text that begins with an apostrophe gets a second one, so that `unguard` can remove the first.
     """
     begins = text.lstrip()[:1]
     return "'" + text if begins in FORMULA or text[:1] in ("'", "\t", "\r", "\n") else text
 
 
 def unguard(cell: str) -> str:
-    """What `guard` was given."""
+    """Return the text that `guard` was given."""
     return cell[1:] if cell.startswith("'") else cell
 
 
 def number(value: float | None) -> str:
-    """Shortest digits that read back as the same number; empty where it is missing."""
+    """Return the fewest digits that read back as the same number; empty if it is missing."""
     if value is None or math.isnan(value):
         return ""
     return str(value) if isinstance(value, int) else shortest(value)
 
 
 def board_csv(head: Sequence[str], rows: Iterable[Sequence[CsvValue]]) -> str:
-    """Text is guarded, numbers stay numbers, None is an empty cell."""
+    """Return CSV with texts guarded, numbers as numbers, and empty cells for None."""
     return plain_formats.to_csv(head, rows, text=guard, number=shortest)
 
 
 def read_csv(path: Path, required: Sequence[str]) -> tuple[list[str], list[dict[str, str]]]:
-    """(columns, rows) of a file that `board_csv` wrote; cells as they stand, see `unguard` and `to_number`.
+    """Read (columns, rows) of a file that `board_csv` wrote; cells are unchanged, see `unguard`.
 
     Raises:
-        AwError: unreadable, malformed, or without a column that must be there.
+        AwError: the file is unreadable or malformed, or lacks a required column.
     """
     advice = "it is no file of a leaderboard, or was changed by hand: restore it from your version control"
     head, rows = plain_formats.read_csv(path, required, LARGEST, advice)
@@ -63,10 +66,10 @@ def read_csv(path: Path, required: Sequence[str]) -> tuple[list[str], list[dict[
 
 
 def to_count(text: str, where: str) -> int:
-    """The whole number from 0 on of a cell.
+    """Return the whole number from 0 on in a cell.
 
     Raises:
-        AwError: it holds none, or one of more than 18 digits.
+        AwError: the cell holds no such number, or one of more than 18 digits.
     """
     if not (text.isascii() and text.isdigit()) or len(text) > 18:
         raise AwError(f"{where} {text[:40]!a} is no count; restore the file")
@@ -74,10 +77,10 @@ def to_count(text: str, where: str) -> int:
 
 
 def to_number(cell: str, where: str) -> float:
-    """The number in a cell; NaN for an empty one.
+    """Return the number in a cell; NaN for an empty cell.
 
     Raises:
-        AwError: it is no number.
+        AwError: the cell holds no number.
     """
     if not cell:
         return math.nan
@@ -87,10 +90,10 @@ def to_number(cell: str, where: str) -> float:
 
 
 def check_text(kind: str, text: str) -> str:
-    """The text, where it is fit to stand in a table: others' names may hold anything that can be printed.
+    """Return the text if it is fit for a table: names may hold everything that can be printed.
 
     Raises:
-        AwError: empty, too long, or with control characters or text-direction marks.
+        AwError: it is empty, too long, or has control characters or text-direction marks.
     """
     hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
     if not text.strip() or len(text) > LONGEST or hidden is not None:
@@ -101,13 +104,13 @@ def check_text(kind: str, text: str) -> str:
 
 
 def slug(text: str) -> str:
-    """A file name for any text: lower case, digits and '-', and never a path."""
+    """Return a file name for any text: lower case, digits and '-', never a path."""
     ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
     return re.sub(r"[^a-z0-9]+", "-", ascii_text).strip("-")[:48].strip("-")
 
 
 def unique_slug(*texts: str) -> str:
-    """A file name of its own for every tuple of texts."""
+    """Return a different file name for every tuple of texts."""
     digest = hashlib.sha256("\0".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:8]
     return "-".join(filter(None, (slug(texts[0]), digest)))
 
@@ -117,16 +120,16 @@ LAST = (
     "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
     "result_hash", "checked", "reproduce", "row_hash",
 )  # fmt: skip
-NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns of others than plain text
-COST = "cost_"  # begins the column of a cost; every other column of numbers is a quality
-ALONE = "alone"  # the cost that says whether the run had the machine alone: 1 or 0
+NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns that are not plain text
+COST = "cost_"  # prefix of columns with costs; all other columns with numbers are qualities
+ALONE = "alone"  # the cost that is 1 if the run had the machine alone, else 0
 TIDY = (
     "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
     "version", "source", "config_hash", "scene_hash", "checked",
 )  # fmt: skip
-# What was computed again from renders and photos: every metric of pictures, PSNR alone, or nothing.
+# What was computed again from renders and photos: every metric of pictures, PSNR only, or nothing.
 Checked = Literal["photos", "psnr", "files"]
-CHECKED: tuple[Checked, ...] = ("files", "psnr", "photos")  # the stronger last
+CHECKED: tuple[Checked, ...] = ("files", "psnr", "photos")  # from weak to strong
 Key = tuple[str, str, str, str, str, int]
 
 
@@ -137,18 +140,18 @@ class Entry:
     dataset: str
     scene: str
     method: str
-    setting: str  # what sets it apart, for people: "2000 iterations, effects exposure"
-    options: str  # first 8 hex digits of the hash of the method's options; empty where it has none
+    setting: str  # the settings as text: "2000 iterations, effects exposure"
+    options: str  # first 8 hex digits of the hash of the method's options; empty without options
     seed: int
     images: int  # test images behind the values
     quality: Mapping[str, float]  # metric variant -> value
     cost: Mapping[str, float]  # as in the result file, numbers only
-    missing: tuple[str, ...]  # metrics that were asked for and are not there
+    missing: tuple[str, ...]  # metrics without a value
     device: str
-    hardware: str  # what times depend on
+    hardware: str  # GPU, or processor and threads
     version: str  # of this package
     source: str  # sha256 of the method's own file; empty for the methods of this package
-    code_hash: str  # sha256 over this package's files; empty in results of before it was kept
+    code_hash: str  # sha256 over this package's files; empty in results of early versions
     config_hash: str
     scene_hash: str
     result_hash: str  # sha256 of metrics.json
@@ -157,7 +160,7 @@ class Entry:
 
     @property
     def key(self) -> Key:
-        """The cell it fills."""
+        """The cell of the grid that the run fills."""
         return (self.dataset, self.scene, self.method, self.setting, self.options, self.seed)
 
     @property
@@ -166,20 +169,20 @@ class Entry:
 
     @property
     def row_hash(self) -> str:
-        """sha256 over the cells of its row: what a hand or a spreadsheet changes there shows."""
+        """sha256 over the cells of the row, which reveals changes by hand or by a spreadsheet."""
         plain = {k: getattr(self, k) for k in (*FIRST, *LAST) if k != "row_hash"}
         values = {k: {m: number(v) for m, v in getattr(self, k).items()} for k in ("quality", "cost")}
         return config_hash(plain | values)
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Metrics in the order tables have them, then by name."""
-    known = list(MEASURES)
-    return sorted(names, key=lambda n: (known.index(n) if n in known else len(known), n))
+    """Return metrics in the order of tables, then unknown ones by name."""
+    order = list(MEASURES)
+    return sorted(names, key=lambda n: (order.index(n) if n in order else len(order), n))
 
 
 def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[CsvValue]]]:
-    """Head and rows, one row a run."""
+    """Return the head and one row for each run."""
     quality = in_order({k for e in entries for k in e.quality})
     cost = in_order({k for e in entries for k in e.cost})
     head = [*FIRST, *quality, *(COST + k for k in cost), *LAST]
@@ -194,10 +197,10 @@ def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[CsvValue]]]:
 
 
 def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
-    """The entry of a row.
+    """Return the entry of a row.
 
     Raises:
-        AwError: a cell that cannot be.
+        AwError: a cell has an invalid value.
     """
     text = {k: unguard(row[k]) for k in (*FIRST, *LAST)}
     numbers = {
@@ -224,7 +227,7 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
 
 
 def tidy(entries: Iterable[Entry]) -> Iterator[list[CsvValue]]:
-    """Rows under `TIDY`, one a run and metric; what is missing has a row without a value."""
+    """Yield rows for `TIDY`, one for each run and metric; a missing metric has a row without a value."""
     for e in sorted(entries, key=lambda e: e.key):
         last = [e.device, e.version, e.source, e.config_hash, e.scene_hash, e.checked]
         qualities = {**dict.fromkeys(e.missing, math.nan), **e.quality}
@@ -237,15 +240,15 @@ ALL = "all"
 
 
 def measured(board: Path) -> Path:
-    """The folder of the measured numbers."""
+    """Return the folder of the measured numbers."""
     return board / "measured"
 
 
 def dataset_file(board: Path, dataset: str) -> Path:
-    """Where the runs of a dataset stand.
+    """Return the file with the runs of a dataset.
 
     Raises:
-        AwError: no file can be named after it.
+        AwError: the dataset's name gives no file name.
     """
     name = slug(dataset)
     if not name or name == ALL:
@@ -254,17 +257,17 @@ def dataset_file(board: Path, dataset: str) -> Path:
 
 
 def dataset_files(board: Path) -> list[Path]:
-    """The CSVs of a board, one a dataset."""
+    """Return the CSV files of a board, one for each dataset."""
     return sorted(p for p in measured(board).glob("*.csv") if p.stem != ALL and not p.name.startswith("."))
 
 
 def read_board(board: Path) -> list[Entry]:
-    """Every run on the board, in order; none where there is no board yet.
+    """Read every run on the board, in order; empty if there is no board yet.
 
-    Whoever publishes or writes a board reads it so: what a hand changed must not become what was measured.
+    Publishing and writing use this, so that changes by hand never pass as measurements.
 
     Raises:
-        AwError: a file that is damaged or was changed by hand, or a run that is there twice.
+        AwError: a file is damaged or was changed by hand, or a run is listed twice.
     """
     entries, wrong = examine(board)
     if wrong:
@@ -273,52 +276,52 @@ def read_board(board: Path) -> list[Entry]:
 
 
 def examine(board: Path) -> tuple[list[Entry], list[str]]:
-    """(runs as the files have them, a line for each row and file that was changed by hand).
+    """Read (runs as in the files, a line for each row and file that was changed by hand).
 
     Raises:
-        AwError: a file that is damaged, or a run that is there twice.
+        AwError: a file is damaged, or a run is listed twice.
     """
     entries: list[Entry] = []
     wrong: list[str] = []
     for path in dataset_files(board):
         head, rows = read_csv(path, (*FIRST, *LAST))
-        found = [from_wide(head, row, f"{path} row {at}") for at, row in enumerate(rows, 2)]
-        for e in found:
+        in_file = [from_wide(head, row, f"{path} row {at}") for at, row in enumerate(rows, 2)]
+        for e in in_file:
             if dataset_file(board, e.dataset) != path:
                 raise AwError(f"{path} holds a run of dataset {e.dataset!a}: restore the file")
         wrong += [
-            f"{path} row {at} ({e.name}) was changed by hand, its cells do not hash to its row_hash: restore "
+            f"{path} row {at} ({e.name}) was changed by hand, its cells do not match its row_hash: restore "
             "the file from your version control, or remove it and all.csv and add its runs again"
-            for at, (row, e) in enumerate(zip(rows, found), 2)
+            for at, (row, e) in enumerate(zip(rows, in_file), 2)
             if row["row_hash"] != e.row_hash
         ]
-        entries += found
+        entries += in_file
     seen: set[object] = set()
     for e in entries:
         if e.key in seen:
             raise AwError(f"{e.name} is twice in {dataset_file(board, e.dataset)}: restore the file")
         seen.add(e.key)
     entries.sort(key=lambda e: e.key)
-    # Where a row was changed, all.csv must differ: that is not a second problem.
+    # if a row was changed, all.csv differs too, which is no second problem
     return entries, wrong or _other_files(board, entries)
 
 
 def _other_files(board: Path, entries: Sequence[Entry]) -> list[str]:
-    """A line for each file that the runs do not give; one that is not there can be made from them."""
+    """Return a line for each file that differs from what the runs give; an absent file is no problem."""
     return [
-        f"{path} is not what the runs of {path.parent} give: rows were changed, added or taken out by hand, "
-        "or a write was cut off; restore the files from your version control. Where "
-        f"{ALL}.csv alone is wrong, remove it: 'aw leaderboard add' of any run writes it again"
+        f"{path} does not match the runs of {path.parent}: rows were changed, added or removed by hand, "
+        "or a write was interrupted; restore the files from your version control. If only "
+        f"{ALL}.csv is wrong, remove it: 'aw leaderboard add' of any run writes it again"
         for path, text in files_of(board, entries).items()
         if path.is_file() and path.read_bytes() != text.encode()
     ]
 
 
 def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:
-    """Path and content of every CSV of a board with these runs.
+    """Return path and content of every CSV file of a board with these runs.
 
     Raises:
-        AwError: two datasets whose names differ only in case or blanks.
+        AwError: the names of two datasets differ only in case or blanks.
     """
     by_file: dict[Path, list[Entry]] = {}
     for e in entries:
@@ -332,11 +335,11 @@ def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:
 
 
 def write_board(board: Path, entries: Sequence[Entry]) -> None:
-    """Write what changed; all.csv last, because it can be made again from the others."""
+    """Write the changed files; all.csv comes last, because it can be made again from the others."""
     files = files_of(board, entries)
     for path in dataset_files(board):
         if path not in files:
-            path.unlink()  # of a dataset whose last run was taken down
+            path.unlink()  # the last run of this dataset was removed
     for path, text in files.items():
         if not path.is_file() or path.read_bytes() != text.encode():
             write_text(path, text)

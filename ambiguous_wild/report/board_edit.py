@@ -1,4 +1,4 @@
-"""Add runs to the board, where each is checked first; remove runs; check a board."""
+"""Add runs to a board after checking each, remove runs, and check a board."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Tick = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class AddReport:
-    """What became of one run."""
+    """The outcome of one run."""
 
     run: Path
     outcome: Outcome
@@ -54,29 +54,29 @@ def add(
     """Check runs and add those that pass.
 
     Args:
-        board: folder of the leaderboard; made where there is none.
+        board: folder of the leaderboard; it is made if it does not exist.
         paths: run folders, or folders of runs.
-        dataset: of all these runs; None: what their scenes say.
-        scenes: where the scenes lie, if not where the runs say.
-        images: test images, and train photos with masks, a scene of which copies are kept.
-        replace_other: a run with other numbers takes the place of the one on the board.
-        quick: of the metrics recompute PSNR alone.
+        dataset: dataset of all these runs; None: what their scenes say.
+        scenes: where the scenes lie; None: where the runs say.
+        images: number of test images, and of train photos with masks, to copy for each scene.
+        replace_other: replace a run on the board whose numbers differ.
+        quick: recompute only PSNR.
         dry: write nothing.
         tick: called with (runs done, runs).
 
     Returns:
-        One report a run, in the order of their paths.
+        One report for each run, in the order of their paths.
 
     Raises:
-        AwError: no run there, the board is damaged or in use.
+        AwError: there is no run, or the board is damaged or in use.
     """
     runs = _find(paths)
     with folder_lock(board, "aw leaderboard add"):
         if not dry:
             sweep(measured(board))
-        there = read_board(board)
-        board_pictures.read_index(board)  # a damaged one is found before anything is written
-        finder = Scenes(scenes, dataset, there)
+        on_board = read_board(board)
+        board_pictures.read_index(board)  # a damaged index is found before anything is written
+        finder = Scenes(scenes, dataset, on_board)
         reports: dict[Path, AddReport] = {}
         passed: list[Verified] = []
         for done, run in enumerate(sorted(runs)):
@@ -88,36 +88,36 @@ def add(
             except AwError as error:
                 reports[run] = AddReport(run, "refused", str(error))
         tick(len(runs), len(runs))
-        merged = _merge(there, passed, replace_other, reports)
+        merged = _merge(on_board, passed, replace_other, reports)
         if not dry:
-            taken = [v for v in passed if reports[v.run].outcome != "refused"]
-            if taken:
+            accepted = [v for v in passed if reports[v.run].outcome != "refused"]
+            if accepted:
                 write_board(board, merged)
-                board_pictures.keep(board, taken, images)  # after its run: no picture without one
+                board_pictures.keep(board, accepted, images)  # after the runs: every picture has a run
     return [reports[run] for run in sorted(runs)]
 
 
 def _find(paths: Sequence[Path]) -> set[Path]:
-    found: set[Path] = set()
+    runs: set[Path] = set()
     for path in paths:
         if not path.is_dir():
             raise AwError(f"no run folder {path}: give a folder that 'aw bench -o' wrote")
         below = list(run_folders(path))
         if not below:
             raise AwError(f"no run in {path}: 'aw bench --method NAME --scene SCENE -o {path}' makes one")
-        found.update(below)
-    return found
+        runs.update(below)
+    return runs
 
 
 def _merge(
-    there: list[Entry],
+    on_board: list[Entry],
     passed: list[Verified],
     replace_other: bool,
     reports: dict[Path, AddReport],
 ) -> list[Entry]:
-    """The runs of the board afterwards; fills in the reports."""
-    entries = {e.key: e for e in there}
-    for reason, bad in _conflicts(there, passed):
+    """Return the runs of the board with those that passed, and add their reports."""
+    entries = {e.key: e for e in on_board}
+    for reason, bad in _conflicts(on_board, passed):
         reports[bad.run] = AddReport(bad.run, "refused", reason)
     for v in passed:
         if v.run in reports:
@@ -128,11 +128,11 @@ def _merge(
             entries[v.entry.key] = v.entry
         elif old.result_hash == v.entry.result_hash and old.config_hash == v.entry.config_hash:
             reports[v.run] = AddReport(v.run, "there already")
-            # A run that was once checked against the photos stays checked.
+            # a run that was once checked against the photos stays checked
             better = max(old.checked, v.entry.checked, key=CHECKED.index)
-            # The commands that make the scene are known where the scene is at hand.
-            again = v.entry.reproduce if v.scene is not None else old.reproduce
-            entries[v.entry.key] = replace(old, checked=better, reproduce=again)
+            # the commands that make the scene are known only if the scene is on this machine
+            reproduce = v.entry.reproduce if v.scene is not None else old.reproduce
+            entries[v.entry.key] = replace(old, checked=better, reproduce=reproduce)
         elif replace_other:
             reports[v.run] = AddReport(v.run, "replaced")
             entries[v.entry.key] = v.entry
@@ -145,7 +145,7 @@ def _other_numbers(new: Verified, old: Entry) -> str:
     differing = [k for k in old.quality if old.quality[k] != new.entry.quality.get(k)]
     key = differing[0] if differing else None
     shown = (
-        f"{key} {new.entry.quality.get(key)} here and {old.quality[key]} there"
+        f"{key} is {new.entry.quality.get(key)}, on the board {old.quality[key]}"
         if key
         else "only its cost differs"
     )
@@ -155,41 +155,41 @@ def _other_numbers(new: Verified, old: Entry) -> str:
     )
 
 
-def _conflicts(there: list[Entry], passed: list[Verified]) -> list[tuple[str, Verified]]:
-    """(why, run) of those that cannot stand together; the same whatever the order they came in."""
+def _conflicts(on_board: list[Entry], passed: list[Verified]) -> list[tuple[str, Verified]]:
+    """Return (reason, run) of runs that contradict others; the result does not depend on their order."""
     cells: dict[Key, list[Verified]] = defaultdict(list)
     hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
     configs: dict[str, list[Entry]] = defaultdict(list)
     for v in passed:
         cells[v.entry.key].append(v)
-    for e in (*there, *(v.entry for v in passed)):
+    for e in (*on_board, *(v.entry for v in passed)):
         hashes[e.dataset, e.scene].add(e.scene_hash)
         configs[e.config_hash].append(e)
-    on_board = {(e.dataset, e.scene): e.scene_hash for e in there}
-    found: list[tuple[str, Verified]] = []
+    board_hashes = {(e.dataset, e.scene): e.scene_hash for e in on_board}
+    conflicts: list[tuple[str, Verified]] = []
     for v in passed:
         e = v.entry
         scenes = hashes[e.dataset, e.scene]
         twins = [o for o in configs[e.config_hash] if o.key != e.key]
         others = [o for o in cells[e.key] if o.entry.result_hash != e.result_hash]
-        if len(scenes) > 1 and e.scene_hash != on_board.get((e.dataset, e.scene)):
+        if len(scenes) > 1 and e.scene_hash != board_hashes.get((e.dataset, e.scene)):
             reason = (
-                f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, another run's of that name has "
-                f"{min(scenes - {e.scene_hash})[:12]}: other photos, split or size, so their numbers do not "
-                "compare; put it under another --dataset"
+                f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, in another run it has "
+                f"{min(scenes - {e.scene_hash})[:12]}: other photos, split or size, so their numbers cannot "
+                "be compared; give it another --dataset"
             )
         elif others:
-            reason = f"{v.run} and {others[0].run} are the same cell with other numbers; give one of them"
+            reason = f"{v.run} and {others[0].run} are the same cell with different numbers; give only one"
         elif twins:
             twin = min(twins, key=lambda o: o.key)
             reason = (
-                f"{v.run}: its configuration is there already as {twin.name} of dataset {twin.dataset!a}; "
+                f"{v.run}: its configuration is on the board as {twin.name} of dataset {twin.dataset!a}; "
                 "give it the same --dataset, or 'aw leaderboard remove' the other"
             )
         else:
             continue
-        found.append((reason, v))
-    return found
+        conflicts.append((reason, v))
+    return conflicts
 
 
 def remove(
@@ -202,13 +202,13 @@ def remove(
     seed: int | None = None,
     dry: bool = False,
 ) -> list[Entry]:
-    """Remove the runs of a method, or those of them that the other words choose.
+    """Remove the runs of a method, or only those that match all other arguments.
 
     Returns:
-        What was removed; with `dry` what would be.
+        The runs that were removed, or with `dry` would be.
 
     Raises:
-        AwError: a name that is not on the board, no run that all words fit, or the board is in use.
+        AwError: a name is not on the board, no run matches all arguments, or the board is in use.
     """
     if not board.is_dir():
         raise AwError(f"no leaderboard {board}: name its folder with --board")
@@ -216,32 +216,32 @@ def remove(
     with folder_lock(board, "aw leaderboard remove"):
         entries = read_board(board)
         for what, value in asked.items():
-            there = {str(getattr(e, what)) for e in entries}
-            if value is not None and str(value) not in there:
-                raise unknown(f"{what} on the board {board}", str(value), there)
-        gone = [e for e in entries if all(v is None or getattr(e, k) == v for k, v in asked.items())]
-        if not gone:
-            raise AwError(f"no run on {board} is all of this; leave out one of the choices")
+            present = {str(getattr(e, what)) for e in entries}
+            if value is not None and str(value) not in present:
+                raise unknown(f"{what} on the board {board}", str(value), present)
+        removed = [e for e in entries if all(v is None or getattr(e, k) == v for k, v in asked.items())]
+        if not removed:
+            raise AwError(f"no run on {board} matches all of these options; leave one of them out")
         if not dry:
-            kept = [e for e in entries if e not in gone]
-            board_pictures.drop(board, kept)  # before its run: no picture without one
+            kept = [e for e in entries if e not in removed]
+            board_pictures.drop(board, kept)  # before the runs: every picture has a run
             write_board(board, kept)
-    return gone
+    return removed
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found."""
+    """The result of a check."""
 
     runs: int
     problems: tuple[str, ...]  # one line each
 
 
 def check(board: Path) -> Checked:
-    """Read everything again and compare.
+    """Read all files of a board and compare them with each other.
 
     Raises:
-        AwError: no board.
+        AwError: there is no board.
     """
     if not measured(board).is_dir():
         raise AwError(
@@ -259,18 +259,18 @@ def check(board: Path) -> Checked:
 
 
 def _copies(entries: Iterable[Entry]) -> Iterator[str]:
-    """Runs that are there twice: under one configuration, or as two seeds with the same numbers."""
+    """Yield lines about runs that are listed twice: with one configuration, or as two seeds."""
     by_config: dict[str, Entry] = {}
     by_values: dict[object, Entry] = {}
     for e in entries:
         first = by_config.setdefault(e.config_hash, e)
         if first is not e:
-            yield f"{e.name} and {first.name} have the same configuration hash: one is the other's copy"
-        # Whole runs of noise-free reference rows may agree between methods; between seeds nothing does.
+            yield f"{e.name} and {first.name} have the same configuration hash: one is a copy of the other"
+        # references without noise may agree between methods, but seeds never agree
         values = tuple(sorted((k, v) for k, v in e.quality.items() if not k.startswith("mask_")))
         other = by_values.setdefault((*e.key[:-1], values), e)
         if values and other is not e:
-            yield f"{e.name} and seed {other.seed} have the same numbers in all digits: is it the same run?"
+            yield f"{e.name} and seed {other.seed} agree in all digits: check whether it is the same run"
 
 
 def _pictures(board: Path) -> Iterator[str]:

@@ -1,7 +1,7 @@
-"""Copies of test renders, photos and masks, kept beside the CSVs so that the page needs no run folder.
+"""Keep copies of test renders, photos and masks beside the CSV files, so that the page needs no run folder.
 
-Kind "test": render of a test view, or its photo. Kind "train": a train photo, and what a method masks in it.
-Kind "exact": the exact mask of a train photo. Masks are transparent where a pixel is kept.
+Kind "test": the render of a test view, or its photo. Kind "train": a train photo, or the mask that a method
+predicts for it. Kind "exact": the exact mask of a train photo. Masks are transparent where a pixel is kept.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from ambiguous_wild.report.board import (
 from ambiguous_wild.report.board_verify import RENDERS, Verified
 
 INDEX = "index.csv"
-OLD = (  # columns of an index of before masks were kept: every picture is of kind "test"
+OLD = (  # columns of an index of earlier versions, which kept no masks: every picture is of kind "test"
     "dataset", "scene", "image", "method", "setting", "options", "seed", "psnr", "file", "sha256", "row_hash",
 )  # fmt: skip
 COLUMNS = (*OLD[:-1], "kind", "row_hash")
@@ -49,7 +49,7 @@ Row = dict[str, str]  # by column; method is empty for photos and exact masks
 
 @dataclass(frozen=True)
 class _Place:
-    """What a picture shows, see above."""
+    """What a picture shows; see the kinds above."""
 
     dataset: str
     scene: str
@@ -65,21 +65,21 @@ class _Place:
         mask = self.kind == EXACT or (self.kind == TRAIN and bool(self.method))
         name = "exact" if self.kind == EXACT else name
         parts = (slug(self.dataset), unique_slug(self.scene), unique_slug(self.image))
-        # A train photo can have the name of a test photo.
+        # a train photo may have the same name as a test photo
         parts = parts if self.kind == TEST else (*parts[:2], f"train-{parts[2]}")
         return "/".join((*parts, f"{name}.{'png' if mask else 'jpg'}"))
 
 
 def folder_of(board: Path) -> Path:
-    """Where the pictures lie."""
+    """Return the folder of the pictures."""
     return measured(board) / "images"
 
 
 def read_index(board: Path) -> list[Row]:
-    """What the pictures of a board show; empty where there is none.
+    """Read what the pictures of a board show; empty if there are none.
 
     Raises:
-        AwError: the index is damaged, or names a file elsewhere.
+        AwError: the index is damaged, or names a wrong file.
     """
     path = folder_of(board) / INDEX
     if not path.is_file():
@@ -92,10 +92,10 @@ def read_index(board: Path) -> list[Row]:
         if row["kind"] not in KINDS:
             raise AwError(f"{path} row {at}: kind is none of {', '.join(KINDS)}; restore the index")
         if row["file"] != _place(row).file:
-            raise AwError(f"{path} row {at} names a file that is not its own: restore the index")
+            raise AwError(f"{path} row {at} names the file of another picture: restore the index")
         if row.pop("row_hash") != _row_hash(row, f"{path} row {at}"):
             raise AwError(
-                f"{path} row {at} was changed by hand, its cells do not hash to its row_hash: "
+                f"{path} row {at} was changed by hand, its cells do not match its row_hash: "
                 "restore the file from your version control"
             )
         if row["seed"]:
@@ -104,15 +104,15 @@ def read_index(board: Path) -> list[Row]:
 
 
 def keep(board: Path, runs: Iterable[Verified], count: int) -> int:
-    """Keep pictures of these runs: per method and scene those of the lowest seed.
+    """Keep pictures of runs: for each method and scene those of the lowest seed.
 
     Args:
-        board: its folder.
-        runs: that were verified.
-        count: test images, and train photos with masks, a scene, evenly over their names; 0 keeps none.
+        board: folder of the board.
+        runs: the verified runs.
+        count: number of test images, and of train photos with masks, for each scene, evenly spaced by name.
 
     Returns:
-        How many pictures were written.
+        The number of pictures written.
     """
     index = {_place(row): row for row in read_index(board)}
     before = dict(index)
@@ -127,7 +127,7 @@ def keep(board: Path, runs: Iterable[Verified], count: int) -> int:
 
 
 def drop(board: Path, runs: Iterable[Entry]) -> None:
-    """Remove the pictures of runs that are not among these, and photos without any render left."""
+    """Remove the pictures of all other runs, and photos that have no render any more."""
     cells = {(*e.key[:-1], str(e.seed)) for e in runs}
     index = read_index(board)
     keys = ("dataset", "scene", "method", "setting", "options", "seed")
@@ -144,7 +144,7 @@ def drop(board: Path, runs: Iterable[Entry]) -> None:
 
 
 def _view(row: Row) -> tuple[str, str, str, bool]:
-    """The test view or train photo of a picture."""
+    """Return the test view or train photo of a picture."""
     return row["dataset"], row["scene"], row["image"], row["kind"] == TEST
 
 
@@ -159,14 +159,14 @@ def _write_index(board: Path, index: Iterable[Row]) -> None:
 
 
 def _row_hash(row: Row, where: str) -> str:
-    """sha256 over the other cells of a row."""
+    """Return the sha256 over the other cells of a row."""
     psnr = number(to_number(row["psnr"], where))
-    columns = OLD[:-1] if row["kind"] == TEST else COLUMNS[:-1]  # rows of before keep their hash
+    columns = OLD[:-1] if row["kind"] == TEST else COLUMNS[:-1]  # rows of earlier versions keep their hash
     return config_hash([psnr if k == "psnr" else row[k] for k in columns])
 
 
 def chosen(names: tuple[str, ...], count: int) -> list[str]:
-    """`count` names, evenly spread."""
+    """Return `count` of the names, evenly spaced."""
     at = (
         np.linspace(0, len(names) - 1, min(count, len(names)) + 2)[1:-1]
         if len(names) > count
@@ -178,8 +178,7 @@ def chosen(names: tuple[str, ...], count: int) -> list[str]:
 def _keep_one(board: Path, run: Verified, name: str, index: dict[_Place, Row]) -> int:
     e = run.entry
     place = _Place(e.dataset, e.scene, name, e.method, e.setting, e.options)
-    known = index.get(place)
-    if known is not None and known["seed"] and int(known["seed"]) < e.seed:
+    if _has_lower_seed(index.get(place), e.seed):
         return 0
     written = 0
     if run.scene is not None:
@@ -190,8 +189,12 @@ def _keep_one(board: Path, run: Verified, name: str, index: dict[_Place, Row]) -
     return written + _write(board, place, _jpeg(render), str(e.seed), run.psnr[name], index)
 
 
+def _has_lower_seed(row: Row | None, seed: int) -> bool:
+    return row is not None and bool(row["seed"]) and int(row["seed"]) < seed
+
+
 def _keep_masks(board: Path, run: Verified, count: int, index: dict[_Place, Row]) -> int:
-    """Train photos with what the run masks on them, and the exact masks, where there are any."""
+    """Keep train photos, the run's masks of them, and the exact masks if there are any."""
     e, scene = run.entry, run.scene
     if scene is None:
         return 0
@@ -200,8 +203,7 @@ def _keep_masks(board: Path, run: Verified, count: int, index: dict[_Place, Row]
     for name in chosen(tuple(sorted(n for n, path in masks.items() if path.is_file())), count):
         view = next(v for v in scene.train if v.name == name)
         place = _Place(e.dataset, e.scene, name, e.method, e.setting, e.options, TRAIN)
-        known = index.get(place)
-        if known is not None and known["seed"] and int(known["seed"]) < e.seed:
+        if _has_lower_seed(index.get(place), e.seed):
             continue
         photo = _jpeg(view.image_path)
         written += _write(board, _Place(e.dataset, e.scene, name, kind=TRAIN), photo, "", math.nan, index)
@@ -237,7 +239,7 @@ def _overlay(
     size: tuple[int, int],  # px of the photo, width and height
     colour: tuple[int, int, int, int],
 ) -> bytes:
-    """A PNG of the photo's aspect: the colour where shown, transparent elsewhere."""
+    """Return a PNG with the photo's aspect ratio: the colour where shown, transparent elsewhere."""
     scale = min(1.0, SIDE / max(size))
     size = (max(round(size[0] * scale), 1), max(round(size[1] * scale), 1))
     shown = cv2.resize(shown.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0

@@ -1,6 +1,6 @@
-"""The page: one index.html with CSVs and pictures beside it, made from the board's CSVs alone.
+"""Publish a board: one index.html with CSV files and pictures beside it, made from the board's files alone.
 
-What the page's scripts read: runs, pictures, methods, reported numbers with what the audit found.
+The page's scripts read its data: runs, pictures, methods, reported numbers and the findings of the audit.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TypedDict
 from urllib.parse import quote
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.harness.measures import measure
-from ambiguous_wild.harness.models import TrainedModel, find_models, open_scene
 from ambiguous_wild.harness.result_file import RESULT
+from ambiguous_wild.harness.trained_models import TrainedModel, find_models, open_scene
 from ambiguous_wild.io.files import (
     atomic_dir,
     check_output,
@@ -52,7 +53,7 @@ from ambiguous_wild.report.board import (
 from ambiguous_wild.viewing.page_file import page_text
 
 COSTS = ("reference_s", "train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
-TIMES = ("reference_s", "train_s", "fps")  # compare only between runs that had the machine alone
+TIMES = ("reference_s", "train_s", "fps")  # comparable only between runs that had the machine alone
 MASKS = ("mask_iou", "mask_precision", "mask_recall")
 PRINTED_LABELS = {"lpips": "LPIPS", "memory": "memory", "gpu_hours": "GPU h", "fps": "FPS"}
 LABELS = {
@@ -63,7 +64,7 @@ COLUMNS = (
     "dataset", "scene", "method", "setting", "options", "seed", "images", "missing", "device", "hardware",
     "version", "source", "code_hash", "config_hash", "scene_hash", "result_hash", "checked", "reproduce",
 )  # fmt: skip
-# Code of the authors; papers are linked by the arXiv number that the method's entry names.
+# Code of the authors. Papers are linked by the arXiv number in the method's entry, else by PAPERS.
 CODE = {
     "3dgs": "https://github.com/graphdeco-inria/gaussian-splatting",
     "absgs": "https://github.com/TY424/AbsGS",
@@ -82,25 +83,50 @@ PAPERS = {
 }
 
 
+class ReportedData(TypedDict):
+    """Reported numbers, as the page's scripts read them."""
+
+    reported: list[dict[str, CsvValue]]  # by `REPORTED_COLUMNS`, and "where"
+    findings: list[dict[str, str | list[str]]]  # kind, text, where
+    sources: dict[str, dict[str, str]]  # table -> title, venue, url, caption
+
+
+class PageData(ReportedData):
+    """What the page's scripts read."""
+
+    date: str
+    version: str
+    order: list[str]  # of the metrics
+    partial: list[str]  # metrics that some images or scenes lack
+    times: list[str]
+    references: list[str]
+    methods: dict[str, dict[str, str]]  # name -> summary, paper, links
+    measures: dict[str, dict[str, str | int | None]]  # key -> label, better, digits
+    runs: list[Facts]  # by `COLUMNS`, and quality, cost, alone
+    models: dict[str, str]
+    images: list[Facts]  # rows of the index of pictures
+    files: list[str]
+
+
 def facts(
     entries: Sequence[Entry],
     index: Iterable[Mapping[str, str]],
     reported: Reported,
     files: list[str],
     models: Mapping[str, str] = MappingProxyType({}),
-) -> dict[str, Any]:
-    """The page's data, ready for JSON.
+) -> PageData:
+    """Return the page's data, ready for JSON.
 
     Args:
         entries: runs of the board.
-        index: rows of `pictures.read_index`.
+        index: rows of `board_pictures.read_index`.
         reported: numbers that papers print; may be empty.
-        files: names of the CSVs beside the page.
-        models: page that shows a run's model, by hash of its result.
+        files: names of the CSV files beside the page.
+        models: page that shows a run's model, by the hash of its result.
     """
     order = in_order({k for e in entries for k in e.quality})
     missing = {k for e in entries for k in e.missing}
-    measures = {
+    measures: dict[str, dict[str, str | int | None]] = {
         k: {"label": LABELS.get(k, m.label), "better": m.better, "digits": m.digits}
         for k in (*order, *sorted(missing), *COSTS, "lpips_alex")
         for m in (measure(k),)
@@ -130,9 +156,9 @@ def facts(
     }
 
 
-def _run(e: Entry) -> dict[str, Any]:
+def _run(e: Entry) -> Facts:
     quality = dict(e.quality)
-    if "mask_recall" not in quality:  # no distractor to find: an IoU of 0 says nothing
+    if "mask_recall" not in quality:  # the scene has no distractors: an IoU of 0 has no meaning
         quality = {k: v for k, v in quality.items() if k not in MASKS}
     alone = e.cost.get(ALONE)
     return {k: getattr(e, k) for k in COLUMNS} | {
@@ -143,11 +169,10 @@ def _run(e: Entry) -> dict[str, Any]:
 
 
 def _method(name: str) -> dict[str, str]:
-    """What a method is, with links; a name that this package does not know has none."""
+    """Return summary and links of a method; empty for a method that is not of this package."""
     from ambiguous_wild.methods.registry import BUILTIN
 
-    known = {entry.name: entry for entry in BUILTIN}
-    entry = known.get(re.split("[@]", name)[0])
+    entry = {entry.name: entry for entry in BUILTIN}.get(name.partition("@")[0])
     if entry is None:
         return {"summary": "", "paper": "", "paper_url": "", "code_url": ""}
     number = re.search(r"arXiv (\d{4}\.\d{4,5})", entry.paper)
@@ -158,12 +183,12 @@ def _method(name: str) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _numbers(values: Mapping[str, float]) -> dict[str, Any]:
+def _numbers(values: Mapping[str, float]) -> dict[str, float | str | None]:
     return {k: _number(v) for k, v in values.items()}
 
 
 def _number(value: float) -> float | str | None:
-    """As JSON has it: no NaN, no infinity."""
+    """Return a value for JSON, which has neither NaN nor infinity."""
     if math.isfinite(value):
         return value
     return None if math.isnan(value) else str(value)
@@ -172,29 +197,20 @@ def _number(value: float) -> float | str | None:
 SOURCE = "reported"
 SOURCES = "sources.json"
 REPORTED_COLUMNS = (
-    "source",
-    "method",
-    "setting",
-    "dataset",
-    "scene",
-    "metric",
-    "variant",
-    "value",
-    "printed",
-    "table",
-)
+    "source", "method", "setting", "dataset", "scene", "metric", "variant", "value", "printed", "table",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Reported:
-    """What papers print, where it stands, and what `aw audit` found in it."""
+    """Numbers that papers print, their sources, and the findings of `aw audit`."""
 
     numbers: tuple[Number, ...] = ()
     findings: tuple[Finding, ...] = ()
     sources: dict[str, dict[str, str]] = field(default_factory=dict)  # table -> title, venue, url, caption
 
-    def plain(self) -> dict[str, Any]:
-        """For the page: findings are looked up by the place of a number."""
+    def plain(self) -> ReportedData:
+        """Return the data for the page, which finds a number's findings by its place ("where")."""
         return {
             "reported": [
                 {column: _plain(n, column) for column in (*REPORTED_COLUMNS[1:], "where")}
@@ -206,31 +222,31 @@ class Reported:
 
 
 def read_reported(folder: Path) -> Reported:
-    """Every number of FOLDER/*.csv that says method and scene, in order; none without the folder.
+    """Read every number of FOLDER/*.csv that names method and scene, in order; none without the folder.
 
     Raises:
-        AwError: a file that is unreadable or malformed.
+        AwError: a file is unreadable or malformed.
     """
     if not folder.is_dir() or not any(folder.glob("*.csv")):
         return Reported()
     numbers = read_tables([folder])
-    # of no method: what the text says of the photos
-    found = [n for n in numbers if n.known and n.method != "dataset"]
-    found.sort(key=lambda n: (n.dataset, n.method, n.setting, n.scene, n.table, n.metric, n.variant))
-    return Reported(tuple(found), tuple(audit(numbers)), read_sources(folder / SOURCES))
+    # the method "dataset" stands for facts about the photos themselves
+    shown = [n for n in numbers if n.known and n.method != "dataset"]
+    shown.sort(key=lambda n: (n.dataset, n.method, n.setting, n.scene, n.table, n.metric, n.variant))
+    return Reported(tuple(shown), tuple(audit(numbers)), read_sources(folder / SOURCES))
 
 
 def read_sources(path: Path) -> dict[str, dict[str, str]]:
-    """Table -> title of its paper, link and caption, from the sources.json beside reported tables.
+    """Read title of the paper, link and caption of each table, from sources.json beside reported tables.
 
     Raises:
-        AwError: it is there and not of that form.
+        AwError: the file is malformed.
     """
     if not path.is_file():
         return {}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        papers, tables = found["papers"], found["tables"]
+        sources = json.loads(path.read_text(encoding="utf-8"))
+        papers, tables = sources["papers"], sources["tables"]
         return {
             str(name): {
                 "caption": str(about.get("caption", "")),
@@ -248,13 +264,13 @@ def read_sources(path: Path) -> dict[str, dict[str, str]]:
 
 
 def _link(url: object) -> str:
-    """An address that a page may link to; empty for anything else, such as javascript:."""
+    """Return an address that a page may link to; empty for anything else, such as javascript:."""
     text = str(url or "")
     return text if re.fullmatch(r"https?://[^\s\"'<>]+", text) else ""
 
 
 def reported_csv(numbers: Sequence[Number]) -> str:
-    """One number a row, each marked as reported; beside the value how it is printed."""
+    """Return CSV with one number per row, each marked as reported, with its value and as printed."""
     rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in numbers)
     return board_csv(REPORTED_COLUMNS, rows)
 
@@ -275,13 +291,13 @@ SCRIPTS = (
 
 @dataclass(frozen=True)
 class Published:
-    """What the page shows."""
+    """The numbers of things that the page shows."""
 
     runs: int
     datasets: int
     images: int
     reported: int
-    reported_from: str | None = None  # the folder that was looked into; None: not asked for
+    reported_from: str | None = None  # the folder of reported numbers; None: not asked for
     model_pages: int = 0
 
 
@@ -295,16 +311,16 @@ def publish(
     models: Sequence[Path] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Published:
-    """Write the page; an earlier page in `out` is replaced once the new one is whole.
+    """Write the page; an earlier page in `out` is replaced once the new one is complete.
 
     Args:
         board: folder of the leaderboard.
-        out: for index.html, data/*.csv and images/.
-        reported: show what papers print, too: BOARD/reported/*.csv, else the tables of this package.
-        reported_from: show what papers print, too, from this folder.
-        title: of the page.
-        models: run folders, or folders of them; their models go into pages of `aw view`, OUT/models/*.html.
-        say: told which entries have no model there.
+        out: folder for index.html, data/*.csv and images/.
+        reported: also show numbers that papers print: BOARD/reported/*.csv, else the tables of this package.
+        reported_from: also show numbers that papers print, from this folder.
+        title: title of the page.
+        models: run folders, or folders of them; their models are shown on OUT/models/*.html, as by `aw view`.
+        say: gets a line for each entry without a model there.
 
     Raises:
         AwError: the board is damaged, or `out` holds something else.
@@ -349,7 +365,7 @@ def publish(
 
 
 def _restore(out: Path) -> None:
-    """Put the old page back where a killed call had moved it away and not yet the new one in."""
+    """Put the old page back if a call was killed between moving it away and moving the new one in."""
     if out.exists():
         return
     for left in sorted(out.parent.glob(f".{out.name}.old-*")):
@@ -370,19 +386,19 @@ def _check_folder(out: Path) -> None:
     )
     if names and (not made or names - OURS):
         odd = sorted(names - OURS)[0] if names - OURS else "another page"
-        raise AwError(f"{out} holds something else than a published board ({odd}); choose another -o")
-    known = _published(out)
-    if known is not None:
-        refuse_strangers(out, known)
+        raise AwError(f"{out} holds other files than a published board ({odd}); choose another -o")
+    published = _published(out)
+    if published is not None:
+        refuse_strangers(out, published)
 
 
 def _published(out: Path) -> set[str] | None:
-    """What the last publish wrote there; None for a page of before it kept a list."""
+    """Return the names of files that the last publish wrote; None for a page of an early version."""
     try:
-        found = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+        names = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return {MANIFEST, *map(str, found)} if isinstance(found, list) else None
+    return {MANIFEST, *map(str, names)} if isinstance(names, list) else None
 
 
 def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Number]) -> list[str]:
@@ -405,11 +421,11 @@ def _copy_picture(source: Path, target: Path, digest: str) -> None:
     shutil.copyfile(source, target)
 
 
-def page(title: str, known: Mapping[str, Any]) -> str:
-    """The page; data and title can be anything and stay text."""
-    # A picture beside a file:// page is not 'self' in every browser.
-    here = Path(__file__).resolve().parent / "page"
-    return fill_page(here, known, SCRIPTS, title=title, images="'self' file: data:", sort_keys=True)
+def page(title: str, data: PageData) -> str:
+    """Return the page; data and title remain text, whatever they hold."""
+    # a picture beside a file:// page is not 'self' in every browser
+    template = Path(__file__).resolve().parent / "page"
+    return fill_page(template, data, SCRIPTS, title=title, images="'self' file: data:", sort_keys=True)
 
 
 MODELS = "models"
@@ -418,30 +434,30 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class ModelPages:
-    """What was written."""
+    """The pages of models that were written."""
 
-    links: dict[str, str]  # by the result hash of a run: where its entry is shown, relative to index.html
+    links: dict[str, str]  # link to a run's entry, relative to index.html, by the hash of its result
     pages: int
 
 
 def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path, say: Say) -> ModelPages:
     """Write OUT/models/*.html from run folders whose results are on the board.
 
-    Of an entry (a method with its setting) the lowest seed that is at hand is shown.
+    A method with its setting is shown by the lowest seed that has a model below `runs`.
 
     Args:
-        entries: of the board.
+        entries: runs of the board.
         runs: run folders, or folders of them.
         out: folder of the published page.
-        say: told which entries have no model at hand.
+        say: gets a line for each method without a model.
 
     Raises:
-        AwError: no run with a model below `runs`, or a scene that is not where its run says.
+        AwError: no run with a model below `runs`, or a scene is not where its run says.
     """
-    found, notes = find_models(runs)
+    trained, notes = find_models(runs)
     for note in notes:
         say(note)
-    by_hash = {sha256_file(f.run / RESULT): f for f in found}
+    by_hash = {sha256_file(t.run / RESULT): t for t in trained}
     scenes: dict[tuple[str, str], dict[str, list[Entry]]] = {}
     for entry in sorted(entries, key=lambda e: e.key):
         label = f"{entry.method} ({entry.setting})" + (f" {entry.options}" if entry.options else "")
@@ -453,14 +469,14 @@ def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path,
         for label, of_group in groups.items():
             at_hand = [e for e in of_group if e.result_hash in by_hash]
             if not at_hand:
-                say(f"no model of {label} on {scene}: its run is not below the folders given")
+                say(f"no model of {label} on {scene}: its run is not below the given folders")
                 continue
             chosen = at_hand[0]
             shown.append((label, by_hash[chosen.result_hash]))
         if not shown:
             continue
         if len({f.scene_hash for _, f in shown}) > 1:
-            raise AwError(f"runs on scene {scene!r} of {dataset!r} saw different photos: publish them apart")
+            raise AwError(f"runs on scene {scene!r} of {dataset!r} used different photos: publish them apart")
         name = _page_name(dataset, scene, names)
         models = [replace(f.model, label=label) for label, f in shown]
         text, _, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
@@ -473,7 +489,7 @@ def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path,
 
 
 def _page_name(dataset: str, scene: str, taken: set[str]) -> str:
-    """A file name nobody has yet; names of scenes can be anything."""
+    """Return a file name that is not taken; names of scenes may hold any characters."""
     stem = f"{slug(dataset)}-{slug(scene)}".strip("-") or "scene"
     name, number = f"{stem}.html", 1
     while name in taken:

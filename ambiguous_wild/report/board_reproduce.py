@@ -1,11 +1,11 @@
-"""The settings of a run in words, and the commands that make it and its scene again in an empty folder."""
+"""Describe the settings of a run, and the commands that make it and its scene again in an empty folder."""
 
 from __future__ import annotations
 
 import json
 import shlex
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -13,9 +13,9 @@ from typing import Any
 
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.core.config import config_hash, flatten, to_plain
+from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
 from ambiguous_wild.harness.cell import scene_identity
-from ambiguous_wild.harness.result_file import RunResult
+from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.report.board import HIDDEN, Entry
 from ambiguous_wild.simulate.presets import PRESETS, resized
@@ -25,11 +25,11 @@ from ambiguous_wild.simulate.spec_file import plain_spec
 FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing", "sfm")
 
 
-def setting(config: Mapping[str, Any]) -> str:
-    """Length, effects, protocol, limits: "2000 iterations, effects exposure".
+def setting(config: RunConfig) -> str:
+    """Return length, effects, protocol and limits as text: "2000 iterations, effects exposure".
 
-    Only what the run itself says, for it is part of a cell: a method's defaults, which later versions change,
-    have no say in it. Options have a hash of their own.
+    The text identifies a cell of the board. So it depends on the run alone, not on defaults of methods, which
+    later versions may change. The options have their own hash.
     """
     train = config["train"]
     words = [_length(train)]
@@ -46,33 +46,33 @@ def setting(config: Mapping[str, Any]) -> str:
     return ", ".join(words)
 
 
-def _length(train: Mapping[str, Any]) -> str:
+def _length(train: TrainRecord) -> str:
     seconds = train.get("budget_s")
     if seconds is None:
         return f"{train.get('iterations')} iterations"
     return f"{seconds / 60:g} min" if seconds >= 60 else f"{seconds:g} s"
 
 
-def options_hash(config: Mapping[str, Any]) -> str:
-    """First 8 hex digits over the method's options; empty where it has none."""
+def options_hash(config: RunConfig) -> str:
+    """Return the first 8 hex digits of the hash of the method's options; empty without options."""
     return config_hash(config["options"])[:8] if config["options"] else ""
 
 
-def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
-    """The command that makes the run again, the scene by its name.
+def command(config: RunConfig, before: Sequence[str] = ()) -> str:
+    """Return the command that makes the run again, with the scene by its name.
 
-    From the hashed configuration alone: what a result file calls a command is a stranger's text, and whoever
-    reads a board pastes this one into a shell.
+    It is made from the hashed configuration alone. The command in a result file may be a stranger's text, and
+    readers of a board paste this one into a shell.
 
     Args:
-        config: of the run.
+        config: configuration of the run.
         before: commands that make its scene, see `preparation`.
 
     Raises:
-        AwError: it would hold what is not seen: control characters, line breaks, text-direction marks.
+        AwError: it would hold invisible characters: control characters, line breaks, text-direction marks.
     """
     train, method = config["train"], config["method"]
-    words = [
+    words: list[object] = [
         "aw",
         "bench",
         "--method",
@@ -104,15 +104,15 @@ def command(config: Mapping[str, Any], before: Sequence[str] = ()) -> str:
     text = " && ".join([*before, shlex.join(str(w) for w in words)])
     hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
     if hidden is not None:
-        raise AwError(f"config.yaml holds {hidden!a}, which no command can show: run it again without")
+        raise AwError(f"config.yaml holds the invisible character {hidden!a}: run again without it")
     return text
 
 
-def _changed(config: Mapping[str, Any]) -> dict[str, str]:
-    """METHOD.KEY and value of options that are not the method's defaults on every machine.
+def _changed(config: RunConfig) -> dict[str, str]:
+    """Return METHOD.KEY and value of options that are not the method's defaults on every machine.
 
-    Of a method in a file, all of them. Of a variant only those that depend on the machine: its name says the
-    others.
+    For a method in a file these are all options, for a variant those that depend on the machine: the others
+    follow from its name.
     """
     options, name = flatten(config["options"]), config["method"]
     if "@" in name:
@@ -125,7 +125,7 @@ def _changed(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _chosen(method: str) -> list[tuple[str, str, str]]:
-    """Of a graft: place, member and name of each option whose default depends on the machine."""
+    """Return place, member and name of each option of a graft whose default depends on the machine."""
     from ambiguous_wild.methods.registry import get_method
 
     try:
@@ -136,8 +136,8 @@ def _chosen(method: str) -> list[tuple[str, str, str]]:
 
 
 @cache
-def _defaults(method: str) -> dict[str, Any] | None:
-    """Defaults that are the same on every machine; None of an unknown method."""
+def _defaults(method: str) -> Options | None:
+    """Return the defaults that are the same on every machine; None for an unknown method."""
     from ambiguous_wild.methods.registry import get_method
 
     try:
@@ -149,14 +149,14 @@ def _defaults(method: str) -> dict[str, Any] | None:
 
 
 def _word(value: Any) -> str:
-    """As `--set` reads it."""
+    """Return the value as `--set` reads it."""
     if isinstance(value, (list, tuple)):
         return ",".join(map(_word, value))
     return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def hardware(path: Path, result: RunResult) -> str:
-    """What the times depend on: "Intel Xeon, 2 threads", or the GPU.
+    """Return the processor with its threads, "Intel Xeon, 2 threads", or the GPU.
 
     Raises:
         AwError: env.json is damaged.
@@ -176,10 +176,10 @@ def hardware(path: Path, result: RunResult) -> str:
 
 
 def preparation(scene: Scene | None) -> list[str]:
-    """`aw simulate` and `aw build-scene` for a simulated scene; empty where photos cannot be made again.
+    """Return the commands that make a simulated scene; empty for other scenes.
 
     Args:
-        scene: of a run; None: not at hand.
+        scene: scene of a run; None: it is not on this machine.
     """
     truth = _read(scene.root / "truth" / "capture.json") if scene is not None else {}
     settings = scene.info.get("settings") if scene is not None else None
@@ -190,7 +190,7 @@ def preparation(scene: Scene | None) -> list[str]:
     return [*simulate, shlex.join(_build(raw, scene.name, settings))] if simulate else []
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> Facts:
     try:
         facts = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -198,23 +198,23 @@ def _read(path: Path) -> dict[str, Any]:
     return facts if isinstance(facts, dict) else {}
 
 
-def _simulate(truth: Mapping[str, Any], name: str) -> list[str]:
-    """By its preset where that gives the same spec; else the spec itself, as a file."""
+def _simulate(truth: Facts, name: str) -> list[str]:
+    """Return the command that simulates: by preset if that gives the same spec, else from a file."""
     spec, seed = truth.get("spec"), truth.get("seed")
     if not isinstance(spec, dict) or not isinstance(seed, int):
         return []
     end = [*(["--seed", str(seed)] if seed else []), "-o", f"raw/{name}"]
-    known = PRESETS.get(str(truth.get("preset")))
-    if known is not None:
-        views = spec.get("train_views") if spec.get("train_views") != known.train_views else None
-        width = spec.get("width") if spec.get("width") != known.width else None
+    preset = PRESETS.get(str(truth.get("preset")))
+    if preset is not None:
+        views = spec.get("train_views") if spec.get("train_views") != preset.train_views else None
+        width = spec.get("width") if spec.get("width") != preset.width else None
         try:
-            same = json.loads(json.dumps(plain_spec(resized(known, views, width)))) == spec
+            same = json.loads(json.dumps(plain_spec(resized(preset, views, width)))) == spec
         except (AwError, TypeError):
             same = False
         if same:
             size = [*(["--views", str(views)] if views else []), *(["--width", str(width)] if width else [])]
-            return [shlex.join(["aw", "simulate", known.name, *size, *end])]
+            return [shlex.join(["aw", "simulate", preset.name, *size, *end])]
     file = f"{name}.yaml"
     text = json.dumps(spec, ensure_ascii=True)  # JSON is YAML
     return [
@@ -223,9 +223,9 @@ def _simulate(truth: Mapping[str, Any], name: str) -> list[str]:
     ]
 
 
-def _build(raw: str, name: str, settings: Mapping[str, Any]) -> list[str]:
+def _build(raw: str, name: str, settings: Facts) -> list[str]:
     usual = {f.name: f.default for f in fields(BuildSettings)}
-    settings = {"sfm": "thorough", **settings}  # the only way there was before scenes recorded it
+    settings = {"sfm": "thorough", **settings}  # scenes of early versions do not say it
     words = ["aw", "build-scene", raw, "-o", name]
     if settings.get("factor") is not None:
         words += ["--factor", str(settings["factor"])]
@@ -239,25 +239,26 @@ SIMULATED = "simulated"
 
 
 class Scenes:
-    """Finds scenes, each opened once."""
+    """Find the scenes of runs; each is opened once."""
 
     def __init__(
         self, folder: Path | None = None, dataset: str | None = None, board: Iterable[Entry] = ()
     ) -> None:
-        """Args:
-        folder: of scenes, or one scene; instead of where the runs say they lie.
-        dataset: of every scene, whatever it says itself.
-        board: what is known of scenes that are not at hand.
+        """
+        Args:
+            folder: folder of scenes, or one scene; None = where the runs say.
+            dataset: dataset of all scenes; None = what each scene says.
+            board: runs of the board, which give the dataset of scenes that are not on this machine.
         """
         self._folder, self._dataset = folder, dataset
-        self._known = {e.scene_hash: e.dataset for e in board}
+        self._datasets = {e.scene_hash: e.dataset for e in board}
         self._opened: dict[tuple[Path, int | None], tuple[Scene, str]] = {}
 
-    def find(self, run: Path, config: Mapping[str, Any]) -> Scene | None:
-        """The scene of a run; None where it is not on this machine.
+    def find(self, run: Path, config: RunConfig) -> Scene | None:
+        """Return the scene of a run; None if it is not on this machine.
 
         Raises:
-            AwError: what lies there is another scene, or damaged.
+            AwError: the folder holds another scene, or a damaged one.
         """
         asked = config["scene"]
         path = self._path(asked)
@@ -276,41 +277,32 @@ class Scenes:
             )
         return scene
 
-    def _path(self, asked: Mapping[str, Any]) -> Path | None:
+    def _path(self, asked: SceneConfig) -> Path | None:
         name = str(asked.get("name"))
         if self._folder is not None:
             if (self._folder / "sparse").is_dir():
                 return self._folder
-            # The name is a stranger's: it must not lead elsewhere.
+            # the name may be a stranger's, and must not lead out of the folder
             inside = Path(name).name == name and (self._folder / name).is_dir()
             return self._folder / name if inside else None
         path = asked.get("path")
         return Path(path) if isinstance(path, str) and path and Path(path).is_dir() else None
 
     def dataset(self, run: Path, scene: Scene | None, scene_hash: str) -> str:
-        """The dataset: as asked for, as scene.json says, "simulated", or as the board knows it.
+        """Return the dataset: the given one, that in scene.json, "simulated", or that on the board.
 
         Raises:
-            AwError: nothing says it.
+            AwError: none of these is available.
         """
         if self._dataset is not None:
             return self._dataset
         if scene is not None:
-            said = scene.info.get("dataset")
-            if isinstance(said, str) and said.strip():
-                return said
-            if _simulated(scene.root):
+            name = scene.info.get("dataset")
+            if isinstance(name, str) and name.strip():
+                return name
+            if isinstance(_read(scene.root / "truth" / "capture.json").get("preset"), str):
                 return SIMULATED
-        if scene_hash in self._known:
-            return self._known[scene_hash]
+        if scene_hash in self._datasets:
+            return self._datasets[scene_hash]
         why = "its scene is not on this machine" if scene is None else f"{scene.root} names none"
-        raise AwError(f"{run}: no dataset known, {why}; say it with --dataset NAME")
-
-
-def _simulated(root: Path) -> bool:
-    """Whether `aw simulate` made the photos."""
-    try:
-        facts = json.loads((root / "truth" / "capture.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(facts, dict) and isinstance(facts.get("preset"), str)
+        raise AwError(f"{run}: the dataset is unknown, {why}; give it with --dataset NAME")

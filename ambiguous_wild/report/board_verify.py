@@ -1,4 +1,4 @@
-"""Verify a run folder before it is added to a board; each failed check is one line."""
+"""Verify a run folder before it is added to a board; each failed check gives a one-line error."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn, cast
+from typing import NoReturn, cast
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.cell import config_identity
-from ambiguous_wild.harness.choosing import mixed_tests
-from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, Metric, measure, measure_images, metrics
+from ambiguous_wild.harness.chosen_effects import mixed_tests
+from ambiguous_wild.harness.measures import ImageRow, Metric, measure, measure_images, metrics
 from ambiguous_wild.harness.result_file import (
     FAILED,
     MODEL,
@@ -23,6 +23,7 @@ from ambiguous_wild.harness.result_file import (
     RunConfig,
     RunResult,
     check_model,
+    mask_scores,
     mean_of,
     metrics_of,
     read_result,
@@ -43,22 +44,22 @@ from ambiguous_wild.report.board_reproduce import (
 
 ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
-REQUIRED = ("psnr", "ssim", "ssim_inria")  # no reason excuses it: they need nothing but the two pictures
+REQUIRED = ("psnr", "ssim", "ssim_inria")  # always measurable: they need only the two pictures
 
 
 class Unfinished(AwError):
-    """The run has no result yet: nothing is wrong with it."""
+    """The run has no result yet, which is no fault."""
 
 
 @dataclass(frozen=True)
 class Verified:
-    """A run that may stand on the board."""
+    """A run that passed all checks."""
 
     entry: Entry
     run: Path
     names: tuple[str, ...]  # of the test images
     psnr: Mapping[str, float]  # by image
-    scene: Scene | None  # None: not at hand
+    scene: Scene | None  # None: it is not on this machine
 
 
 def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
@@ -67,11 +68,11 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     Args:
         run: the run folder.
         scenes: finds the run's scene and its dataset.
-        quick: of the metrics recompute PSNR alone.
+        quick: recompute only PSNR.
 
     Raises:
-        Unfinished: it has no result yet.
-        AwError: it failed, was changed, is partial, or not one of ours; says what to do.
+        Unfinished: the run has no result yet.
+        AwError: the run failed, was changed, is partial, or not of this program; the error says what to do.
     """
     result, config = _result(run), _config(run)
     _check_identity(run, result, config)
@@ -80,7 +81,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     mixed = str(result["facts"].get("test_photos") or ("" if scene is None else mixed_tests(scene)))
     if mixed:
         raise AwError(
-            f"{run}: {mixed}; build the scene with clean photos in test/ or --test-list FILE, and bench that"
+            f"{run}: {mixed}; build the scene with clean photos in test/ or --test-list FILE, and bench again"
         )
     _check_values(run, result, photos=scene is not None)
     if scene is not None:
@@ -92,12 +93,12 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     verdict = timing_of(result["cost"]).verdict
     if verdict != "unknown":
         cost[ALONE] = float(verdict == "alone")
-    words, again = _words(run, config, preparation(scene))
+    setting_text, reproduce = _words(run, config, preparation(scene))
     entry = Entry(
         dataset=check_text("dataset", dataset),
         scene=check_text(f"scene name of {run}", result["scene"]),
         method=check_text(f"method name of {run}", result["method"]),
-        setting=words,
+        setting=setting_text,
         options=options_hash(config),
         seed=result["seed"],
         images=len(renders),
@@ -113,9 +114,9 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
         scene_hash=result["scene_hash"],
         result_hash=sha256_file(run / RESULT),
         checked="files" if scene is None else "psnr" if quick else "photos",
-        reproduce=again,
+        reproduce=reproduce,
     )
-    psnr = {row["name"]: _known(row.get("psnr")) for row in result["per_image"]}
+    psnr = {row["name"]: _or_nan(row.get("psnr")) for row in result["per_image"]}
     return Verified(entry, run, tuple(sorted(renders)), psnr, scene)
 
 
@@ -129,7 +130,9 @@ def _partial(run: Path, what: str) -> NoReturn:
 
 def _result(run: Path) -> RunResult:
     if not (run / RESULT).is_file() and not (run / FAILED).is_file():
-        raise Unfinished(f"{run} has no {RESULT}: still running, or stopped; the same 'aw bench' finishes it")
+        raise Unfinished(
+            f"{run} has no {RESULT}: still running, or stopped; run the same 'aw bench' again to finish it"
+        )
     result = read_result(run / (RESULT if (run / RESULT).is_file() else FAILED))
     if result["status"] != "ok":
         error = " ".join(str(result["error"]).split())[:120]
@@ -151,26 +154,26 @@ def _config(run: Path) -> RunConfig:
 
 
 def _words(run: Path, config: RunConfig, before: list[str]) -> tuple[str, str]:
-    """(setting, commands) of a configuration that a stranger wrote."""
+    """Return (setting, commands) of a configuration, which a stranger may have written."""
     try:
         return check_text(f"setting of {run}", setting(config)), command(config, before)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:
-        raise AwError(f"{run / 'config.yaml'} is none that 'aw bench' writes ({error}): {RESTORE}") from None
+        raise AwError(f"{run / 'config.yaml'} was not written by 'aw bench' ({error}): {RESTORE}") from None
 
 
 def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
-    """Configuration and result are of each other, and of code that can be named."""
+    """Check that configuration and result belong together, and that their code is known."""
     from ambiguous_wild.methods.registry import BUILTIN
 
     try:
         computed = config_identity(config)
     except (TypeError, ValueError) as error:
         raise AwError(f"{run / 'config.yaml'} has no hash ({error}): {RESTORE}") from None
-    for where, known in (("config.yaml", config["config_hash"]), (RESULT, result["config_hash"])):
-        if known != computed:
-            _changed(run, f"config.yaml hashes to {computed[:12]}, {where} says {str(known)[:12]}")
+    for where, written in (("config.yaml", config["config_hash"]), (RESULT, result["config_hash"])):
+        if written != computed:
+            _changed(run, f"config.yaml hashes to {computed[:12]}, {where} says {str(written)[:12]}")
     pairs = {
         "method": (config["method"], result["method"]),
         "scene": (config["scene"].get("name"), result["scene"]),
@@ -184,18 +187,18 @@ def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
         if asked != got:
             _changed(run, f"{what} is {str(asked)[:40]!a} in config.yaml and {str(got)[:40]!a} in {RESULT}")
     source, method = config["source"], config["method"]
-    # A variant "method@..." is the method's code under another setting.
+    # a variant "method@..." has the method's code and another setting
     named = method.split("@")[0] in {entry.name for entry in BUILTIN}
     if not (re.fullmatch(r"[0-9a-f]{64}", source) or (named and not source)):
         raise AwError(
-            f"{run}: method {method[:60]!a} is none of this package and config.yaml has no hash of its code, "
-            "so its code is unknown; run it as a file, see docs/extend.md"
+            f"{run}: the code of method {method[:60]!a} is unknown: it is not in this package, and "
+            "config.yaml has no hash of it; run it as a file, see docs/extend.md"
         )
 
 
 def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]:
-    """Image name -> render; everything a result rests on is there."""
-    # A program of others may have no splats; then its result says no size either.
+    """Check that all files of a run are present; return the path of the render by image name."""
+    # an external program may write no splats; then its result has no size either
     size = result["cost"].get("model_mb")
     needed = (ENVIRONMENT,) if size is None and not ours else (MODEL, ENVIRONMENT)
     lacking = [name for name in needed if not (run / name).is_file()]
@@ -204,41 +207,41 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     if lacking:
         raise AwError(f"{run} is partial, it lacks {shortlist(lacking)}; {RESTORE}")
     if not renders:
-        raise AwError(f"{run} measured no test image: a scene without test views has no place on a board")
+        raise AwError(f"{run} measured no test image: a board takes only scenes with test views")
     unlisted = sorted({p.name for p in set((run / RENDERS).rglob("*.png")) - set(renders.values())})
     if unlisted:
-        _partial(run, f"{shortlist(unlisted)} was rendered and {RESULT} does not list it")
+        _partial(run, f"{shortlist(unlisted)} was rendered, but {RESULT} does not list it")
     check_model(run, result)
     model_mb = (run / MODEL).stat().st_size / 1e6 if MODEL in needed else None
     if model_mb is not None and (size is None or not math.isclose(size, model_mb, abs_tol=1e-6)):
-        _changed(run, f"{MODEL} is not of the size that {RESULT} says")
+        _changed(run, f"the size of {MODEL} differs from that in {RESULT}")
     for path in renders.values():
         read_png_rgb(path)
     return renders
 
 
 def renders_of(run: Path, result: RunResult) -> dict[str, Path]:
-    """Where the render of each image lies, by its name."""
+    """Return the path of each image's render, by the image's name."""
     return {row["name"]: run / RENDERS / _inside(run, row["name"]) for row in result["per_image"]}
 
 
 def _inside(run: Path, name: str) -> str:
     pure = PurePosixPath(name)
     if pure.is_absolute() or ".." in pure.parts or not pure.name or "\\" in name:
-        raise AwError(f"{run} names a test image outside itself: {name[:60]!a}; it is no run of ours")
+        raise AwError(f"{run} names a test image outside of its folder: {name[:60]!a}; {RESTORE}")
     return str(pure.with_suffix(".png"))
 
 
 def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
     """Refuse numbers that no measurement can give, and results that lack a required number.
 
-    `photos`: the test photos are at hand, and tell whether an infinite PSNR is right.
+    `photos`: the test photos are on this machine, so that an infinite PSNR can be verified.
     """
     rows = result["per_image"]
     for metric in REQUIRED:
         lacking = [row["name"] for row in rows if metrics_of(row).get(metric) is None]
         if lacking:
-            _partial(run, f"no {metric} of {shortlist(lacking)}, which every run measures")
+            _partial(run, f"it has no {metric} of {shortlist(lacking)}, which every run measures")
     for impossible in impossible_values(result):
         _impossible(run, *impossible)
     for row in rows:
@@ -247,17 +250,17 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
             if value is None or not isinstance(about, Metric):
                 continue
             if math.isinf(value) and not (about.infinite and photos):
-                why = "is infinite only where picture and photo are equal, and the photos are not at hand: "
-                why = f"{why}name them with --scene" if about.infinite else "is finite"
+                why = "is infinite only if picture and photo are equal, and the photos are not at hand: "
+                why = f"{why}name their scene with --scene" if about.infinite else "is finite"
                 _impossible(run, f"{metric} of {row['name']}", value, why)
 
 
 def _impossible(run: Path, what: str, value: float, why: str) -> NoReturn:
-    _changed(run, f"{what} is {value:g} in {RESULT}, such a number {why}")
+    _changed(run, f"{what} is {value:g} in {RESULT}, but such a number {why}")
 
 
 def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[str, ...]]:
-    """(mean over the images by metric, metrics that lack a value somewhere)."""
+    """Return (mean over the images by metric, metrics that some image lacks)."""
     rows = [metrics_of(row) for row in result["per_image"]]
     names = {metric for row in rows for metric in row} | set(result["missing"])
     for name in sorted(names):
@@ -268,13 +271,12 @@ def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[st
         ):
             raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
     means = {name: mean_of(result, name) for name in names}
-    masks: Mapping[str, Any] = result["masks"] or {}
-    means |= {f"mask_{k}": float(masks[k]) for k in MASK_LABELS if masks.get(k) is not None}
+    means |= {f"mask_{name}": float(score) for name, score in mask_scores(result).items()}
     missing = tuple(sorted(k for k, v in means.items() if math.isnan(v)))
     return {k: v for k, v in means.items() if not math.isnan(v)}, missing
 
 
-def _known(value: float | None) -> float:
+def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
@@ -294,61 +296,60 @@ def check_photos(
 
     Args:
         run: the run folder, for messages.
-        scene: with the test photos, opened with `verify`: its files are those that its hash was made of.
+        scene: the scene with the test photos, opened with `verify`, so that its files match its hash.
         rows: metrics of each image.
-        renders: PNG by image name.
+        renders: path of the PNG by image name.
         half: the right half was measured.
-        quick: PSNR of the whole picture alone.
+        quick: recompute only PSNR.
 
     Raises:
-        AwError: an image left out or added, a number that does not follow, or a render that is the photo
-            itself.
+        AwError: an image was left out or added, a number differs, or a render is the photo itself.
     """
     views = {view.name: view for view in scene.test}
     if set(views) != set(renders):
         odd = sorted(set(views) ^ set(renders))
         raise AwError(
-            f"{run} is partial: measured are {len(renders)} images, scene {scene.root} has {len(views)} test "
-            f"photos ({shortlist(odd)} in one of them only); a mean over a part is no result"
+            f"{run} is partial: {len(renders)} images were measured, scene {scene.root} has {len(views)} "
+            f"test photos (only one of them has {shortlist(odd)}); a mean over a part of them is no result"
         )
-    asked = [m for m in metrics().values() if m.key == "psnr" or not (quick or m.tolerance is None)]
-    known = [m for m in asked if any(m.key in row for row in rows)]
+    verifiable = [m for m in metrics().values() if m.key == "psnr" or not (quick or m.tolerance is None)]
+    compared = [m for m in verifiable if any(m.key in row for row in rows)]
     copies = []
     for row in rows:
         name = row["name"]
         render, photo = read_png_rgb(renders[name]), read_png_rgb(views[name].image_path)
         if render.shape != photo.shape:
-            raise AwError(f"{renders[name]} is not of the size of {views[name].image_path}: it was changed")
-        (computed,), _ = measure_images([(name, render, photo)], known, scene, half=half)
-        for metric in known:
+            raise AwError(f"{renders[name]} differs from {views[name].image_path} in size: it was changed")
+        (computed,), _ = measure_images([(name, render, photo)], compared, scene, half=half)
+        for metric in compared:
             _compare(run, row, metric, metrics_of(computed))
         right = slice(photo.shape[1] // 2 if half else 0, None)
         if np.array_equal(render[:, right], photo[:, right]):
             copies.append(name)
     if copies:
         raise AwError(
-            f"{run} shows the test photos themselves: every pixel of {shortlist(copies)} is its photo's, "
-            "which no model renders; render from the model: 'aw bench --overwrite always'"
+            f"{run} shows the test photos themselves: every pixel of {shortlist(copies)} equals the photo's, "
+            "which no model achieves; render from the model: 'aw bench --overwrite always'"
         )
 
 
 def _compare(run: Path, row: ImageRow, metric: Metric, computed: Mapping[str, float | None]) -> None:
-    """A value is there where the picture has one, and nowhere else; a run may lack a metric as a whole."""
+    """Check one metric of one image against the computed value; a run may lack a metric as a whole."""
     key, name, values = metric.key, row["name"], metrics_of(row)
     if key in values and key not in computed:
         raise AwError(
-            f"{run} was changed: {key} of {name} is in metrics.json, and its scene has no such pixel in that "
-            f"picture; {RESTORE}"
+            f"{run} was changed: metrics.json has {key} of {name}, but that picture has no such pixel; "
+            f"{RESTORE}"
         )
     if key in computed and key not in values:
-        there = "though its scene has such pixels there" if metric.partial else "but of the other images"
-        raise AwError(f"{run} is partial: no {key} of {name}, {there}; {RESTORE}")
+        why = "although the picture has such pixels" if metric.partial else "but of the other images"
+        raise AwError(f"{run} is partial: it has no {key} of {name}, {why}; {RESTORE}")
     if key not in values:
         return
-    value, again = _known(values[key]), _known(computed[key])
-    both_missing = math.isnan(value) and math.isnan(again)
-    if not (value == again or abs(value - again) <= (metric.tolerance or 0.0) or both_missing):
+    value, correct = _or_nan(values[key]), _or_nan(computed[key])
+    both_missing = math.isnan(value) and math.isnan(correct)
+    if not (value == correct or abs(value - correct) <= (metric.tolerance or 0.0) or both_missing):
         raise AwError(
             f"{run} was changed: {key} of {name} is {value:.6f} in metrics.json, render and photo give "
-            f"{again:.6f}; {RESTORE}"
+            f"{correct:.6f}; {RESTORE}"
         )

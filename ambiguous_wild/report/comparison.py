@@ -1,9 +1,9 @@
-"""From runs to a comparison: rows are methods, columns are measures, one table a scene.
+"""Compare runs in tables: rows are methods, columns are measures, one table for each scene.
 
-The mean is taken over images, then over seeds, then over scenes, in that order. No mean is shown where a
-value is missing. A scene that cannot have a value, such as a mask score without distractors, is left out of
-the mean, for every method. A failed run makes its cell "failed", so that no method gains by failing where
-it is hard, and a method with an unfinished run shows what it has but is not ranked.
+The mean is taken over images, then over seeds, then over scenes, in that order. No mean is shown if a value
+is missing. A scene on which a measure is undefined, such as a mask score without distractors, is left out of
+the mean for every method. A failed run makes its cell "failed", so that no method gains by failing on hard
+scenes. A method with an unfinished run is shown, but not ranked.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import pandas as pd
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
-from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, read_runs
+from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, read_runs
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.notes import incomparable, notes, untimed
@@ -33,30 +33,28 @@ MASK_COLUMNS = ("mask_iou", "mask_precision")
 def comparison(
     runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = (), drop_empty: bool | None = None
 ) -> list[Table]:
-    """The comparison of every method: a table a scene, before them the mean where there are several.
+    """Compare all methods: one table for each scene, preceded by the mean if there are several scenes.
 
-    Notes on what is missing, failed or not comparable stand below the last table.
+    The last table has notes on runs that are missing, failed or not comparable.
 
     Args:
         runs: from `store.read_runs`.
-        metrics: columns by key, in this order; empty: PSNR, SSIM, LPIPS, whatever else was measured, mask
-            IoU and cost.
-        scenes: only these, in this order; empty: all, by name.
-        drop_empty: leave out columns without any value; a note says why they are empty. None: unless
-            `metrics` names them.
+        metrics: keys of the columns, in this order; empty: PSNR, SSIM, LPIPS, every other measured metric,
+            mask IoU and cost.
+        scenes: names of scenes, in this order; empty: all, by name.
+        drop_empty: leave out columns without any value; a note says why they are empty. None: leave them
+            out unless `metrics` names them.
 
     Raises:
-        AwError: a metric or scene that no run has, or no finished run.
+        AwError: no run has such a metric or scene, or there is no finished run.
     """
     frame = runs.runs
     if not len(frame):
         names = shortlist(f"{i.folder} ({i.reason})" for i in runs.incomplete)
         raise AwError(f"no finished run: {names}")
-    known = sorted(frame["scene"].unique())
-    for name in scenes:
-        if name not in known:
-            raise unknown("scene", name, known)
-    chosen = tuple(dict.fromkeys(scenes)) or tuple(known)
+    present = sorted(frame["scene"].unique())
+    check_names("scene", scenes, present)
+    chosen = tuple(dict.fromkeys(scenes)) or tuple(present)
     runs = replace(
         runs,
         runs=frame[frame["scene"].isin(chosen)],
@@ -90,7 +88,7 @@ def comparison(
 
 
 class Tables(tuple[Table, ...]):
-    """Tables that `print` and a notebook show as they are read."""
+    """Tables that `print` shows as text and a notebook as HTML."""
 
     def __repr__(self) -> str:
         return f"Tables({', '.join(table.title for table in self)})"
@@ -105,31 +103,31 @@ class Tables(tuple[Table, ...]):
 def table(
     runs: Runs | Path | str, *, metrics: str | Sequence[str] = (), scenes: str | Sequence[str] = ()
 ) -> Tables:
-    """The `comparison` of runs, or of every run below a folder; one name needs no list."""
-    found = runs if isinstance(runs, Runs) else read_runs(runs)
+    """Return the `comparison` of runs, or of every run below a folder; a single name needs no list."""
+    runs = runs if isinstance(runs, Runs) else read_runs(runs)
     columns, only = ([names] if isinstance(names, str) else names for names in (metrics, scenes))
-    return Tables(comparison(found, metrics=columns, scenes=only))
+    return Tables(comparison(runs, metrics=columns, scenes=only))
 
 
 EFFECTS = Measure("effects", "effects", None, 0, per_image=False)
 
 
 def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
-    """The table with a column of what each row was trained with, where the rows of a scene differ in that."""
+    """Add a column with the effects of each row, if the rows of a scene differ in their effects."""
     done = frame[frame["status"] == "ok"]
     if not any(of["effects"].nunique() > 1 for _, of in done.groupby("scene")):
         return table
-    here = done[done["scene"] == table.columns[0].scene] if table.columns[0].scene else done
+    shown = done[done["scene"] == table.columns[0].scene] if table.columns[0].scene else done
     rows = []
     for row in table.rows:
-        names = " or ".join(dict.fromkeys(here[here["method"] == row.name]["effects"]))
+        names = " or ".join(dict.fromkeys(shown[shown["method"] == row.name]["effects"]))
         rows.append(replace(row, cells=(*row.cells, Cell(printed=names) if names else Cell(state="missing"))))
     column = Column("", EFFECTS, table.columns[0].scene, words=True)
     return replace(table, columns=(*table.columns, column), rows=tuple(rows))
 
 
 def _without_empty(tables: list[Table]) -> list[Table]:
-    """Without the columns that have no value anywhere; where none has any, everything stays."""
+    """Leave out columns without any value, unless all columns are such."""
     kept = [
         i
         for i in range(len(tables[0].columns))
@@ -141,7 +139,7 @@ def _without_empty(tables: list[Table]) -> list[Table]:
 def _undefined(
     columns: tuple[Measure, ...], scenes: tuple[str, ...], defined: Mapping[str, Sequence[str]]
 ) -> list[str]:
-    """A line for the columns whose mean leaves the same scenes out."""
+    """Return lines that name the columns whose mean leaves out scenes."""
     lines: dict[str, list[str]] = {}
     for column in columns:
         out = [s for s in scenes if s not in defined[column.key]]
@@ -151,7 +149,7 @@ def _undefined(
 
 
 class _Index:
-    """Values by (method, scene): finding them in the frames for every cell would be quadratic."""
+    """Values by (method, scene); a search in the frames for every cell would take quadratic time."""
 
     def __init__(self, runs: Runs) -> None:
         self.runs = dict(iter(runs.runs.groupby(["method", "scene"])))
@@ -160,22 +158,24 @@ class _Index:
         self.untimed = set(untimed(runs.runs))
 
     def seeds(self, method: str, scene: str, column: Measure) -> pd.Series:
-        """The run's value by seed, NaN where missing."""
+        """Return the value of each seed's run; NaN if it is missing."""
         rows = self.runs[method, scene].set_index("seed")
         if not column.per_image:
             values = rows[column.key] if column.key in rows else pd.Series(math.nan, index=rows.index)
             values = values.astype(float)
             if column.key in MASK_COLUMNS and "mask_recall" in rows:
-                # Without a distractor recall is undefined, and an IoU of 0 says nothing.
+                # without a distractor recall is undefined, and an IoU of 0 has no meaning
                 values = values.where(rows["mask_recall"].notna())
             return values.sort_index()
         images = self.images.get((method, scene, column.key))
-        found = {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
-        means = {seed: stats.mean(found.get(seed, np.empty(0))) for seed in sorted(rows.index)}
+        by_seed = (
+            {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
+        )
+        means = {seed: stats.mean(by_seed.get(seed, np.empty(0))) for seed in sorted(rows.index)}
         return pd.Series(means, dtype=float)
 
     def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:
-        """Whether the measure is defined on the scene: some method has a value, or it always is."""
+        """Return whether the measure is defined on the scene: always, or because a method has a value."""
         if not column.partial and column.key not in (*MASK_COLUMNS, "mask_recall"):
             return True
         return any(
@@ -260,7 +260,7 @@ def _mean_row(
             low, high = (float(np.mean(ends)) for ends in zip(*own))
             cells.append(Cell(value, math.nan, low, high, ranged=True))
         else:
-            # Seed by seed, so that the spread is that of the number shown; needs the same seeds everywhere.
+            # means over scenes for each seed, whose spread is shown; they need the same seeds on all scenes
             by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
             cells.append(Cell(value, stats.spread(by_seed.mean(axis=1))))
     return Row(
@@ -269,10 +269,7 @@ def _mean_row(
 
 
 def _ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozenset[str]) -> list[Row]:
-    """The rows with the first, second and third of every column marked.
-
-    `unranked`: columns of times that were measured on machines that differ.
-    """
+    """Mark the first, second and third of every column, except in the `unranked` columns."""
     marked = [list(row.cells) for row in rows]
     for i, column in enumerate(columns):
         if column.key in unranked:
@@ -302,35 +299,32 @@ _TEXT = ("scene", "method", "image", "metric", "better", "reason", *_OF_RUN)
 
 
 def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> pd.DataFrame:
-    """All runs as one table.
+    """Return all runs as one table with a row for each number.
 
     Args:
         runs: from `store.read_runs`.
-        metrics: only these; empty: all.
-        scenes: only these; empty: all.
+        metrics: keys to keep; empty: all.
+        scenes: names to keep; empty: all.
 
     Returns:
-        Columns `COLUMNS`. A number of a whole run (cost, masks) has an empty image. A missing value is NaN
-        and `reason` says why, where a run says it; a run that failed has one row, metric "failed". `better`
-        is "higher", "lower" or empty.
+        Columns `COLUMNS`. A number of a whole run (cost, masks) has an empty image. A missing value is NaN,
+        with the `reason` if the run has one. A failed run has one row, with metric "failed". `better` is
+        "higher", "lower" or empty.
 
     Raises:
-        AwError: a metric or scene that no run has.
+        AwError: no run has such a metric or scene.
     """
     frame = pd.concat([_images(runs), _missing(runs), _whole(runs), _failed(runs)], ignore_index=True)
     frame = _only(_only(frame, "metric", metrics), "scene", scenes)
     frame["better"] = frame["metric"].map(lambda key: measure(str(key)).better or "")
-    if len(runs.runs):  # no finished run: there are neither rows nor hashes
+    if len(runs.runs):  # without a finished run there are neither rows nor hashes
         frame = frame.merge(runs.runs[[*_KEYS, *_OF_RUN]], on=_KEYS, how="left")
     frame = frame.reindex(columns=list(COLUMNS)).fillna(dict.fromkeys(_TEXT, ""))
     return frame.sort_values([*_KEYS, "image"], kind="stable", ignore_index=True)
 
 
 def _only(frame: pd.DataFrame, column: str, names: Sequence[str]) -> pd.DataFrame:
-    known = sorted(frame[column].unique())
-    for name in names:
-        if name not in known:
-            raise unknown(column, name, known)
+    check_names(column, names, sorted(frame[column].unique()))
     return frame[frame[column].isin(list(names))].copy() if names else frame
 
 
@@ -340,11 +334,11 @@ def _images(runs: Runs) -> pd.DataFrame:
 
 
 def _missing(runs: Runs) -> pd.DataFrame:
-    """Metrics that a run lacks as a whole and that have no row of any image."""
+    """Return metrics that a run lacks as a whole, and that have no row for any image."""
     key = [*_KEYS, "metric"]
-    shown = set(runs.images[key].itertuples(index=False, name=None))
-    gone = [row not in shown for row in runs.missing[key].itertuples(index=False, name=None)]
-    return runs.missing[gone].assign(image="", value=math.nan)
+    with_images = set(runs.images[key].itertuples(index=False, name=None))
+    lacking = [row not in with_images for row in runs.missing[key].itertuples(index=False, name=None)]
+    return runs.missing[lacking].assign(image="", value=math.nan)
 
 
 def _whole(runs: Runs) -> pd.DataFrame:
@@ -353,7 +347,7 @@ def _whole(runs: Runs) -> pd.DataFrame:
     done = runs.runs[runs.runs["status"] == "ok"]
     numbers = [name for name in done.columns if name not in _NO_NUMBER]
     frame = done.melt(_KEYS, numbers, "metric", "value")
-    # A cost that does not apply (memory of a GPU) and mask scores without a truth are no gaps.
+    # costs that do not apply (memory of a GPU) and mask scores without a truth are left out
     frame["value"] = pd.to_numeric(frame["value"], errors="coerce")
     return frame[frame["value"].notna()].assign(image="", reason="")
 

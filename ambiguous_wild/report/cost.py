@@ -1,4 +1,4 @@
-"""The cost report as plain data, JSON, CSV, and text for a terminal."""
+"""Make the cost report and write it as JSON, CSV, and text for a terminal."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.timing import seconds_range
 from ambiguous_wild.io.files import is_record, refuse_files_there, write_json, write_text
 from ambiguous_wild.report import plain_formats
 from ambiguous_wild.report.cost_curves import Change, Curve, Point, Summary, changes, curves_of, points
-from ambiguous_wild.report.cost_reach import Answer, Reach, answers, times_to_reach
-from ambiguous_wild.report.cost_read import CostRun, CostRuns, why_unranked
+from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
+from ambiguous_wild.report.cost_targets import Answer, Reach, answers, times_to_reach
 from ambiguous_wild.report.plain_formats import plain, to_csv
 from ambiguous_wild.report.table import Table, text_table
 
@@ -33,40 +34,40 @@ class CostReport:
     reach: tuple[Reach, ...]
     changes: tuple[Change, ...]
     notes: tuple[str, ...]
-    answers: tuple[Answer, ...]  # one a scene
+    answers: tuple[Answer, ...]  # one for each scene
     reference: bool  # times are seconds of the reference machine; else wall seconds
-    setup: bool  # whether times count what comes before the first step
-    made_by: str
+    setup: bool  # times include the set-up before the first step
+    made_by: str  # the command
 
 
 def cost_report(
-    found: CostRuns, *, targets: Sequence[float] = (), setup: bool = False, made_by: str = ""
+    cost_runs: CostRuns, *, targets: Sequence[float] = (), setup: bool = False, made_by: str = ""
 ) -> CostReport:
-    """The cost report of the runs.
+    """Make the cost report of the runs.
 
     Args:
-        found: from `read_cost_runs`.
+        cost_runs: from `read_cost_runs`.
         targets: PSNR in dB to reach; empty = some below the best of each scene.
-        setup: count what comes before the first step as time too.
+        setup: add the set-up before the first step to the time.
         made_by: the command that makes it again.
     """
-    curves, scenes = curves_of(found.runs), tuple(sorted({run.scene for run in found.runs}))
+    curves, scenes = curves_of(cost_runs.runs), tuple(sorted({run.scene for run in cost_runs.runs}))
     return CostReport(
         tuple(curves),
         scenes,
         tuple(points(curves, setup=setup)),
         tuple(times_to_reach(curves, targets, setup=setup)),
-        tuple(changes(found.runs)),
-        (*found.notes, *_gaps(curves, scenes), *_unranked(curves)),
+        tuple(changes(cost_runs.runs)),
+        (*cost_runs.notes, *_gaps(curves, scenes), *_unranked(curves)),
         tuple(answers(curves, setup=setup)),
-        found.reference,
+        cost_runs.reference,
         setup,
         made_by,
     )
 
 
 def _unranked(curves: Sequence[Curve]) -> list[str]:
-    """One line a reason for times that are not ranked."""
+    """Return a line for each reason why times are not ranked."""
     reasons: dict[str, list[str]] = {}
     for curve in curves:
         if why := why_unranked(curve.runs):
@@ -77,38 +78,36 @@ def _unranked(curves: Sequence[Curve]) -> list[str]:
 def _gaps(curves: Sequence[Curve], scenes: Sequence[str]) -> list[str]:
     lines = []
     for curve in curves:
-        gone = [scene for scene in scenes if not curve.on(scene)]
-        if gone:
+        lacking = [scene for scene in scenes if not curve.on(scene)]
+        if lacking:
             lines.append(
-                f"no run: {curve.name}, {curve.length.text}, on {', '.join(gone)}; its means over scenes are "
-                "missing"
+                f"no run: {curve.name}, {curve.length.text}, on {', '.join(lacking)}; its means over scenes "
+                "are missing"
             )
-    return lines + _blind([run for curve in curves for run in curve.runs if not run.error])
+    return lines + _unprobed([run for curve in curves for run in curve.runs if not run.error])
 
 
-def _blind(runs: Sequence[CostRun]) -> list[str]:
-    """Which runs were not probed: methods of which none was by their name, else each run."""
-    seen = {run.method for run in runs if not run.blind}
-    never = sorted({run.method for run in runs} - seen)
+def _unprobed(runs: Sequence[CostRun]) -> list[str]:
+    """Return lines about runs without probes: one for each run, or for all methods without any probes."""
+    probed = {run.method for run in runs if not run.unprobed}
+    never = sorted({run.method for run in runs} - probed)
     lines = [
-        f"{run.blind} ({run.method} on {run.scene}, seed {run.seed}): only its end is known, so there is no "
-        "mean time over it and runs with probes"
+        f"{run.unprobed} ({run.method} on {run.scene}, seed {run.seed}): only its final PSNR is known, so "
+        "there is no mean time over it and runs with probes"
         for run in runs
-        if run.blind and run.method in seen
+        if run.unprobed and run.method in probed
     ]
-    lines += [run.blind for run in runs if run.method in never and "damaged" in run.blind]
+    lines += [run.unprobed for run in runs if run.method in never and "damaged" in run.unprobed]
     if never:
-        lines.append(
-            f"no probes in the timelines of {', '.join(never)}: of the way to a PSNR only the end is known"
-        )
+        lines.append(f"no probes in the timelines of {', '.join(never)}: only their final PSNR is known")
     return lines
 
 
 def write_report(report: CostReport, folder: Path) -> list[Path]:
-    """cost.json, cost.csv, time-to-psnr.csv, changes.csv and timelines.csv; returns what was written.
+    """Write cost.json, cost.csv, time-to-psnr.csv, changes.csv and timelines.csv; return the paths written.
 
     Raises:
-        AwError: files of these names are there, and no earlier report.
+        AwError: the folder has files of these names that are no earlier report.
     """
     _remove_earlier(folder)
     tables = {
@@ -127,15 +126,15 @@ def write_report(report: CostReport, folder: Path) -> list[Path]:
 
 
 def _remove_earlier(folder: Path) -> None:
-    """Remove the files of an earlier report, and nothing else: old plots must not stay beside new tables."""
+    """Remove the files of an earlier report, as old plots must not remain beside new tables."""
     if not is_record(folder / "cost.json", "time_to_psnr"):
         refuse_files_there(folder, FILES)
     for name in FILES:
         (folder / name).unlink(missing_ok=True)
 
 
-def plain_data(report: CostReport) -> dict[str, Any]:
-    """The report for JSON; null = missing."""
+def plain_data(report: CostReport) -> Facts:
+    """Return the report for JSON; None = missing."""
     data = {
         "schema": 1,
         "made_by": report.made_by,
@@ -151,8 +150,8 @@ def plain_data(report: CostReport) -> dict[str, Any]:
     return dict(finite(data))
 
 
-def _point_row(p: Point) -> dict[str, Any]:
-    row: dict[str, Any] = {"curve": p.curve, "method": p.method, "length": p.length, "runs": p.runs}
+def _point_row(p: Point) -> Facts:
+    row: Facts = {"curve": p.curve, "method": p.method, "length": p.length, "runs": p.runs}
     row |= _both("psnr", p.psnr) | _both("minutes", p.minutes)
     row |= {"minutes_low": p.low, "minutes_high": p.high, "not_ranked": p.unranked, "pareto_front": p.front}
     row |= _both("setup_s", p.setup_s)
@@ -161,37 +160,22 @@ def _point_row(p: Point) -> dict[str, Any]:
     return row
 
 
-def _reach_row(r: Reach) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "scene": r.scene or "",
-        "curve": r.curve,
-        "length": r.length,
-        "target": r.target,
-        "psnr": r.psnr,
-    }
-    return (
-        row
-        | _both("minutes", r.minutes)
-        | {"minutes_low": r.low, "minutes_high": r.high, "not_ranked": r.unranked}
-        | {"upper_bound": r.bound, "reached": r.reached, "runs": r.runs, "missing": r.missing}
-    )
+def _reach_row(r: Reach) -> Facts:
+    row: Facts = {"scene": r.scene or "", "curve": r.curve, "length": r.length, "target": r.target}
+    row |= {"psnr": r.psnr} | _both("minutes", r.minutes)
+    row |= {"minutes_low": r.low, "minutes_high": r.high, "not_ranked": r.unranked}
+    return row | {"upper_bound": r.bound, "reached": r.reached, "runs": r.runs, "missing": r.missing}
 
 
-def _change_row(c: Change) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "kind": c.kind,
-        "name": c.name,
-        "method": c.method,
-        "before": c.before,
-        "after": c.after,
-    }
+def _change_row(c: Change) -> Facts:
+    row: Facts = {"kind": c.kind, "name": c.name, "method": c.method, "before": c.before, "after": c.after}
     row |= {"length": c.length, "scenes": " ".join(c.scenes), "pairs": c.pairs}
     row |= _both("db", c.db) | {"db_low": c.low, "db_high": c.high}
     row |= _both("minutes", c.minutes) | _both("ms_per_iteration", c.ms)
     return row | {"db_per_minute": c.per_minute, "same_time": c.same_time, "not_ranked": c.unranked}
 
 
-def _timeline_rows(curves: Iterable[Curve]) -> Iterable[dict[str, Any]]:
+def _timeline_rows(curves: Iterable[Curve]) -> Iterable[Facts]:
     for curve in curves:
         for run in curve.runs:
             for at, psnr in run.points:
@@ -204,7 +188,7 @@ def _both(name: str, value: Summary) -> dict[str, float]:
 
 
 def finite(value: Any) -> Any:
-    """NaN is null, as in a result file; infinity is the string it writes."""
+    """Return the value with None for NaN and a string for infinity, as in a result file."""
     if isinstance(value, dict):
         return {k: finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -219,11 +203,11 @@ TIMES = {
     True: "times: reference seconds, see docs/cost.md; ranked between runs that were alone",
     False: "times: wall seconds of the machine; ranked between runs that were alone",
 }
-SHORT_MIN = 3.0  # trainings below this are told in seconds
+SHORT_MIN = 3.0  # trainings below this are shown in seconds
 
 
 def to_text(report: CostReport) -> str:
-    """Every table of the report, aligned, and what is missing below."""
+    """Return every table of the report as aligned text, with the notes below."""
     parts = [plain_formats.to_text(tables_of(report))]
     parts += [f"{plain(answer.text)}" for answer in report.answers]
     parts += ["±: sample standard deviation over seeds"] if _has_spread(report) else []
@@ -235,7 +219,7 @@ def to_text(report: CostReport) -> str:
 
 @dataclass(frozen=True)
 class Unit:
-    """Of the times that are shown; files hold minutes."""
+    """The unit of times that are shown; files hold minutes."""
 
     name: str
     per_minute: float
@@ -246,7 +230,7 @@ class Unit:
 
 
 def time_unit(report: CostReport) -> Unit:
-    """Seconds where every training is short, else minutes."""
+    """Return seconds if every training is short, else minutes."""
     minutes = [
         run.train_s / 60.0 for curve in report.curves for run in curve.runs if not math.isnan(run.train_s)
     ]
@@ -257,7 +241,7 @@ def time_unit(report: CostReport) -> Unit:
 
 
 def tables_of(report: CostReport) -> list[Table]:
-    """The tables: what each curve reaches, how soon, and what each change brings."""
+    """Return the tables: what each curve reaches, when it reaches a PSNR, and what each change brings."""
     tables = [_points(report)]
     scenes: dict[str | None, list[Reach]] = {}
     for row in report.reach:
@@ -316,7 +300,7 @@ def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Ta
 def _when(row: Reach, unit: Unit, several: bool) -> str:
     if not row.runs:
         return "no run"
-    if row.missing:  # the reason stands below the tables
+    if row.missing:  # the reason is in the notes below the tables
         return MISSING
     if row.reached < row.runs:
         return "never" if not row.reached else f"{row.reached} of {row.runs} runs"
@@ -327,7 +311,7 @@ def _when(row: Reach, unit: Unit, several: bool) -> str:
 
 
 def _time(minutes: Summary, row: Point | Reach, unit: Unit) -> str:
-    """A mean with its deviation; where it is not ranked, the range over the runs."""
+    """Return a mean with its deviation or, if it is not ranked, the range over the runs."""
     if not row.unranked or math.isnan(minutes.mean):
         return number(unit.of(minutes), unit.digits)
     return seconds_range([row.low * unit.per_minute, row.high * unit.per_minute], unit.digits)
@@ -347,7 +331,7 @@ def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Table:
 
 
 def per_minute(change: Change) -> str:
-    """dB an extra minute, or why there is none."""
+    """Return the dB per extra minute, or why there are none."""
     if math.isnan(change.minutes.mean) or math.isnan(change.db.mean):
         return MISSING
     if change.unranked:
@@ -358,7 +342,7 @@ def per_minute(change: Change) -> str:
 
 
 def number(value: Summary, digits: int, *, sign: bool = False, spread: bool = True) -> str:
-    """A mean and its deviation over seeds; a dash where it is missing."""
+    """Return a mean and its deviation over seeds as text; a dash if it is missing."""
     if math.isnan(value.mean):
         return MISSING
     text = f"{value.mean:{'+' if sign else ''},.{digits}f}"

@@ -1,12 +1,12 @@
-"""Curves: the runs of one method with the same settings, over its scenes and seeds, and their front.
+"""Gather runs into curves and points, find the Pareto front, and measure what a single change brings.
 
-A mean is over seeds, then over scenes. A cell that failed, or a scene that a curve has no run on, makes
-the mean missing, so that no method gains from a failure.
+A curve holds the runs of one method with the same settings, over scenes and seeds. A mean is over seeds, then
+over scenes. A failed cell, or a scene without a run, makes the mean missing, so that no method gains from a
+failure.
 
-Gain and cost of one effect or option, from pairs of runs that differ in nothing else.
-
-Both runs of a pair have the same method, scene, seed, length, device and code. Where the length is a
-budget, both trained equally long: what the effect costs is in its dB already, and dB a minute has no meaning.
+A change is one effect or option. Its gain and cost come from pairs of runs that differ in nothing else: the
+method, scene, seed, length, device and code are the same. Where the length is a budget, both trained equally
+long: the gain in dB then includes what the effect costs, and dB per minute have no meaning.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numpy as np
 
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
-from ambiguous_wild.report.cost_read import CostRun, Length, why_unranked
+from ambiguous_wild.report.cost_runs import CostRun, Length, why_unranked
 
-SAME_TIME = 0.01  # of the training: a smaller difference in minutes is no difference
+SAME_TIME = 0.01  # of the training: a smaller difference of times counts as none
 _ABSENT = "(absent)"
 
 Kind = Literal["effect", "part", "resolution", "gaussians", "interval", "option"]
@@ -43,13 +43,13 @@ class Change:
     length: str
     scenes: tuple[str, ...]
     pairs: int
-    db: Summary  # gained; over pairs
+    db: Summary  # gain in PSNR, over pairs
     low: float  # 95 % bootstrap interval of the gain, over the test images of all pairs
     high: float
-    minutes: Summary  # of training, more than without; over pairs
-    ms: Summary  # an iteration, more than without
-    share: float  # extra minutes over the training without
-    unranked: str = ""  # why the minutes cannot be trusted; empty where they can
+    minutes: Summary  # extra minutes of training, over pairs
+    ms: Summary  # extra ms per iteration
+    share: float  # extra minutes, as a share of the training without the change
+    unranked: str = ""  # why the minutes cannot be trusted; empty if they can
 
     @property
     def what(self) -> str:
@@ -61,7 +61,7 @@ class Change:
 
     @property
     def per_minute(self) -> float:
-        """dB an extra minute; NaN where it takes no longer, or a run was not alone."""
+        """Gain in dB per extra minute; NaN if it takes no longer, or a run was not alone."""
         if not self.minutes.mean > 0.0 or self.same_time or self.unranked:
             return math.nan
         return self.db.mean / self.minutes.mean
@@ -72,13 +72,13 @@ class Change:
 
 
 def changes(runs: Sequence[CostRun]) -> list[Change]:
-    """Every effect and option that some pair of runs isolates, by kind, name and method."""
+    """Measure every effect and option in which alone some pair of runs differs, by kind, name and method."""
     usable = [run for run in runs if not run.error]
-    found = [_change("effect", key, pairs) for key, pairs in sorted(_effect_pairs(usable).items())]
-    found += [_change("part", key, pairs) for key, pairs in sorted(_part_pairs(usable).items())]
+    measured = [_change("effect", key, pairs) for key, pairs in sorted(_effect_pairs(usable).items())]
+    measured += [_change("part", key, pairs) for key, pairs in sorted(_part_pairs(usable).items())]
     for key, pairs in sorted(_option_pairs(usable).items()):
-        found.append(_change(_kind(key[0]), key, _costlier_second(pairs)))
-    return sorted(found, key=lambda c: (KINDS.index(c.kind), c.name, c.method))
+        measured.append(_change(_kind(key[0]), key, _costlier_second(pairs)))
+    return sorted(measured, key=lambda c: (KINDS.index(c.kind), c.name, c.method))
 
 
 def _kind(option: str) -> Kind:
@@ -111,13 +111,13 @@ def _effect_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
 
 
 def _part_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
-    """Each variant of an ablation against the method as it is; where that was not run, the first variant."""
+    """Pair each variant of an ablation with the unchanged method or, without a run of it, the first one."""
     pairs: dict[Key, Pairs] = {}
     for group in _groups(runs, lambda r: (r.base, r.scene, r.seed, r.length, r.rest, r.effects)):
         plain = [run for run in group if run.method == run.base]
         variants = sorted((run for run in group if run.method != run.base and "=" not in run.method),
                           key=lambda run: run.method)  # fmt: skip
-        if len(plain) > 1:  # several settings of it: not clear which one a variant belongs to
+        if len(plain) > 1:  # with several settings it is unclear which one a variant belongs to
             continue
         for of_group in _groups(variants, lambda run: run.method.partition("@")[2].partition("-")[0]):
             host, *others = [*plain, *of_group]
@@ -150,7 +150,7 @@ def _option_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
 
 
 def _costlier_second(pairs: Pairs) -> Pairs:
-    """The pairs turned so that the second run is the one that takes longer, on average."""
+    """Return the pairs in the order in which the second runs take longer, on average."""
     extra = np.mean([_ms(b) - _ms(a) for a, b in pairs])
     return [(b, a) for a, b in pairs] if extra < 0.0 else pairs
 
@@ -187,7 +187,7 @@ def _change(kind: Kind, key: Key, pairs: Pairs) -> Change:
 
 
 def _interval(pairs: Pairs) -> stats.Interval:
-    """Of the gain, over the test images: the same pictures with and without, seeds averaged before."""
+    """Return the interval of the gain over test images, paired by image, after a mean over seeds."""
     images: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for a, b in pairs:
         for name, psnr in a.images.items():
@@ -221,7 +221,7 @@ class Curve:
 
     @property
     def trained_s(self) -> float:
-        """Seconds of the longest training; 0 where none is known."""
+        """Seconds of the longest training; 0 if none is known."""
         return max((run.train_s for run in self.runs if math.isfinite(run.train_s)), default=0.0)
 
     def on(self, scene: str) -> list[CostRun]:
@@ -237,7 +237,7 @@ class Summary:
 
 
 def curves_of(runs: Sequence[CostRun]) -> list[Curve]:
-    """Runs gathered into curves, by name, the shortest training first."""
+    """Gather runs into curves, sorted by name, then from the shortest training."""
     names = _names(runs)
     groups: dict[tuple[str, Length], list[CostRun]] = {}
     for run, name in zip(runs, names):
@@ -251,7 +251,7 @@ def scenes_of(curves: Iterable[Curve]) -> tuple[str, ...]:
 
 
 def longest(curves: Sequence[Curve]) -> list[Curve]:
-    """Of each name the curve that trained longest."""
+    """Return the curve that trained longest, for each name."""
     best: dict[str, Curve] = {}
     for curve in curves:  # sorted by length
         best[curve.name] = curve
@@ -259,12 +259,12 @@ def longest(curves: Sequence[Curve]) -> list[Curve]:
 
 
 def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], float]) -> Summary:
-    """Mean over seeds, then scenes; the spread is over seeds of the mean over scenes.
+    """Return the mean over seeds, then scenes; the spread is over seeds of the mean over scenes.
 
     Args:
-        curve: whose runs.
-        scenes: the mean is over these; one without a run makes it missing.
-        value: of a run; NaN = missing.
+        curve: the runs.
+        scenes: scenes of the mean; if one has no run, the mean is missing.
+        value: the number of a run; NaN = missing.
     """
     by_scene = [{run.seed: value(run) for run in curve.on(scene)} for scene in scenes]
     if not all(by_scene):
@@ -272,12 +272,12 @@ def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], floa
     mean = stats.mean([stats.mean(list(values.values())) for values in by_scene])
     seeds = by_scene[0].keys()
     if any(values.keys() != seeds for values in by_scene):
-        return Summary(mean)  # seeds that are not everywhere: no mean over scenes of a seed
+        return Summary(mean)  # scenes have different seeds: no seed has a mean over all scenes
     return Summary(mean, stats.spread([stats.mean([v[seed] for v in by_scene]) for seed in sorted(seeds)]))
 
 
 def psnr_at(run: CostRun, seconds: np.ndarray) -> np.ndarray:
-    """PSNR of a run at times [n] s, by straight lines between its probes; NaN outside them."""
+    """Return the PSNR of a run at times [n] s, interpolated linearly between probes; NaN outside of them."""
     if not run.points:
         return np.full(len(seconds), math.nan)
     at, psnr = np.array(run.points).T
@@ -285,7 +285,7 @@ def psnr_at(run: CostRun, seconds: np.ndarray) -> np.ndarray:
 
 
 def timeline(curve: Curve, scenes: Sequence[str], count: int = 120) -> tuple[np.ndarray, np.ndarray]:
-    """Mean PSNR over training time, where every run of every scene has one.
+    """Return the mean PSNR over training time, where every run of every scene has one.
 
     Returns:
         (seconds [n], dB [n]); both empty where a run is missing.
@@ -303,7 +303,7 @@ def timeline(curve: Curve, scenes: Sequence[str], count: int = 120) -> tuple[np.
 
 
 def _names(runs: Sequence[CostRun]) -> list[str]:
-    """The name of each run's curve: its method, and the settings that vary among its runs."""
+    """Return the name of each run's curve: its method, and the settings that vary among the method's runs."""
     asked: dict[str, set[str]] = {}
     values: dict[str, dict[str, set[Any]]] = {}
     for run in runs:
@@ -331,37 +331,37 @@ class Point:
     length: str
     runs: int
     psnr: Summary  # dB
-    minutes: Summary  # of training; with the set-up before it where `setup` is set
+    minutes: Summary  # of training; with the set-up if `setup` was asked for
     setup_s: Summary
-    numbers: dict[str, Summary]  # ms an iteration, Gaussians, MB, frames a second, own metrics
+    numbers: dict[str, Summary]  # ms per iteration, Gaussians, MB, frames per second, the user's metrics
     unranked: str = ""  # why its time is not ranked
-    low: float = math.nan  # minutes of its fastest and its slowest run, shown where it is not ranked
-    high: float = math.nan
+    low: float = math.nan  # minutes of the fastest run; shown if the time is not ranked
+    high: float = math.nan  # minutes of the slowest run
     front: bool = False  # Pareto-optimal: no other curve reaches this PSNR in less time
 
 
 def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool = False) -> list[Point]:
-    """One point a curve, with those on the Pareto front of training time and PSNR marked.
+    """Return one point for each curve, and mark those on the Pareto front of training time and PSNR.
 
     References, and curves with a run that was not alone on its machine, are never on the front.
 
     Args:
         curves: from `curves_of`.
-        scenes: the means are over these; empty = every scene that any curve has.
-        setup: count what comes before the first step as time too.
+        scenes: scenes of the means; empty = every scene that any curve has.
+        setup: add the set-up before the first step to the time.
     """
     scenes = tuple(scenes) or scenes_of(curves)
     names = dict.fromkeys(name for curve in curves for run in curve.runs for name in run.numbers)
-    made = [_point(curve, scenes, setup, names) for curve in curves]
-    best = {id(p) for p in pareto([p for p in made if not knows_truth(p.method) and not p.unranked])}
-    return [replace(p, front=id(p) in best) for p in made]
+    all_points = [_point(curve, scenes, setup, names) for curve in curves]
+    best = {id(p) for p in pareto([p for p in all_points if not knows_truth(p.method) and not p.unranked])}
+    return [replace(p, front=id(p) in best) for p in all_points]
 
 
 def pareto(among: Sequence[Point]) -> list[Point]:
-    """Pareto-optimal points in order of time; a point with a missing number is never one."""
-    known = [p for p in among if not math.isnan(p.psnr.mean) and not math.isnan(p.minutes.mean)]
+    """Return the Pareto-optimal points in order of time; points with a missing number are left out."""
+    complete = [p for p in among if not math.isnan(p.psnr.mean) and not math.isnan(p.minutes.mean)]
     front: list[Point] = []
-    for point in sorted(known, key=lambda p: (p.minutes.mean, -p.psnr.mean)):
+    for point in sorted(complete, key=lambda p: (p.minutes.mean, -p.psnr.mean)):
         if not front or point.psnr.mean > front[-1].psnr.mean:
             front.append(point)
     return front
@@ -375,7 +375,7 @@ def _point(curve: Curve, scenes: Sequence[str], setup: bool, names: Iterable[str
         return summary(curve, scenes, lambda run: run.numbers.get(name, math.nan))
 
     runs = [run for run in curve.runs if run.scene in scenes]
-    known = [m for m in map(minutes, runs) if math.isfinite(m)]
+    finite = [m for m in map(minutes, runs) if math.isfinite(m)]
     return Point(
         curve.name,
         curve.method,
@@ -386,6 +386,6 @@ def _point(curve: Curve, scenes: Sequence[str], setup: bool, names: Iterable[str
         summary(curve, scenes, lambda run: run.setup_s),
         {name: number(name) for name in names},
         why_unranked(runs),
-        min(known, default=math.nan),
-        max(known, default=math.nan),
+        min(finite, default=math.nan),
+        max(finite, default=math.nan),
     )

@@ -1,11 +1,11 @@
-"""The plots of the cost report: timelines, budgets, fronts and what each change brings."""
+"""Draw the plots of the cost report: timelines, budgets, fronts and what each change brings."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -27,7 +27,7 @@ MOST_COLUMNS = 3
 def new_figure(
     panels: int, *, panel: tuple[float, float] = PANEL, reading: str = ""
 ) -> tuple[Any, list[Any]]:
-    """A figure of so many panels and their axes, without the screen; `reading` says below how to read it."""
+    """Make a figure without a screen; return it with the axes of its panels. `reading` is a line below it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -49,7 +49,7 @@ def new_figure(
 
 
 def save(figure: Any, stem: Path) -> list[Path]:
-    """Write STEM.svg and STEM.png; the same figure gives the same bytes."""
+    """Write STEM.svg and STEM.png; equal figures give equal bytes."""
     import matplotlib
 
     paths = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
@@ -60,8 +60,15 @@ def save(figure: Any, stem: Path) -> list[Path]:
     return paths
 
 
-def looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour and line of every name; the same names look the same in every plot."""
+class LineStyle(TypedDict):
+    """Arguments of matplotlib's `plot`."""
+
+    color: Any
+    linestyle: Any
+
+
+def line_styles(names: Sequence[str]) -> dict[str, LineStyle]:
+    """Return colour and line of every name, the same in every plot."""
     return {
         name: {
             "color": plot_colour(CATEGORIES[i % len(CATEGORIES)]),
@@ -72,12 +79,12 @@ def looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def text(axes: Any, what: str, **kw: Any) -> None:
-    """A title or a label from others' names: neither formula nor control character."""
+    """Set a title or label that may hold any name, without formulas and control characters."""
     getattr(axes, f"set_{what}")(plain(kw.pop("label")), parse_math=False, **kw)
 
 
 def spread_out(heights: Sequence[float], gap: float) -> list[float]:
-    """Heights for labels at least `gap` apart, near where they belong; those that overlap share a middle."""
+    """Return heights for labels at least `gap` apart, near the given ones; overlapping labels are centred."""
     order = sorted(range(len(heights)), key=lambda i: heights[i])
     pools: list[tuple[float, list[int]]] = []  # (middle, members)
     for i in order:
@@ -101,7 +108,7 @@ def _bottom(pool: tuple[float, list[int]], gap: float) -> float:
 
 
 def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> None:
-    """Names in the right margin, at the height where their lines end; (name, x, y, colour) each."""
+    """Write names in the right margin, at the ends of their lines; each end is (name, x, y, colour)."""
     if not ends:
         return
     low, high = axes.get_ylim()
@@ -117,7 +124,7 @@ def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> Non
 
 
 def label_points(axes: Any, points: Sequence[tuple[str, float, float, Any]]) -> None:
-    """Names beside their points, towards the middle of the panel; (name, x, y, colour) each."""
+    """Write names beside points, on the side of the panel's middle; each point is (name, x, y, colour)."""
     low, high = axes.get_ylim()
     to_axes = axes.transData + axes.transAxes.inverted()
     heights = spread_out([y for _, _, y, _ in points], 0.062 * (high - low))
@@ -130,7 +137,7 @@ def label_points(axes: Any, points: Sequence[tuple[str, float, float, Any]]) -> 
 
 
 def ticks_of_time(axes: Any, times: Sequence[float]) -> None:
-    """A logarithmic axis with a tick at every one of the few times."""
+    """Make the x axis logarithmic, with a tick at each of the few times."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     axes.set_xscale("log")
@@ -152,7 +159,7 @@ KINDS = {kind: k for k, kind in enumerate(CHANGES)}
 
 
 def draw_all(report: CostReport, folder: Path) -> list[Path]:
-    """Draw every plot that the runs have data for, as SVG and PNG; returns the paths."""
+    """Draw every plot that the runs have data for, as SVG and PNG; return the paths written."""
     written = []
     for name, draw in zip(PLOTS, (draw_timelines, draw_budgets, draw_front, draw_changes)):
         figure = draw(report)
@@ -161,51 +168,49 @@ def draw_all(report: CostReport, folder: Path) -> list[Path]:
 
 
 def _panels(report: CostReport) -> list[tuple[str, tuple[str, ...]]]:
-    """(title, scenes) of each panel: the mean first where there are several."""
+    """Return (title, scenes) of each panel; with several scenes, the mean comes first."""
     panels: list[tuple[str, tuple[str, ...]]] = [(scene, (scene,)) for scene in report.scenes]
     return [(f"mean over {len(panels)} scenes", report.scenes), *panels] if len(panels) > 1 else panels
 
 
 def draw_timelines(report: CostReport) -> Any | None:
-    """Test PSNR over training time: seeds thin, their mean thick, their spread at the end."""
+    """Draw test PSNR over training time: thin lines for seeds, thick for their mean, bars for the spread."""
     curves = [c for c in longest(report.curves) if any(len(run.points) > 1 for run in c.runs)]
     if not curves:
         return None
-    panels, look, unit = _panels(report), looks([c.name for c in report.curves]), time_unit(report)
+    panels, styles, unit = _panels(report), line_styles([c.name for c in report.curves]), time_unit(report)
     figure, axes = new_figure(
         len(panels), reading="thick: mean over seeds; thin: each seed; bars: sample deviation over seeds"
     )
     for panel, (title, scenes) in zip(axes, panels):
-        ends = [end for c in curves if (end := _timeline(panel, c, scenes, look[c.name], unit)) is not None]
+        ends = [end for c in curves if (end := _timeline(panel, c, scenes, styles[c.name], unit)) is not None]
         _finish(panel, title, f"training time ({unit.name})")
         label_right(panel, ends)
         panel.set_xlim(left=0.0)
     return figure
 
 
-def _timeline(
-    axes: Any, curve: Curve, scenes: tuple[str, ...], look: dict[str, Any], unit: Unit
-) -> Any | None:
+def _timeline(axes: Any, curve: Curve, scenes: tuple[str, ...], style: LineStyle, unit: Unit) -> Any | None:
     scale = unit.per_minute / 60.0
     if len(scenes) == 1:
         for run in curve.on(scenes[0]):
             at = np.array(run.points).reshape(-1, 2)
-            axes.plot(at[:, 0] * scale, at[:, 1], **look, linewidth=0.7, alpha=0.45)
+            axes.plot(at[:, 0] * scale, at[:, 1], **style, linewidth=0.7, alpha=0.45)
     seconds, psnr = timeline(curve, scenes)
     x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
     y = summary(curve, scenes, lambda run: run.psnr)
     seconds = seconds * scale
     if finite(x.mean, y.mean) and len(seconds) and x.mean >= seconds[-1]:  # the dot belongs to its curve
         seconds, psnr = np.append(seconds, x.mean), np.append(psnr, y.mean)
-    axes.plot(seconds, psnr, **look, linewidth=2.0)
-    return _end(axes, curve.name, x, y, look)
+    axes.plot(seconds, psnr, **style, linewidth=2.0)
+    return _end(axes, curve.name, x, y, style)
 
 
-def _end(axes: Any, name: str, x: Summary, y: Summary, look: dict[str, Any]) -> Any | None:
+def _end(axes: Any, name: str, x: Summary, y: Summary, style: LineStyle) -> Any | None:
     if not finite(x.mean, y.mean):
         return None
-    _dot(axes, x, y, look["color"])
-    return name, x.mean, y.mean, look["color"]
+    _dot(axes, x, y, style["color"])
+    return name, x.mean, y.mean, style["color"]
 
 
 def _dot(axes: Any, x: Summary, y: Summary, colour: Any, *, hollow: bool = False) -> None:
@@ -215,20 +220,20 @@ def _dot(axes: Any, x: Summary, y: Summary, colour: Any, *, hollow: bool = False
 
 
 def draw_budgets(report: CostReport) -> Any | None:
-    """PSNR at the end of runs of several lengths: each dot was trained for that long from the start."""
+    """Draw the final PSNR of runs of several lengths; each dot is a separate training."""
     lengths = {name: [c for c in report.curves if c.name == name] for name in {c.name for c in report.curves}}
     if all(len(curves) < 2 for curves in lengths.values()):
         return None
-    panels, look, unit = _panels(report), looks(list(lengths)), time_unit(report)
+    panels, styles, unit = _panels(report), line_styles(list(lengths)), time_unit(report)
     figure, axes = new_figure(
         len(panels), reading="every dot is a training of that length; bars: sample deviation over seeds"
     )
     for panel, (title, scenes) in zip(axes, panels):
         ends, times = [], []
         for name in sorted(lengths):
-            ends_of = _joined(panel, lengths[name], scenes, look[name], unit)
+            ends_of = _joined(panel, lengths[name], scenes, styles[name], unit)
             times += [x for x, _ in ends_of]
-            ends += [(name, *ends_of[-1], look[name]["color"])] if ends_of else []
+            ends += [(name, *ends_of[-1], styles[name]["color"])] if ends_of else []
         _finish(panel, title, f"training time ({unit.name})")
         label_right(panel, ends)
         if times:
@@ -237,7 +242,7 @@ def draw_budgets(report: CostReport) -> Any | None:
 
 
 def _joined(
-    axes: Any, curves: Sequence[Curve], scenes: tuple[str, ...], look: dict[str, Any], unit: Unit
+    axes: Any, curves: Sequence[Curve], scenes: tuple[str, ...], style: LineStyle, unit: Unit
 ) -> list[tuple[float, float]]:
     ends = []
     for curve in curves:
@@ -245,14 +250,14 @@ def _joined(
         y = summary(curve, scenes, lambda run: run.psnr)
         if finite(x.mean, y.mean):
             ends.append((x.mean, y.mean))
-            _dot(axes, Summary(x.mean), y, look["color"])
+            _dot(axes, Summary(x.mean), y, style["color"])
     ends.sort()
-    axes.plot([x for x, _ in ends], [y for _, y in ends], **look, linewidth=2.0)
+    axes.plot([x for x, _ in ends], [y for _, y in ends], **style, linewidth=2.0)
     return ends
 
 
 def _few(times: Sequence[float]) -> list[float]:
-    """Times rounded to two digits, those that would touch left out."""
+    """Return times rounded to two digits, without those whose labels would overlap."""
     kept: list[float] = []
     for time in sorted({float(f"{t:.2g}") for t in times}):
         if not kept or time > 1.3 * kept[-1]:
@@ -261,8 +266,8 @@ def _few(times: Sequence[float]) -> list[float]:
 
 
 def draw_front(report: CostReport) -> Any | None:
-    """PSNR against time, megabytes and frames a second; the grey line is the Pareto front."""
-    look, unit = looks([p.curve for p in report.points]), time_unit(report)
+    """Draw PSNR against time, megabytes and frames per second; the grey line is the Pareto front."""
+    styles, unit = line_styles([p.curve for p in report.points]), time_unit(report)
     panels = [
         axis for axis in AXES if any(finite(_x(p, axis[0], unit).mean, p.psnr.mean) for p in report.points)
     ]
@@ -279,12 +284,14 @@ def draw_front(report: CostReport) -> Any | None:
         _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in rivals], less_is_better)
         for p in known:
             hollow = bool(p.unranked) and key != "model_mb"
-            _dot(panel, _x(p, key, unit), p.psnr, look[p.curve]["color"], hollow=hollow)
+            _dot(panel, _x(p, key, unit), p.psnr, styles[p.curve]["color"], hollow=hollow)
         for name in dict.fromkeys(p.curve for p in known):  # trainings of several lengths
             line = [(_x(p, key, unit).mean, p.psnr.mean) for p in known if p.curve == name]
-            panel.plot([x for x, _ in line], [y for _, y in line], **look[name], linewidth=1.0, alpha=0.6)
+            panel.plot([x for x, _ in line], [y for _, y in line], **styles[name], linewidth=1.0, alpha=0.6)
         last = {p.curve: p for p in known}  # of a curve of several lengths, the longest has the name
-        ends = [(p.curve, _x(p, key, unit).mean, p.psnr.mean, look[p.curve]["color"]) for p in last.values()]
+        ends = [
+            (p.curve, _x(p, key, unit).mean, p.psnr.mean, styles[p.curve]["color"]) for p in last.values()
+        ]
         if key == "minutes":
             label = f"{label}{' and set-up' if report.setup else ''} ({unit.name})"
         over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
@@ -312,7 +319,7 @@ def _front_line(axes: Any, at: Sequence[tuple[float, float]], less_is_better: bo
 
 
 def draw_changes(report: CostReport) -> Any | None:
-    """A row a change: dB gained with its interval, and beside it what it costs."""
+    """Draw a row for each change: the gain in dB with its interval, and its cost beside it."""
     rows = [c for c in report.changes if finite(c.db.mean)]
     if not rows:
         return None

@@ -1,10 +1,10 @@
-"""Which method and settings to train a scene with for a given time, from measured runs of other scenes.
+"""Recommend a method and settings for a scene and a training time, from measured runs of other scenes.
 
-A setting is a method with its options, effects, resolution and number of Gaussians. Its PSNR for a time is
-that of its trainings on each scene, on straight lines over log time between the lengths that were run. Scenes
-differ by more than settings do, so PSNR is split into a part of the scene and a part of the setting (least
-squares over all pairs that were measured); the setting of the highest part is recommended. A scene that was
-measured itself is judged by its own runs.
+A setting is a method with its options, effects, resolution and number of Gaussians. Its PSNR at a time is
+interpolated between the lengths that were run on a scene, linearly over log time. Scenes differ by more than
+settings do, so PSNR is split into a part of the scene and a part of the setting (least squares over all
+measured pairs), and the setting with the highest part is recommended. If the scene itself was measured, only
+its own runs are used.
 """
 
 from __future__ import annotations
@@ -20,30 +20,29 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_curves import Curve, curves_of, summary
-from ambiguous_wild.report.cost_read import CostRun, CostRuns, why_unranked
+from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
+from ambiguous_wild.report.cost_targets import duration
 
-CLOSE_DB = 0.3  # a setting this near the best is told as an alternative
+CLOSE_DB = 0.3  # a setting this near the best is marked as equally good
 _TAKEN = ("--method", "--effects", "--resolution", "--max-gaussians", "--set", "--plugin", "--device")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting and what it is worth within the budget."""
+    """A setting, and its quality and cost within the budget."""
 
     name: str  # of the curve: the method, and settings that differ between the runs
     method: str
-    behind: float  # dB behind the best setting; 0.0 for it
-    spread: (
-        float  # sample deviation over scenes of what the scene's and the setting's part leave; NaN for one
-    )
-    psnr: float  # dB: of the scene itself where it was measured, else the mean over the scenes of its runs
+    behind: float  # dB below the best setting; 0.0 for the best
+    spread: float  # sample deviation over scenes of the residual of both parts; NaN for one scene
+    psnr: float  # dB: of the scene itself if it was measured, else the mean over the scenes of its runs
     scenes: int
-    seconds: float  # of training: the budget, or the longest training of it that was measured
+    seconds: float  # of training: the budget, or the longest measured training if that is shorter
     setup_s: float
     ms_per_iteration: float
     gaussians: float
     model_mb: float
-    words: tuple[str, ...]  # of `aw bench`, without scene and length
+    words: tuple[str, ...]  # arguments of `aw bench`, without scene and length
 
 
 @dataclass(frozen=True)
@@ -52,13 +51,13 @@ class Recommendation:
 
     scene: str
     budget_s: float  # of this machine
-    reference_s: float  # the same in the seconds of the runs
+    reference_s: float  # the budget in the seconds of the runs
     own: bool  # the scene itself was measured
     choices: tuple[Choice, ...]
     notes: tuple[str, ...]
 
     def command(self, scene: str) -> str:
-        """The command that trains the recommended setting."""
+        """Return the command that trains the recommended setting."""
         budget = f"{self.budget_s:.6f}".rstrip("0").rstrip(".") + "s"
         return shlex.join(["aw", "bench", *self.choices[0].words, "--scene", scene, "--budget", budget])
 
@@ -66,14 +65,14 @@ class Recommendation:
 def recommend(
     runs: Sequence[CostRun], scene: str, budget_s: float, *, speed: float = 1.0, scene_hash: str = ""
 ) -> Recommendation:
-    """The settings for a scene, the best first.
+    """Rank the settings for a scene, the best first.
 
     Args:
-        runs: from `read_cost_runs`; those that were not alone count only where no other was.
-        scene: its name.
+        runs: runs from `read_cost_runs`; those that were not alone are used only if no run was alone.
+        scene: name of the scene.
         budget_s: seconds of training on this machine.
-        speed: seconds of the runs in a second of this machine (reference seconds: its calibration).
-        scene_hash: of the scene, to know its own runs by; empty = by name.
+        speed: seconds of the runs per second of this machine, see `speed_here`.
+        scene_hash: hash of the scene, to find its own runs; empty = they are found by name.
 
     Raises:
         AwError: no setting was trained within the budget.
@@ -84,8 +83,8 @@ def recommend(
     alone = [run for run in usable if run.timing.verdict == "alone"]
     notes = []
     if len(alone) < len(usable):
-        left = "left out" if alone else "all of them, used all the same"
-        notes.append(f"runs that were not alone, {left}: {why_unranked(usable)}")
+        use = "left out" if alone else "used, because no run was alone"
+        notes.append(f"runs that were not alone, {use}: {why_unranked(usable)}")
     usable = alone or usable
     own = [run for run in usable if (run.scene_hash == scene_hash if scene_hash else run.scene == scene)]
     reference = budget_s * speed
@@ -94,7 +93,7 @@ def recommend(
         shortest = min((run.train_s for run in usable), default=math.nan)
         raise AwError(
             f"no run was trained within {reference:.0f} s (the shortest took {shortest:.0f} s): "
-            "give a longer --budget, or runs of a shorter one: aw bench --budget 30s"
+            "give a longer --budget, or add runs with a shorter one: aw bench --budget 30s"
         )
     parts, rest = additive(values)
     if own and len(values) < 2:
@@ -109,9 +108,9 @@ def recommend(
 
 
 def value_at(curves: Sequence[Curve], scene: str, seconds: float) -> float:
-    """PSNR in dB of a setting after `seconds` of training on a scene, mean over seeds; NaN if not measured.
+    """Return the PSNR in dB of a setting after `seconds` of training, mean over seeds; NaN if not measured.
 
-    Between two lengths on a straight line over log time; after the longest as the longest.
+    It is interpolated between two lengths, linearly over log time, and constant after the longest.
     """
     ends = sorted(
         (summary(c, (scene,), lambda run: run.train_s).mean, summary(c, (scene,), lambda run: run.psnr).mean)
@@ -119,7 +118,7 @@ def value_at(curves: Sequence[Curve], scene: str, seconds: float) -> float:
         if c.on(scene)
     )
     ends = [(at, psnr) for at, psnr in ends if math.isfinite(at) and math.isfinite(psnr) and at > 0.0]
-    # a budget is met to within a step, and a machine's speed to within some percent
+    # trainings end up to a step after the budget, and a machine's speed is known to some percent
     early = [end for end in ends if end[0] <= 1.05 * seconds]
     if not early:
         return math.nan
@@ -128,40 +127,40 @@ def value_at(curves: Sequence[Curve], scene: str, seconds: float) -> float:
 
 
 def additive(values: dict[tuple[str, str], float]) -> tuple[dict[str, float], dict[str, float]]:
-    """PSNR by (setting, scene) as a part of the setting plus a part of the scene, by least squares.
+    """Split PSNR by (setting, scene) into a part of the setting plus a part of the scene, by least squares.
 
     Returns:
-        The part of each setting in dB, up to a constant; and the sample deviation over scenes of what both
-        parts leave, NaN for a setting of one scene.
+        The part of each setting in dB, up to a constant; and the sample deviation over scenes of the
+        residual, NaN for a setting with one scene.
     """
     names, scenes = (sorted({key[k] for key in values}) for k in range(2))
     rows = np.zeros((len(values), len(names) + len(scenes)))
     for k, (name, scene) in enumerate(values):
         rows[k, names.index(name)] = rows[k, len(names) + scenes.index(scene)] = 1.0
-    found = np.linalg.lstsq(rows, np.array(list(values.values())), rcond=None)[0]
-    left = np.array(list(values.values())) - rows @ found
-    rest = {
-        name: stats.spread([float(x) for x, key in zip(left, values) if key[0] == name]) for name in names
+    parts = np.linalg.lstsq(rows, np.array(list(values.values())), rcond=None)[0]
+    residual = np.array(list(values.values())) - rows @ parts
+    spread = {
+        name: stats.spread([float(x) for x, key in zip(residual, values) if key[0] == name]) for name in names
     }
-    return dict(zip(names, map(float, found))), rest
+    return dict(zip(names, map(float, parts))), spread
 
 
 def values_within(runs: Sequence[CostRun], seconds: float) -> dict[tuple[str, str], float]:
-    """PSNR within so many seconds, by (name of the setting, scene)."""
-    found = {}
+    """Return the PSNR that is reached within `seconds`, by (name of the setting, scene)."""
+    values = {}
     for name, curves in _curves_by_name(runs).items():
         for scene in sorted({s for curve in curves for s in curve.scenes}):
             value = value_at(curves, scene, seconds)
             if math.isfinite(value):
-                found[name, scene] = value
-    return found
+                values[name, scene] = value
+    return values
 
 
 def _curves_by_name(runs: Sequence[CostRun]) -> dict[str, list[Curve]]:
-    found: dict[str, list[Curve]] = {}
+    by_name: dict[str, list[Curve]] = {}
     for curve in curves_of(runs):
-        found.setdefault(curve.name, []).append(curve)
-    return found
+        by_name.setdefault(curve.name, []).append(curve)
+    return by_name
 
 
 def _choice(
@@ -193,13 +192,13 @@ def _choice(
 
 
 def words_of(run: CostRun) -> tuple[str, ...]:
-    """What of a run's command makes its setting: neither scene, seed nor length."""
+    """Return the arguments of a run's command that make its setting, without scene, seed and length."""
     try:
-        said = shlex.split(run.reproduce)[2:]
-    except ValueError:  # not a command of ours
-        said = []
+        arguments = shlex.split(run.reproduce)[2:]
+    except ValueError:  # not a command that this program wrote
+        arguments = []
     kept: list[str] = []
-    for flag, value in zip(said[::2], said[1::2]):
+    for flag, value in zip(arguments[::2], arguments[1::2]):
         if flag in _TAKEN:
             kept += [flag, run.asked if flag == "--effects" and run.asked in ("auto", "all") else value]
     if "--method" not in kept:
@@ -208,41 +207,37 @@ def words_of(run: CostRun) -> tuple[str, ...]:
     return tuple(kept)
 
 
-def in_words(found: Recommendation, scene: str) -> str:
-    """The recommendation for a terminal."""
-    best = found.choices[0]
-    machine = f"{_time(found.budget_s)} on this machine"
-    if not math.isclose(found.reference_s, found.budget_s, rel_tol=0.005):
-        machine += f" ({_time(found.reference_s)} of the reference machine)"
-    where = "measured on this scene" if found.own else f"mean over {best.scenes} measured scenes"
+def in_words(recommendation: Recommendation, scene: str) -> str:
+    """Return the recommendation as text for a terminal."""
+    best = recommendation.choices[0]
+    machine = f"{duration(recommendation.budget_s)} on this machine"
+    if not math.isclose(recommendation.reference_s, recommendation.budget_s, rel_tol=0.005):
+        machine += f" ({duration(recommendation.reference_s)} of the reference machine)"
+    where = "measured on this scene" if recommendation.own else f"mean over {best.scenes} measured scenes"
     lines = [
-        f"for {found.scene} within {machine}: {best.name}",
-        f"  {found.command(scene)}",
+        f"for {recommendation.scene} within {machine}: {best.name}",
+        f"  {recommendation.command(scene)}",
         f"  PSNR {best.psnr:.2f} dB ({where}), {best.ms_per_iteration:.1f} ms/iteration, "
         f"{best.gaussians:,.0f} Gaussians, {best.model_mb:.1f} MB, set-up {best.setup_s:.1f} s",
     ]
-    for other in found.choices[1:]:
+    for other in recommendation.choices[1:]:
         close = " (within the noise of a scene)" if other.behind < CLOSE_DB else ""
         lines.append(
             f"  {other.name}: {other.behind:.2f} dB less{close}, {other.gaussians:,.0f} Gaussians, "
             f"{other.model_mb:.1f} MB"
         )
-    return "\n".join([*lines, *found.notes]) + "\n"
+    return "\n".join([*lines, *recommendation.notes]) + "\n"
 
 
-def _time(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.3g} min"
-
-
-def speed_here(found: CostRuns, say: Callable[[str], None] = lambda text: None) -> float:
-    """Reference seconds in a second of this machine, by the calibration that the runs were timed with.
+def speed_here(cost_runs: CostRuns, say: Callable[[str], None] = lambda text: None) -> float:
+    """Return the reference seconds per second of this machine, by the calibration of the runs.
 
     Args:
-        found: the runs; their kernel says on which device.
-        say: told when kernels have to be compiled first.
+        cost_runs: the runs; their kernel decides on which device this machine is measured.
+        say: gets a line if kernels have to be compiled first.
 
     Raises:
-        AwError: the runs are of a GPU, and there is none here that can be used.
+        AwError: the runs used a GPU, and this machine has none that can be used.
     """
     import torch
 
@@ -250,7 +245,7 @@ def speed_here(found: CostRuns, say: Callable[[str], None] = lambda text: None) 
     from ambiguous_wild.splat.calibration import KERNELS, prepare_cpu
     from ambiguous_wild.splat.readiness import choose
 
-    kernels = {run.timing.kernel for run in found.runs if not run.error}
+    kernels = {run.timing.kernel for run in cost_runs.runs if not run.error}
     device = next((device for device, size in KERNELS.items() if size.name in kernels), "cpu")
     if device == "cpu":
         prepare_cpu(None, say)

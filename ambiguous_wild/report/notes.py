@@ -1,30 +1,30 @@
-"""Notes below a comparison: missing, failed and unfinished runs, results and times that do not compare."""
+"""Write the notes below a comparison: runs that are missing, failed, unfinished or not comparable."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core.config import flatten
-from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.result_file import Options
 from ambiguous_wild.harness.store import Runs, read_config
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 
-LENGTHS_DIFFER = 1.1  # a note is due where the longest training has this many times the shortest's steps
-REFERENCE = "reference_s"  # compares machines; other times compare runs of one machine
+LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps
+REFERENCE = "reference_s"  # comparable between machines; other times are not
 
 
 def notes(
     runs: Runs, columns: Sequence[Measure], methods: Sequence[str], scenes: Sequence[str]
 ) -> tuple[str, ...]:
-    """One line a fact, the gravest first."""
+    """Return all notes, one line each, the most serious first."""
     return (
         *unequal(runs.runs),
         *_mixed(runs.runs),
@@ -42,7 +42,7 @@ def notes(
     )
 
 
-UNEQUAL = "not comparable"  # begins a note that every format shows where it shows ranks
+UNEQUAL = "not comparable"  # begins a note that every format with ranks shows
 CONDITIONS = {
     "effects": "effects",
     "length": "lengths",
@@ -53,7 +53,7 @@ CONDITIONS = {
 
 
 def unequal(frame: pd.DataFrame) -> list[str]:
-    """A line for each condition that differs between the methods of a scene, and one for what all share.
+    """Return a line for each condition that differs between methods on a scene, and one for shared effects.
 
     Args:
         frame: `Runs.runs`.
@@ -63,17 +63,17 @@ def unequal(frame: pd.DataFrame) -> list[str]:
     for column, what in CONDITIONS.items():
         if column not in done:
             continue
-        known = done[done[column].astype(str) != ""]  # a method without features is not another condition
-        apart = [scene for scene, of in known.groupby("scene") if of[column].astype(str).nunique() > 1]
+        given = done[done[column].astype(str) != ""]  # a method without features is not another condition
+        apart = [scene for scene, of in given.groupby("scene") if of[column].astype(str).nunique() > 1]
         if apart:
-            rows = known[known["scene"].isin(apart)].groupby("method")[column]
+            rows = given[given["scene"].isin(apart)].groupby("method")[column]
             each = [f"{method}: {_shared(values)}" for method, values in rows]
             lines.append(
                 f"{UNEQUAL}: {what} differ on {shortlist(map(str, apart))}: {shortlist(each, limit=12)}; a "
                 "rank may be due to this and not to the method"
             )
-        elif column == "effects" and len(known):
-            scenes = known.groupby("scene")[column].first()
+        elif column == "effects" and len(given):
+            scenes = given.groupby("scene")[column].first()
             each = [f"{names} ({shortlist(of.index)})" for names, of in scenes.groupby(scenes)]
             all_of = str(scenes.iloc[0]) if len(each) == 1 else "; ".join(each)
             lines.append(f"all methods trained with effects: {all_of}")
@@ -81,7 +81,7 @@ def unequal(frame: pd.DataFrame) -> list[str]:
 
 
 def _mixed(frame: pd.DataFrame) -> list[str]:
-    """A line for each reason to doubt test photos, with the scenes."""
+    """Return a line for each reason to doubt test photos, with the scenes."""
     rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
     return [f"{reason} ({shortlist(sorted(set(of['scene'])))})" for reason, of in rows.groupby("test_photos")]
 
@@ -100,11 +100,11 @@ def _absent(runs: Runs, methods: Sequence[str], scenes: Sequence[str]) -> list[s
     # methods that lack the same scenes share a line
     lacking: dict[tuple[str, ...], list[str]] = {}
     for method in methods:
-        if gone := tuple(scene for scene in scenes if (method, scene) not in done):
-            lacking.setdefault(gone, []).append(method)
+        if absent := tuple(scene for scene in scenes if (method, scene) not in done):
+            lacking.setdefault(absent, []).append(method)
     return [
-        f"no result: {', '.join(names)} on {shortlist(gone)}; no mean over scenes"
-        for gone, names in lacking.items()
+        f"no result: {', '.join(names)} on {shortlist(absent)}; no mean over scenes"
+        for absent, names in lacking.items()
     ]
 
 
@@ -112,15 +112,15 @@ def _not_ranked(runs: Runs) -> list[str]:
     done = set(zip(runs.runs["method"], runs.runs["scene"]))
     open_runs = Counter((i.method, i.scene) for i in runs.incomplete)
     return [
-        f"not ranked: {method} on {scene}: {count} run{'' if count == 1 else 's'} of it incomplete"
+        f"not ranked: {method} on {scene}: {counted(count, 'run')} incomplete"
         for (method, scene), count in open_runs.items()
         if (method, scene) in done
     ]
 
 
 def _references(methods: Sequence[str]) -> list[str]:
-    known = [method for method in methods if knows_truth(method)]
-    return [f"references, not ranked: {shortlist(known)} (exact masks or clean photos)"] if known else []
+    names = [method for method in methods if knows_truth(method)]
+    return [f"references, not ranked: {shortlist(names)} (exact masks or clean photos)"] if names else []
 
 
 FITTED = {
@@ -133,7 +133,7 @@ FITTED = {
 
 
 def _fitted(runs: Runs) -> list[str]:
-    """What every method was allowed to see of test photos; nothing where no run was allowed anything."""
+    """Return what each method used of test photos; no lines if all runs were measured on whole photos."""
     ok = runs.runs[runs.runs["status"] == "ok"]
     if "fit" not in ok or not len(ok) or set(ok["fit"]) == {"full"}:
         return []
@@ -146,20 +146,20 @@ def _fitted(runs: Runs) -> list[str]:
 
 
 def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
-    """What each method, or donor of a graft, says about itself; `{key}` stands for an option of its runs."""
-    known = all_methods()
+    """Return the note of each method, and of each donor of a graft, with the options of its runs."""
+    entries = all_methods()
     lines = []
     for name in dict.fromkeys(member for method in methods for member in members(method)):
-        if name not in known or not known[name].note:
+        if name not in entries or not entries[name].note:
             continue
         own = runs.runs[[name in members(method) for method in runs.runs["method"]]]
         options = [_options_of(Path(folder), name) for folder in own["folder"]]
-        lines.append(f"{name}: {known[name].about(options)}")
+        lines.append(f"{name}: {entries[name].about(options)}")
     return lines
 
 
-def _options_of(folder: Path, name: str) -> dict[str, Any]:
-    """The options of that method in a run, flat; those of a graft stand below its places."""
+def _options_of(folder: Path, name: str) -> Options:
+    """Return the options of a method in a run, by dotted names; a graft has them below its places."""
     config = read_config(folder)
     options = config.get("options")
     if not isinstance(options, dict):
@@ -175,7 +175,7 @@ def _options_of(folder: Path, name: str) -> dict[str, Any]:
 
 
 def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
-    """One line a metric and reason; names the runs unless it concerns all of them."""
+    """Return a line for each metric and reason; it names the runs unless all of them are concerned."""
     lines = []
     ok = runs.runs[runs.runs["status"] == "ok"]
     for column in columns:
@@ -184,31 +184,31 @@ def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
             names = [f"{r.method} on {r.scene}" for r in group.itertuples()]
             who = "" if len(group) >= len(ok) else f" for {shortlist(dict.fromkeys(names))}"
             lines.append(f"missing: {column.key}{who}: {reason}")
-        # A null without a reason must not pass in silence.
-        told = set(zip(rows["scene"], rows["method"], rows["seed"]))
+        # runs without a value and without a reason have a line too
+        explained = set(zip(rows["scene"], rows["method"], rows["seed"]))
         images = runs.images[runs.images["metric"] == column.key]
-        have = told | set(zip(images["scene"], images["method"], images["seed"]))
+        have = explained | set(zip(images["scene"], images["method"], images["seed"]))
         others = [r for r in ok.itertuples() if (r.scene, r.method, r.seed) not in have]
         if len(images) and others:
             who = shortlist(dict.fromkeys(f"{r.method} on {r.scene}" for r in others))
-            lines.append(f"missing: {column.key} for {who}: not measured there; 'aw rescore' adds it")
+            lines.append(f"missing: {column.key} for {who}: it was not measured; 'aw rescore' adds it")
         gaps = images[images["value"].isna()]
-        silent = [r for r in gaps.itertuples() if (r.scene, r.method, r.seed) not in told]
-        if silent:
-            names = [f"{r.image} ({r.method} on {r.scene})" for r in silent]
+        unexplained = [r for r in gaps.itertuples() if (r.scene, r.method, r.seed) not in explained]
+        if unexplained:
+            names = [f"{r.image} ({r.method} on {r.scene})" for r in unexplained]
             lines.append(f"missing: {column.key}, no reason given, for {shortlist(names)}")
     return lines
 
 
 def _infinite(runs: Runs, columns: Sequence[Measure]) -> list[str]:
-    """One line a metric, method and scene of whose mean some values are no part."""
+    """Return a line for each metric, method and scene whose mean leaves out values that are not finite."""
     rows = runs.images[runs.images["metric"].isin([c.key for c in columns])]
     lines = []
     for (metric, method, scene), of in rows.groupby(["metric", "method", "scene"]):
         finite = int(np.isfinite(of["value"].dropna()).sum())
         if finite < of["value"].notna().sum():
             count = f"{finite} of {len(of)} values"
-            lines.append(f"{metric} of {method} on {scene}: mean of {count}, the others are not finite")
+            lines.append(f"{metric} of {method} on {scene}: mean of {count}; the others are not finite")
     return lines
 
 
@@ -242,20 +242,20 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
 
 
 def untimed(frame: pd.DataFrame) -> dict[tuple[str, str], str]:
-    """(method, scene) -> why its times are not ranked: one of its runs was not alone, or not calibrated.
+    """Return by (method, scene) why times are not ranked: a run was not alone, or not calibrated.
 
     Args:
         frame: `Runs.runs`.
     """
     done = frame[frame["status"] == "ok"]
-    found: dict[tuple[str, str], str] = {}
+    reasons: dict[tuple[str, str], str] = {}
     for row in done[done["timing"] != "alone"].itertuples():
-        found.setdefault((str(row.method), str(row.scene)), f"{row.timing}: {row.timing_reason}")
-    return found
+        reasons.setdefault((str(row.method), str(row.scene)), f"{row.timing}: {row.timing_reason}")
+    return reasons
 
 
 def incomparable(frame: pd.DataFrame, columns: Sequence[Measure]) -> frozenset[str]:
-    """Keys of timed columns whose values come from machines, or calibrations, that differ."""
+    """Return the keys of timed columns whose values come from different machines or calibrations."""
     alone = frame[(frame["status"] == "ok") & (frame["timing"] == "alone")]
     differ = {
         REFERENCE: alone["timing_kernel"].nunique() > 1,
@@ -265,7 +265,7 @@ def incomparable(frame: pd.DataFrame, columns: Sequence[Measure]) -> frozenset[s
 
 
 def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
-    """One line a reason for times that are not ranked."""
+    """Return a line for each reason why times are not ranked."""
     if not any(c.timed for c in columns):
         return []
     reasons: dict[str, list[str]] = {}
@@ -280,7 +280,7 @@ def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
     if unranked - {REFERENCE}:
         machines = sorted(set(frame[frame["timing"] == "alone"]["hardware"]))
         lines.append(
-            f"times of different machines, ranked by reference seconds alone: {shortlist(machines, 4)}"
+            f"times of different machines are ranked by reference seconds only: {shortlist(machines, 4)}"
         )
     if REFERENCE in unranked:
         lines.append("reference seconds of CPU and GPU are not ranked against each other")

@@ -1,4 +1,4 @@
-"""Comparisons side by side: the papers' tables, means over datasets, memory."""
+"""Tables in the form of papers: scenes side by side, means over datasets, rows with reported numbers."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ import numpy as np
 import pandas as pd
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.harness.store import Runs
+from ambiguous_wild.harness.store import Runs, check_names
 from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, Number, read_tables
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.report.table import BLANK, Cell, Column, Row, Table
 
-PER_TABLE = 6  # scenes side by side, as the papers have it
+PER_TABLE = 6  # scenes side by side, as in the papers
 LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
 MEMORY = ("model_mb",)
 
 
 def in_blocks(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> list[Table]:
-    """Tables of `comparison`, a table a scene, with the cells marked that do not differ from the best."""
+    """Return the tables of `comparison`, with cells marked that do not differ from the best."""
     tables = comparison(runs, metrics=metrics, scenes=scenes)
     return Ties(runs).marked(tables, [table.title for table in tables if table.columns[0].scene])
 
@@ -37,20 +36,20 @@ def paper(
     per_table: int = PER_TABLE,
     subject: str = "",
 ) -> list[Table]:
-    """Scenes side by side, PSNR / SSIM / LPIPS under each, the mean last.
+    """Return tables with scenes side by side, PSNR / SSIM / LPIPS under each, and the mean last.
 
     Args:
         runs: from `store.read_runs`.
         metrics: columns under each scene; empty = PSNR, SSIM and the LPIPS that was measured.
-        scenes: only these; empty = all.
-        datasets: scenes by dataset: each has tables and a mean of its own; what is in none comes last.
-        per_table: more scenes than this go into several tables; the mean stands in the last.
-        subject: what the tables are of, where the columns do not say it.
+        scenes: names of scenes to show; empty = all.
+        datasets: scenes by dataset. Each dataset has its own tables and mean; other scenes come last.
+        per_table: most scenes of a table; more are divided into several tables, with the mean in the last.
+        subject: subject of the tables, for their titles.
 
     Raises:
         AwError: unknown metric, scene, or a scene in two datasets.
     """
-    ties, made, begin = Ties(runs), [], f"{subject}, " if subject else ""
+    ties, parts, begin = Ties(runs), [], f"{subject}, " if subject else ""
     for name, members in divided(runs, scenes, datasets or {}).items():
         tables = comparison(
             runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
@@ -63,8 +62,8 @@ def paper(
             part = f" ({number} of {len(chunks)})" if len(chunks) > 1 else ""
             shown = [(table.title, table) for table in chunk]
             shown += [("Mean", table) for table in mean if number == len(chunks)]
-            made.append(side_by_side(title + part, shown, dataset=name).with_notes(*tables[-1].notes))
-    return made
+            parts.append(side_by_side(title + part, shown, dataset=name).with_notes(*tables[-1].notes))
+    return parts
 
 
 def means(
@@ -74,7 +73,7 @@ def means(
     scenes: Sequence[str] = (),
     datasets: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Table]:
-    """One table: the mean over each dataset's scenes side by side; arguments as for `paper`."""
+    """Return one table with the means over each dataset's scenes side by side; arguments as for `paper`."""
     ties = Ties(runs)
     parts: list[Table] = []
     notes: dict[str, None] = {}
@@ -94,16 +93,16 @@ def means(
 
 
 def side_by_side(title: str, tables: Sequence[tuple[str, Table]], *, dataset: str = "") -> Table:
-    """One table of tables with the same rows.
+    """Join tables with the same rows to one table.
 
     Args:
-        title: of the table.
-        tables: (heading of its columns, table), from the left; their notes are left out.
-        dataset: that the scenes belong to.
+        title: title of the table.
+        tables: (heading of the columns, table), from left to right; their notes are left out.
+        dataset: dataset of the scenes.
     """
     shown, rows = [], []
     for number, (group, table) in enumerate(tables, start=1):
-        # words about a row stand once, at its end
+        # text columns about a row are kept once, in the last table
         own = [i for i, c in enumerate(table.columns) if not c.words or number == len(tables)]
         shown.append((group, table.picked(own)))
     tables = shown
@@ -119,7 +118,7 @@ def side_by_side(title: str, tables: Sequence[tuple[str, Table]], *, dataset: st
 
 
 def cost_at_the_end(tables: Sequence[Table]) -> Table:
-    """Tables of `comparison` as one without a title: quality scene by scene, the mean last, then cost."""
+    """Join tables of `comparison` to one without a title: quality by scene, then the mean, then cost."""
     ordered = [*tables[1:], tables[0]] if len(tables) > 1 else list(tables)
     numbers = range(len(tables[0].columns))
     quality = [i for i in numbers if tables[0].columns[i].measure.quality]
@@ -133,15 +132,13 @@ def cost_at_the_end(tables: Sequence[Table]) -> Table:
 def divided(
     runs: Runs, scenes: Sequence[str], datasets: Mapping[str, Sequence[str]]
 ) -> dict[str, tuple[str, ...]]:
-    """The scenes by dataset, in the order given; those of none under "".
+    """Return the scenes by dataset, in the given order; those without a dataset under "".
 
     Raises:
-        AwError: an unknown scene, or one in two datasets.
+        AwError: an unknown scene, or a scene in two datasets.
     """
-    known = sorted(set(runs.runs["scene"]) | {i.scene for i in runs.incomplete})
-    for name in [*scenes, *(s for members in datasets.values() for s in members)]:
-        if name not in known:
-            raise unknown("scene", name, known)
+    present = sorted(set(runs.runs["scene"]) | {i.scene for i in runs.incomplete})
+    check_names("scene", [*scenes, *(s for members in datasets.values() for s in members)], present)
     wanted = list(dict.fromkeys(scenes)) or sorted(set(runs.runs["scene"]))
     of: dict[str, str] = {}
     for dataset, members in datasets.items():
@@ -150,12 +147,12 @@ def divided(
                 raise AwError(
                     f"scene {scene!r} is in two datasets, {of[scene]!r} and {dataset!r}: leave one out"
                 )
-    found = {name: tuple(s for s in wanted if of.get(s, "") == name) for name in [*datasets, ""]}
-    return {name: members for name, members in found.items() if members}
+    by_dataset = {name: tuple(s for s in wanted if of.get(s, "") == name) for name in [*datasets, ""]}
+    return {name: members for name, members in by_dataset.items() if members}
 
 
 def quality_columns(runs: Runs) -> tuple[str, ...]:
-    """PSNR, SSIM and the first LPIPS that was measured; without any, the one that says why it is missing."""
+    """Return PSNR, SSIM and the first LPIPS that was measured, or else the first with a row for it."""
     measured = set(runs.images.dropna(subset=["value"])["metric"])
     present = measured | set(runs.images["metric"])
     lpips = next((k for k in LPIPS if k in measured), next((k for k in LPIPS if k in present), ""))
@@ -163,25 +160,25 @@ def quality_columns(runs: Runs) -> tuple[str, ...]:
 
 
 def _cells(part: Table, method: str) -> tuple[Cell, ...]:
-    found = [row.cells for row in part.rows if row.name == method]
-    return found[0] if found else tuple(Cell(state="absent") for _ in part.columns)
+    absent = tuple(Cell(state="absent") for _ in part.columns)
+    return next((row.cells for row in part.rows if row.name == method), absent)
 
 
 LEVEL = 0.95
 RESAMPLES = 2000
-LEAST = 6  # images: five differences all have the same sign by chance once in 16
+LEAST = 6  # images; five differences have the same sign by chance once in 16 times
 
 
 def difference_interval(
-    differences: Sequence[np.ndarray],  # one a scene: [n], a method less another on the same images
+    differences: Sequence[np.ndarray],  # of each scene: [n], one method minus another on the same images
     *,
     level: float = LEVEL,
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean over scenes of the mean over images.
+    """Return the percentile bootstrap interval of the mean over scenes of the mean over images.
 
-    Images are drawn within their scene. NaN where a value is missing or a scene has fewer than two images.
+    Images are drawn within their scene. It is NaN if a value is missing or a scene has less than two images.
     """
     if not differences or any(len(d) < 2 or not np.isfinite(d).all() for d in differences):
         return math.nan, math.nan
@@ -197,10 +194,10 @@ def difference_interval(
 
 
 class Ties:
-    """Methods that do not differ significantly from the best: a paired bootstrap over the test images.
+    """Find methods that do not differ significantly from the best, by a paired bootstrap over test images.
 
-    The same pictures are drawn for both methods, scene by scene, so that a hard picture affects both alike.
-    Seeds are averaged before; no correction is made for the number of methods that are compared.
+    The same images are drawn for both methods, scene by scene, so that a hard image affects both alike.
+    Seeds are averaged before. There is no correction for the number of compared methods.
     """
 
     def __init__(self, runs: Runs) -> None:
@@ -208,7 +205,7 @@ class Ties:
         self._values: dict[tuple[str, str], pd.DataFrame] = {}
 
     def values(self, scene: str, metric: str) -> pd.DataFrame:
-        """A row an image, a column a method: means over seeds, NaN where a seed has none."""
+        """Return means over seeds, a row for each image, a column for each method; NaN if a seed has none."""
         key = (scene, metric)
         if key not in self._values:
             if key not in self._rows:
@@ -219,9 +216,9 @@ class Ties:
         return self._values[key]
 
     def marked(self, tables: Sequence[Table], scenes: Sequence[str]) -> list[Table]:
-        """Tables of `comparison` with the cells marked that do not differ from the best of their column.
+        """Mark the cells of `comparison` tables that do not differ from the best of their column.
 
-        `scenes`: that a mean is over.
+        `scenes` are those of the means.
         """
         return [
             replace(table, rows=tuple(self._marked(row, table, scenes) for row in table.rows))
@@ -242,15 +239,17 @@ class Ties:
         return replace(row, cells=tuple(cells))
 
     def tied(self, best: str, other: str, scenes: Sequence[str], metric: str) -> bool:
-        """Whether the interval of their difference holds zero, or it is of too few images to tell; False
-        where it is not known."""
+        """Return whether the interval of the difference contains zero, or there are too few images.
+
+        It is False if the interval is unknown.
+        """
         differences = []
         for scene in scenes:
             values = self.values(scene, metric)
             if best not in values or other not in values:
                 return False
             a, b = values[best].to_numpy(float), values[other].to_numpy(float)
-            finite = ~(np.isinf(a) | np.isinf(b))  # what enters no mean decides no difference of means
+            finite = ~(np.isinf(a) | np.isinf(b))  # means leave out infinite values, so differences do too
             differences.append((a - b)[finite])
         low, high = difference_interval(differences)
         few = sum(map(len, differences)) < LEAST and not math.isnan(low)
@@ -258,36 +257,36 @@ class Ties:
 
 
 FAMILIES = ("psnr", "ssim", "lpips")
-NAMES = {"model_mb": "memory"}  # a measure -> how papers call it
+NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
 
 def read_reported(folder: Path | None = None) -> list[Number]:
-    """The transcribed tables.
+    """Read the numbers transcribed from papers.
 
     Raises:
-        AwError: there are none, or one cannot be read.
+        AwError: there are none, or a file cannot be read.
     """
     folder = folder or REPORTED
     if not folder.exists():
-        raise AwError(f"no reported numbers in {folder}: say where they are with --reported-from")
+        raise AwError(f"no reported numbers in {folder}: name their folder with --reported-from")
     return read_tables([folder])
 
 
 def datasets_of(numbers: Sequence[Number], scenes: Sequence[str]) -> dict[str, list[str]]:
-    """Our scenes by the dataset that a reported table has a scene of this name in."""
-    of = {_plain(n.scene): n.dataset for n in numbers if n.known}
-    found: dict[str, list[str]] = {}
+    """Group our scenes by the dataset in which a reported table has a scene of the same name."""
+    dataset_of = {_normalised(n.scene): n.dataset for n in numbers if n.known}
+    datasets: dict[str, list[str]] = {}
     for scene in scenes:
-        if _plain(scene) in of:
-            found.setdefault(of[_plain(scene)], []).append(scene)
-    return found
+        if _normalised(scene) in dataset_of:
+            datasets.setdefault(dataset_of[_normalised(scene)], []).append(scene)
+    return datasets
 
 
 def with_reported(table: Table, numbers: Sequence[Number]) -> Table:
-    """The table with a row for every method that some paper reports on what it shows.
+    """Add a row for every method that a paper reports on the table's scenes and metrics.
 
-    Only methods as published: a row of an ablation has no place here. Where tables contradict each other,
-    all their values are shown. A paper's mean over a dataset stands under ours, over the same scenes or not.
+    Only methods as published are added, no rows of ablations. Where papers contradict each other, all values
+    are shown. A paper's mean over a dataset is shown under ours even if its scenes differ.
 
     Args:
         table: a table of `papers`.
@@ -296,30 +295,29 @@ def with_reported(table: Table, numbers: Sequence[Number]) -> Table:
     texts: dict[tuple[str, str, str], dict[str, list[str]]] = {}  # (method, scene, metric) -> by dataset
     for n in numbers:
         if n.known and not n.setting:
-            texts.setdefault((n.method, _plain(n.scene), n.metric), {}).setdefault(n.dataset, []).append(
-                n.text
-            )
+            by_dataset = texts.setdefault((n.method, _normalised(n.scene), n.metric), {})
+            by_dataset.setdefault(n.dataset, []).append(n.text)
     rows = []
     for method in dict.fromkeys(key[0] for key in texts):
         cells = tuple(_cell(texts, method, column) for column in table.columns)
         if any(cell.printed for cell in cells):
             rows.append(Row(method, cells, kind="reported"))
     if not rows:
-        return table.with_notes("reported: no table has these scenes")
+        return table.with_notes("reported: no paper's table has these scenes")
     return replace(table, rows=(*table.rows, *rows))
 
 
 def _cell(texts: Mapping[tuple[str, str, str], Mapping[str, list[str]]], method: str, column: Column) -> Cell:
     family = column.measure.key.partition("_")[0]
     metric = NAMES.get(column.measure.key, family if family in FAMILIES else "")
-    by_dataset = texts.get((method, _plain(column.scene or MEAN), metric), {})
+    by_dataset = texts.get((method, _normalised(column.scene or MEAN), metric), {})
     if column.dataset:
-        found = by_dataset.get(column.dataset, [])
-    else:  # a scene is told by its name alone, a mean is not
-        found = [text for of in by_dataset.values() for text in of] if column.scene else []
-    return Cell(printed=" / ".join(dict.fromkeys(found))) if found else BLANK
+        values = by_dataset.get(column.dataset, [])
+    else:  # the name identifies a scene without its dataset, but not a mean
+        values = [text for of in by_dataset.values() for text in of] if column.scene else []
+    return Cell(printed=" / ".join(dict.fromkeys(values))) if values else BLANK
 
 
-def _plain(name: str) -> str:
-    """A scene's name without what its spellings differ in."""
+def _normalised(name: str) -> str:
+    """Return a scene's name in lower case with letters and digits only, as its spelling varies."""
     return "".join(c for c in name.casefold() if c.isalnum())

@@ -1,7 +1,7 @@
-"""Tables for a terminal, as Markdown and as CSV.
+"""Write tables as text for a terminal, as Markdown and as CSV.
 
-Names of methods and scenes come from others' files: in every format they stay text. Control characters
-and invisible direction marks are written out, so that a name cannot steer a terminal either.
+Names of methods and scenes come from other people's files. In every format they remain text: control
+characters and invisible direction marks are escaped, so that a name cannot control a terminal either.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ COLORS = {1: "green", 2: "cyan", 3: "yellow"}  # of the terminal
 
 
 def plain(text: str) -> str:
-    """The text on one line, with control and format characters written as escapes."""
+    """Return the text on one line, with control and format characters escaped."""
     hidden = ("Cc", "Cf", "Zl", "Zp", "Cs")
     return "".join(
         c.encode("unicode_escape").decode() if unicodedata.category(c) in hidden else c for c in str(text)
@@ -33,24 +33,24 @@ def plain(text: str) -> str:
 
 
 def display_width(text: str) -> int:
-    """Columns of a terminal: wide characters take two, combining ones none."""
+    """Return the width in columns of a terminal: wide characters take two, combining ones none."""
     wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
     return len(text) + wide - sum(unicodedata.combining(c) > 0 for c in text)
 
 
 def marked(cell: Cell, measure: Measure) -> str:
-    """The cell with its rank and whether it is told apart from the best."""
+    """Return the cell's text with its rank and the mark of a tie with the best."""
     text = plain(cell.text(measure))
     return text + (f" ({cell.rank})" if cell.rank else "") + (f" {TIE}" if cell.tie else "")
 
 
 def row_name(row: Row) -> str:
-    """What stands in front of a row of text."""
+    """Return the name of a row; reported rows are indented."""
     return plain(f"  {row.name}" if row.kind == "reported" else row.name)
 
 
 def to_text(tables: Sequence[Table], *, color: bool = False) -> str:
-    """Aligned for a terminal; with `color`, the three best are coloured."""
+    """Return tables as aligned text; with `color`, the three best are coloured."""
     parts = []
     for table, below in _with_below(tables):
         parts += [plain(table.title), *_aligned(table, color), ""]
@@ -59,7 +59,7 @@ def to_text(tables: Sequence[Table], *, color: bool = False) -> str:
 
 
 def _with_below(tables: Sequence[Table]) -> Iterator[tuple[Table, list[str]]]:
-    """Every table with the lines below it: what its marks mean, and notes."""
+    """Yield every table with the lines below it: the meaning of its marks, and notes."""
     before: list[Table] = []
     for table in tables:
         before.append(table)
@@ -83,7 +83,7 @@ def _aligned(table: Table, color: bool) -> list[str]:
     for title, count in table.groups:
         room = sum(widths[at : at + count]) + 2 * (count - 1)
         name = plain(title)
-        if display_width(name) > room:  # a long name makes room for itself
+        if display_width(name) > room:  # a long name widens its first column
             widths[at] += display_width(name) - room
             room = display_width(name)
         top.append(name + " " * (room - display_width(name)))
@@ -111,7 +111,7 @@ def _text_row(cells: Sequence[str], widths: Sequence[int], ranks: Sequence[int |
 
 
 def to_markdown(tables: Sequence[Table]) -> str:
-    """GitHub tables; the best of a column is bold, the three best are numbered."""
+    """Return tables as GitHub Markdown; the best of a column is bold, the three best are numbered."""
     parts = []
     for table, below in _with_below(tables):
         parts += [f"**{markdown_text(table.title)}**", ""] if table.title else []
@@ -130,10 +130,10 @@ def to_markdown(tables: Sequence[Table]) -> str:
 
 
 def markdown_text(text: str) -> str:
-    """Escaped for a GitHub table: neither HTML, nor a link, nor a new column."""
+    """Return the text escaped for a GitHub table: it cannot make HTML, a link or a new column."""
     text = plain(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     text = re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", text)
-    # A scheme makes a link without any bracket.
+    # GitHub makes links of addresses without any brackets
     return re.sub(r"(?i)\b(https?|ftp|www)(:|\.)", r"\1&#8203;\2", text)
 
 
@@ -152,23 +152,23 @@ def _markdown(cell: Cell, column: Column) -> str:
 
 
 def _markdown_cell(text: str) -> str:
-    """Numbers and intervals unchanged; everything else escaped."""
+    """Return numbers and intervals unchanged, everything else escaped."""
     return text if re.fullmatch(r"[-\d.,%\[\]{}— ]*", text) else markdown_text(text)
 
 
 def csv_text(text: str) -> str:
-    """A cell that a spreadsheet takes for text: a leading formula character gets an apostrophe."""
+    """Return a cell that spreadsheets take for text: a leading formula character gets an apostrophe."""
     text = plain(text) if not str(text).startswith("\t") else "'" + plain(text)
     return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") else text
 
 
 def exact(value: float) -> str:
-    """Digits that read back as the same number: 3.0 for 3.0."""
+    """Return digits that read back as the same number: 3.0 for 3.0."""
     return repr(float(value))
 
 
 def shortest(value: float) -> str:
-    """The fewest digits that read back as the same number: 3 for 3.0."""
+    """Return the fewest digits that read back as the same number: 3 for 3.0."""
     whole = math.isfinite(value) and value == int(value) and abs(value) < 2**53
     return str(int(value)) if whole else exact(value)
 
@@ -180,13 +180,13 @@ def to_csv(
     text: Callable[[str], str] = csv_text,
     number: Callable[[float], str] = exact,
 ) -> str:
-    """CSV of texts, numbers, yes and no; None and NaN are empty cells, so that what is missing is no number.
+    """Return CSV of texts, numbers, yes and no; None and NaN become empty cells.
 
     Args:
         head: names of the columns.
-        rows: one value a column.
-        text: guards a text against spreadsheets that calculate it.
-        number: writes a float.
+        rows: values, one for each column.
+        text: escapes a text that a spreadsheet would calculate.
+        number: formats a float.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -211,16 +211,16 @@ def _csv_cell(value: Any, text: Callable[[str], str], number: Callable[[float], 
 def read_csv(
     path: Path, required: Sequence[str], most_bytes: int, advice: str
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-    """Columns, and (line, cells by column) of each row; cells as they stand.
+    """Read a CSV file; return its columns, and (line, cells by column) of each row, cells unchanged.
 
     Args:
         path: the file.
         required: columns that it must have.
         most_bytes: a larger file is not read.
-        advice: ends an error.
+        advice: end of every error message.
 
     Raises:
-        AwError: unreadable, malformed, or without a column that must be there.
+        AwError: the file is unreadable or malformed, or lacks a required column.
     """
     try:
         if path.stat().st_size > most_bytes:
@@ -236,7 +236,7 @@ def read_csv(
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror}") from None
     missing = [column for column in required if column not in head]
-    named = [column for column in head if column]  # spreadsheets write empty ones at the end
+    named = [column for column in head if column]  # spreadsheets add columns without a name at the end
     if missing or len(set(named)) != len(named):
         what = f"lacks the column {shortlist(missing)}" if missing else "names a column twice"
         raise AwError(f"{path} {what}; {advice}")
@@ -251,7 +251,7 @@ LONG_HEAD = ("table", "kind", "method", "dataset", "column", "scene", "metric", 
 
 
 def to_long_csv(tables: Sequence[Table]) -> str:
-    """One number a row. What was measured has a value, what a paper prints is under `printed` alone."""
+    """Return CSV with one number per row; measured numbers have a value, reported ones only `printed`."""
     rows = (
         (
             table.title, row.kind, row.name, column.dataset, column.group, column.scene, column.measure.key,
@@ -267,10 +267,10 @@ def to_long_csv(tables: Sequence[Table]) -> str:
 
 
 def to_wide_csv(tables: Sequence[Table]) -> str:
-    """One row a scene and method; the mean has an empty scene. The tables have the same columns.
+    """Return CSV with one row per scene and method, for tables with the same columns; means have no scene.
 
-    For every column: the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 %
-    bootstrap interval over the test images of one scene, and `_tied`, yes where not told from the best.
+    Every column has the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 % bootstrap
+    interval over the test images of one scene, and `_tied`, "yes" if not significantly below the best.
     """
     head = ["scene", "method", "status", "runs"]
     for column in tables[0].columns:
@@ -297,7 +297,7 @@ def _status(row: Row) -> str:
 
 
 WIDTH = 100
-# What is shown first; what is not listed comes after, in the order of the table.
+# The most important columns; others follow in the order of the table.
 FIRST = (
     "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
     "flip", "fps", "model_mb",
@@ -305,7 +305,7 @@ FIRST = (
 
 
 def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
-    """Tables of the same columns with the most important ones that fit, in their order.
+    """Reduce tables with the same columns to the most important ones that fit, in their order.
 
     A note below the last table names the others. At least one column is kept, however long the names are.
     """
@@ -330,12 +330,12 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
 
 def _importance(column: Measure) -> int:
     if column.per_image and column.key not in MEASURES:
-        return 0  # who measures by a metric of their own wants to see it
+        return 0  # a user's own metric comes first
     return FIRST.index(column.key) if column.key in FIRST else len(FIRST)
 
 
 def divided(table: Table, width: int = WIDTH) -> list[Table]:
-    """The table as tables that fit: columns of one heading stay together where they can."""
+    """Divide the table into tables that fit; columns with one heading stay together if possible."""
     room = width - max(map(display_width, [table.head, *map(row_name, table.rows)]))
     parts: list[list[int]] = [[]]
     left, at = room, 0
@@ -357,7 +357,7 @@ def divided(table: Table, width: int = WIDTH) -> list[Table]:
 
 
 def _part(table: Table, columns: list[int], k: int, count: int) -> Table:
-    """Notes stand below the last part."""
+    """Return part `k` of a table; only the last part has notes."""
     title = f"{table.title}, part {k + 1} of {count}" if count > 1 else table.title
     return replace(table.picked(columns), title=title, notes=table.notes if k == count - 1 else ())
 

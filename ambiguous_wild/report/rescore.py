@@ -1,6 +1,6 @@
-"""Metrics that were missing when a run ended, computed from its saved pictures; nothing is trained.
+"""Add metrics that a run lacks, computed from its saved pictures; nothing is trained.
 
-Before anything is added, every number of the result is computed again from renders and photos. Where one
+Before anything is added, every number of the result is computed again from renders and photos. If one
 differs, a file was changed since, and the run is refused.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
@@ -24,7 +24,7 @@ from ambiguous_wild.harness.result_file import (
     read_result,
     write_result,
 )
-from ambiguous_wild.harness.store import lacks, read_config, run_folders
+from ambiguous_wild.harness.store import find_runs, lacks, read_config
 from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
@@ -35,12 +35,12 @@ Outcome = Literal["rescored", "complete", "unfinished", "refused"]
 
 @dataclass(frozen=True)
 class Rescored:
-    """What became of one run."""
+    """The outcome of one run."""
 
     run: Path
     outcome: Outcome
-    added: tuple[str, ...] = ()  # metrics
-    missing: tuple[str, ...] = ()  # that are still missing
+    added: tuple[str, ...] = ()  # metrics that were added
+    missing: tuple[str, ...] = ()  # metrics that are still missing
     error: str = ""
 
 
@@ -50,48 +50,43 @@ def rescore(
     scene: Path | None = None,
     tick: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Rescored]:
-    """Add what can be measured now to every run below the folders.
+    """Add the metrics that can be measured now to every run below the folders.
 
     Args:
-        folders: of `aw bench`, or folders of such folders.
+        folders: outputs of `aw bench`, or folders of them.
         scene: where the scene lies now; None = where each run says.
-        tick: told (runs done, runs) after each.
+        tick: called with (runs done, runs) after each run.
 
     Raises:
         AwError: no such folder, or no run in it.
     """
-    runs: dict[Path, Path] = {}
-    for root in folders:
-        if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
-        runs |= {run.resolve(): run for run in run_folders(root)}
+    runs = find_runs(folders)
     if not runs:
         raise AwError(f"no run in {', '.join(map(str, folders))}: 'aw bench -o' makes one")
-    found, scenes = [], _Scenes(scene)
-    for done, run in enumerate(runs.values(), 1):
+    outcomes, scenes = [], _Scenes(scene)
+    for done, run in enumerate(runs, 1):
         try:
-            found.append(_rescore(run, scenes))
+            outcomes.append(_rescore(run, scenes))
         except AwError as error:
-            found.append(Rescored(run, "refused", error=str(error)))
+            outcomes.append(Rescored(run, "refused", error=str(error)))
         tick(done, len(runs))
-    return found
+    return outcomes
 
 
 class _Scenes:
-    """Scenes that were opened."""
+    """A cache of opened scenes."""
 
     def __init__(self, given: Path | None) -> None:
         self.given = given
         self._open: dict[tuple[str, int | None], tuple[Scene, str]] = {}
 
     def find(self, run: Path, result: RunResult, settings: object) -> Scene:
-        """The run's scene, as it was when it was measured."""
-        known = settings if isinstance(settings, dict) else {}
-        path, factor = str(self.given or known.get("path") or ""), known.get("factor")
+        """Return the run's scene; raise AwError if it has changed since the run was measured."""
+        config = settings if isinstance(settings, dict) else {}
+        path, factor = str(self.given or config.get("path") or ""), config.get("factor")
         if not path or not Path(path).is_dir():
-            raise AwError(
-                f"{run}: its scene {path or 'is not named in config.yaml'} is not there: name it with --scene"
-            )
+            why = f"the scene of the run is not at {path}" if path else "config.yaml names no scene"
+            raise AwError(f"{run}: {why}: name its folder with --scene")
         key = path, factor if isinstance(factor, int) else None
         if key not in self._open:
             scene = load_scene(path, factor=key[1])
@@ -117,12 +112,12 @@ def _rescore(run: Path, scenes: _Scenes) -> Rescored:
         half = config.get("protocol", "full") == "half"
         scene = scenes.find(run, result, config.get("scene"))
         renders = renders_of(run, result)
-        if gone := shortlist(path.name for path in renders.values() if not path.is_file()):
-            raise AwError(f"{run} lacks its renders {gone}: restore them, or run it again")
+        if lacking := shortlist(path.name for path in renders.values() if not path.is_file()):
+            raise AwError(f"{run} lacks its renders {lacking}: restore them, or run it again")
         wanted = [metric for key, metric in metrics().items() if lacks(result, key)]
         for row in result["per_image"]:
             for metric in wanted:
-                cast(dict[str, Any], row).pop(metric.key, None)  # of another state of its file
+                row.pop(metric.key, None)  # type: ignore[misc]  # from another version of its file
         check_photos(run, scene, result["per_image"], renders, half=half)
         added = _add(result, scene, wanted, renders, half=half)
         missing = tuple(sorted(result["missing"]))
@@ -136,7 +131,7 @@ def _rescore(run: Path, scenes: _Scenes) -> Rescored:
 def _add(
     result: RunResult, scene: Scene, wanted: Sequence[Metric], renders: dict[str, Path], *, half: bool
 ) -> tuple[str, ...]:
-    """Put the metrics that the result lacks into it; those that no image has a value of stay missing."""
+    """Add metrics to the result; return those added. Metrics without a value in any image stay missing."""
     photos = {view.name: view.image_path for view in scene.test}
     pictures = ((name, read_png_rgb(path), read_png_rgb(photos[name])) for name, path in renders.items())
     rows, missing = measure_images(pictures, wanted, scene, half=half, around=kernel_threads)

@@ -1,4 +1,4 @@
-"""A whole published table: import a suite's scenes, choose methods, print beside the reported numbers."""
+"""Reproduce a published table: import a suite's scenes, choose methods, print beside the reported numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PreparedSuite:
 
     suite: Suite
     scenes: dict[str, Path]  # name in runs -> folder
-    absent: tuple[str, ...]  # scenes of the table that are not there
+    absent: tuple[str, ...]  # scenes of the table that were not found
 
 
 def prepare_suite(
@@ -38,21 +38,21 @@ def prepare_suite(
     """Find and import the suite's scenes.
 
     Args:
-        suite: of `datasets.suites`.
-        root: folder with a folder a scene, in any layout that `aw import` reads, or as scene folders.
-        output: of the runs; imported scenes lie below it.
-        jobs: threads.
-        say: told what is done.
+        suite: a suite of `datasets.suites`.
+        root: folder with one folder for each scene, in any layout of `aw import`, or scene folders.
+        output: folder of the runs; imported scenes are put below it.
+        jobs: number of threads.
+        say: gets a line about each step.
 
     Raises:
-        AwError: no scene there, or one that cannot be imported or is another scene than its folder says.
+        AwError: no scene is found, or one cannot be imported or differs from its folder's name.
     """
-    found, absent = find_scenes(suite, root)
+    folders, absent = find_scenes(suite, root)
     if absent:
         count = f"{len(absent)} of {len(suite.scenes)} scenes"
         say(f"{suite.name}: {count} are not in {root}: {shortlist(absent, 20)}")
     ready = {}
-    for scene, folder in found.items():
+    for scene, folder in folders.items():
         name = scene_id(scene)
         ready[name] = _ready(suite, name, folder, output / SCENES / name, jobs, say)
     return PreparedSuite(suite, ready, tuple(absent))
@@ -69,9 +69,8 @@ def _ready(
         called = str(info.get("name", folder.name))
         if plain(called) != plain(name):
             raise AwError(
-                f"{folder} is the scene {called!r} by its scene.json, not {name!r}: runs and tables "
-                "would name it "
-                "wrongly; rename the folder, or import it again with --name"
+                f"{folder} is the scene {called!r} by its scene.json, not {name!r}: runs and tables would "
+                "have the wrong name; rename the folder, or import it again with --name"
             )
         if suite.factor and info["factor"] != suite.factor:
             say(
@@ -91,7 +90,7 @@ def _ready(
 
 
 def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
-    """Our methods that tables of the suite's dataset report; 3DGS and RefineSplat where none does."""
+    """Return our methods that papers report on the suite's dataset; without any, 3DGS and RefineSplat."""
     from ambiguous_wild.methods.registry import all_methods
     from ambiguous_wild.report.papers import read_reported
 
@@ -101,12 +100,12 @@ def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
 
 
 def suite_tables(prepared: PreparedSuite, runs: Path, reported_from: Path | None = None) -> list[Table]:
-    """The tables, each scene set as printed, our runs above the reported rows; nothing is averaged together.
+    """Return the suite's tables with the scenes as printed: our runs, then the reported rows, never mixed.
 
     Args:
-        prepared: of `prepare_suite`.
+        prepared: from `prepare_suite`.
         runs: folder of the runs.
-        reported_from: reported tables; None = those that come with the package.
+        reported_from: folder of reported tables; None = those of this package.
 
     Raises:
         AwError: no finished run.
@@ -114,24 +113,24 @@ def suite_tables(prepared: PreparedSuite, runs: Path, reported_from: Path | None
     from ambiguous_wild.harness.store import read_runs
     from ambiguous_wild.report.papers import paper, read_reported, with_reported
 
-    suite, found = prepared.suite, read_runs(runs)
-    known = set(found.runs["scene"]) if len(found.runs) else set()
+    suite, measured = prepared.suite, read_runs(runs)
+    present = set(measured.runs["scene"]) if len(measured.runs) else set()
     numbers = read_reported(reported_from)
-    made = []
+    tables = []
     for title, scenes in suite.tables.items():
-        names = [scene_id(s) for s in scenes if scene_id(s) in known]
+        names = [scene_id(s) for s in scenes if scene_id(s) in present]
         if not names:
             continue
-        for table in paper(found, scenes=names, datasets={suite.dataset: names}):
+        for table in paper(measured, scenes=names, datasets={suite.dataset: names}):
             named = dataclasses.replace(table, title=f"{suite.dataset}, {title}")
-            # A paper's mean is over all scenes of its table: beside a mean over some it would mislead.
+            # a paper's mean over all scenes of its table is not shown beside our mean over some of them
             whole = len(names) == len(scenes) and len(suite.tables) == 1
             shown = with_reported(named, numbers)
-            made.append(shown if whole else _without_reported_mean(shown))
-    if not made:
+            tables.append(shown if whole else _without_reported_mean(shown))
+    if not tables:
         raise AwError(f"{runs} has no finished run of {suite.name}")
     note = _note(prepared)
-    return [table.with_notes(note) if note else table for table in made]
+    return [table.with_notes(note) if note else table for table in tables]
 
 
 def _without_reported_mean(table: Table) -> Table:
@@ -151,4 +150,4 @@ def _without_reported_mean(table: Table) -> Table:
 def _note(prepared: PreparedSuite) -> str:
     if not prepared.absent:
         return ""
-    return f"not here: {', '.join(prepared.absent)}; our mean is over fewer scenes than the papers'"
+    return f"scenes not found: {', '.join(prepared.absent)}; our mean is over fewer scenes than the papers'"

@@ -1,7 +1,6 @@
-"""The one table of this package: groups of columns, rows, and what each cell shows.
+"""The table that all reports use: groups of columns, rows, and what each cell shows.
 
-`plain_formats.py` writes tables for a terminal, as Markdown and as CSV, `latex.py` and `html_page.py` in
-their formats.
+`plain_formats.py` writes tables as text, Markdown and CSV, `typeset.py` as LaTeX and HTML.
 """
 
 from __future__ import annotations
@@ -16,20 +15,20 @@ from ambiguous_wild.harness.timing import seconds_range
 
 Kind = Literal["measured", "reported"]
 State = Literal["ok", "missing", "failed", "absent", "blank"]
-SHOWN = {"missing": "—", "failed": "failed", "absent": "no run", "blank": ""}  # blank: nothing belongs there
+SHOWN = {"missing": "—", "failed": "failed", "absent": "no run", "blank": ""}  # blank: no value is expected
 ARROWS = {"higher": "↑", "lower": "↓", None: ""}
 TIE = "≈"
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column; neighbours of the same group stand under one heading."""
+    """A column; neighbours with the same group share one heading."""
 
     group: str  # heading: a scene, a mean, or ""
     measure: Measure
     scene: str = ""  # empty: a mean over scenes
-    dataset: str = ""  # that the scene, or all scenes of the mean, belong to
-    words: bool = False  # text from the left, not numbers from the right, where the format can show it
+    dataset: str = ""  # dataset of the scene, or of all scenes of the mean
+    words: bool = False  # text, aligned left, not numbers, aligned right, if the format can do so
 
     @property
     def label(self) -> str:
@@ -45,14 +44,14 @@ class Cell:
     low: float = math.nan  # 95 % bootstrap interval over the images of one scene
     high: float = math.nan
     rank: int | None = None  # 1, 2, 3 or None
-    ranged: bool = False  # a time that cannot be compared: shown from `low` to `high`, its least and its most
+    ranged: bool = False  # a time that cannot be compared: the range from `low` to `high` is shown
     tie: bool = False  # not the best, and not significantly different from it
     state: State = "ok"
-    printed: str = ""  # a text, or a number as a paper prints it; empty for what was measured
-    markdown: str = ""  # `printed` as Markdown, where it is more than escaped text
+    printed: str = ""  # a text, or a number as a paper prints it; empty for measured numbers
+    markdown: str = ""  # `printed` as Markdown, if that is more than escaped text
 
     def text(self, measure: Measure) -> str:
-        """The number with its spread, or its state; neither rank nor tie."""
+        """Return the number with its spread, or the state; without rank and tie."""
         if self.printed:
             return self.printed
         if self.state != "ok":
@@ -74,29 +73,29 @@ class Row:
     name: str
     cells: tuple[Cell, ...]  # one a column
     kind: Kind = "measured"
-    note: str = ""  # what the row is, where its name does not say it
+    note: str = ""  # the meaning of the row, if its name does not say it
     runs: int = 0  # finished runs behind it
     ranked: bool = True  # False: a run behind it is unfinished, or the method knows the truth
 
 
 @dataclass(frozen=True)
 class Table:
-    """One table as it is to be seen."""
+    """One table as it is shown."""
 
     title: str
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]  # measured first, then reported
-    notes: tuple[str, ...] = ()  # what is missing, failed or not comparable
-    spread_over: str = "seeds"  # what the deviations are over
-    head: str = "method"  # above the names of the rows
-    continued: bool = False  # legend and notes stand below the next table
+    notes: tuple[str, ...] = ()  # lines on missing, failed and incomparable numbers
+    spread_over: str = "seeds"  # the deviations are over these
+    head: str = "method"  # heading of the rows' names
+    continued: bool = False  # legend and notes are below the next table
 
     def with_notes(self, *notes: str) -> Table:
-        """The same table with more lines below."""
+        """Return the table with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
     def picked(self, indices: Sequence[int]) -> Table:
-        """The table with the columns of these indices alone, in this order."""
+        """Return the table with only the columns of these indices, in this order."""
         rows = tuple(replace(row, cells=tuple(row.cells[i] for i in indices)) for row in self.rows)
         return replace(self, columns=tuple(self.columns[i] for i in indices), rows=rows)
 
@@ -106,18 +105,18 @@ class Table:
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """(heading, columns under it), from the left."""
-        found: list[tuple[str, int]] = []
+        """Return (heading, number of columns under it), from left to right."""
+        groups: list[tuple[str, int]] = []
         for column in self.columns:
-            if found and found[-1][0] == column.group:
-                found[-1] = (column.group, found[-1][1] + 1)
+            if groups and groups[-1][0] == column.group:
+                groups[-1] = (column.group, groups[-1][1] + 1)
             else:
-                found.append((column.group, 1))
-        return found
+                groups.append((column.group, 1))
+        return groups
 
     @property
     def legend(self) -> list[str]:
-        """What the marks that occur in it mean, but for the ranks."""
+        """Return a line for each kind of mark in the table, except ranks."""
         lines = []
         if any(cell.tie for cell in self.cells):
             lines.append(
@@ -129,16 +128,16 @@ class Table:
             lines.append(f"±: sample standard deviation over {self.spread_over}")
         if any(row.kind == "reported" for row in self.rows):
             lines.append(
-                "reported: printed in a paper, not measured here; neither ranked nor part of any mean; of "
-                "SSIM and LPIPS the variant is often unknown"
+                "reported: printed in a paper, not measured here; neither ranked nor part of any mean; the "
+                "variant of SSIM and LPIPS is often unknown"
             )
         if self.contradicts:
-            lines.append("a / b: tables that contradict each other")
+            lines.append("a / b: values from tables that contradict each other")
         return lines
 
     @property
     def contradicts(self) -> bool:
-        """Whether a cell shows several values that papers print for the same thing."""
+        """True if a cell shows several values, because papers print different numbers for the same cell."""
         reported = [cell for row in self.rows if row.kind == "reported" for cell in row.cells]
         return any(" / " in cell.printed for cell in reported)
 
@@ -146,30 +145,30 @@ class Table:
 def text_table(
     title: str, head: Sequence[str], rows: Iterable[Sequence[str | Cell]], *, words: Sequence[str] = ()
 ) -> Table:
-    """A table of texts.
+    """Make a table of texts.
 
     Args:
-        title: above it.
-        head: of every column; the first column names the rows.
-        rows: texts, or cells of them, one a column.
-        words: columns that hold words and no numbers.
+        title: title of the table.
+        head: headings of the columns; the first column names the rows.
+        rows: texts or cells, one for each column.
+        words: headings of the columns that hold words.
     """
     columns = tuple(Column("", Measure(text, text, None, 0), words=text in words) for text in head[1:])
-    made = [
+    text_rows = tuple(
         Row(str(first), tuple(c if isinstance(c, Cell) else Cell(printed=c) if c else BLANK for c in rest))
         for first, *rest in rows
-    ]
-    return Table(title, columns, tuple(made), head=head[0])
+    )
+    return Table(title, columns, text_rows, head=head[0])
 
 
 def ranks(values: Sequence[float], measure: Measure) -> list[int | None]:
-    """First, second and third of a column; equal in print = equal rank; what is not finite has none."""
+    """Return the ranks 1 to 3 of a column, None for the rest; values that print alike share a rank."""
     shown = [round(v, measure.digits) if math.isfinite(v) else math.nan for v in values]
-    known = [v for v in shown if not math.isnan(v)]
-    if measure.better is None or len(set(known)) < 2:
+    finite = [v for v in shown if not math.isnan(v)]
+    if measure.better is None or len(set(finite)) < 2:
         return [None] * len(values)
-    found: list[int | None] = []
+    places: list[int | None] = []
     for value in shown:
-        ahead = sum(v > value if measure.better == "higher" else v < value for v in known)
-        found.append(None if math.isnan(value) or ahead > 2 else ahead + 1)
-    return found
+        ahead = sum(v > value if measure.better == "higher" else v < value for v in finite)
+        places.append(None if math.isnan(value) or ahead > 2 else ahead + 1)
+    return places

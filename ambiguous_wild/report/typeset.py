@@ -1,11 +1,11 @@
-"""Tables as LaTeX (booktabs, ready to `\\input`) and as one HTML page without script, font or request."""
+"""Write tables as LaTeX (booktabs, ready to `\\input`) and as one HTML page that needs no other file."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
 
-from ambiguous_wild.harness.choosing import MIXED
+from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.report.notes import UNEQUAL
 from ambiguous_wild.report.plain_formats import plain
@@ -15,9 +15,7 @@ NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}
 COLORS = (("awfirst", "1,0.75,0.75"), ("awsecond", "1,0.87,0.72"), ("awthird", "1,0.98,0.72"))
 APPROX = r"$\approx$"
 WIDE = 3  # a table of more columns spans both columns of text
-FIT = (
-    "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%"  # shrunk only where it must be
-)
+FIT = "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%"  # shrunk only if too wide
 SPECIAL = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -27,7 +25,7 @@ SPECIAL = {
     "|": r"\textbar{}",
     # \textquotedbl needs fontenc T1, which not every class loads.
     '"': "{''}",
-    # A row end takes these two for its own options when a name begins with them.
+    # after the end of a row, LaTeX would read these two as options of the row end
     "[": "{[}",
     "*": "{*}",
     "–": "--",
@@ -36,7 +34,7 @@ SPECIAL = {
 
 
 def latex_text(text: str) -> str:
-    """Escaped; what pdflatex's own fonts lack is written out, so that any name compiles."""
+    """Return the text escaped; characters that pdflatex's fonts lack are written as code points."""
     return "".join(map(_latex_character, plain(text)))
 
 
@@ -50,9 +48,9 @@ def _latex_character(c: str) -> str:
 
 
 def to_latex(tables: Sequence[Table]) -> str:
-    """One float a table, with a caption; a table without a title is a bare tabular, for a float of its own.
+    """Return a float with a caption for each table; a table without a title becomes a bare tabular.
 
-    The notes and the command that made it stand below as comments.
+    Notes, with the command that made the runs, follow as comments.
     """
     parts = [NEEDS, *(f"\\providecolor{{{name}}}{{rgb}}{{{rgb}}}" for name, rgb in COLORS)]
     for table in tables:
@@ -81,9 +79,9 @@ def _tabular(table: Table) -> list[str]:
             ]
             before = row.kind
         lines.append(_latex_row(table, row))
-    # the other notes are comments: these say what a printed rank is worth
+    # these notes are printed, as they limit what a rank means; the others are comments
     below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
-    if not table.title and any(cell.tie for cell in table.cells):  # there is no caption that says it
+    if not table.title and any(cell.tie for cell in table.cells):  # a bare tabular has no caption
         below.append(f"{TIE}: not significantly different from the best (paired bootstrap, 95 %).")
     width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
     lines += [
@@ -169,7 +167,7 @@ RANKS = ("first", "second", "third")
 
 
 def to_html(tables: Sequence[Table]) -> str:
-    """The tables on one page; names are text, whatever they hold."""
+    """Return the tables as one HTML page; names are escaped."""
     title = escape(plain(tables[0].title)) if len(tables) == 1 else "Results"
     head = (
         '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -185,7 +183,7 @@ def _section(table: Table) -> str:
 
 
 def html_table(table: Table) -> str:
-    """The element alone, for a page with a style of its own; names are text."""
+    """Return only the table element, for a page with its own style; names are escaped."""
     parts = ["<table>", "<thead>"]
     begins = _begins(table)
     if any(title for title, _ in table.groups):
@@ -209,7 +207,7 @@ def html_table(table: Table) -> str:
 
 
 def _begins(table: Table) -> list[str]:
-    """A class for the first column of every group but the first."""
+    """Return a CSS class for the first column of every group except the first."""
     return [
         "begins" if i and c.group != table.columns[i - 1].group else "" for i, c in enumerate(table.columns)
     ]

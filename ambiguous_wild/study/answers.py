@@ -1,4 +1,4 @@
-"""The key of a study, and the answer files of its raters, read and checked against the key."""
+"""Read the key of a study, and check the answer files of its raters against the key."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypedDict
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
@@ -23,7 +23,7 @@ _KEY_FIELDS = {KIND_PHOTO: ("scene", "view"), KIND_PAIR: ("scene", "view", "x", 
 
 @dataclass(frozen=True)
 class Key:
-    """What is needed to score answers."""
+    """The key that is needed to score answers."""
 
     study: str  # id of the study
     title: str
@@ -31,7 +31,7 @@ class Key:
 
 
 def study_id(*parts: Any) -> str:
-    """Hash of `parts`, 16 hexadecimal digits."""
+    """Return the hash of `parts`, 16 hexadecimal digits."""
     text = json.dumps(parts, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -40,7 +40,7 @@ def read_key(path: Path) -> Key:
     """Read and check a key.
 
     Raises:
-        AwError: unreadable, not a key, of another version, or damaged.
+        AwError: the file is unreadable, no key, of another version, or damaged.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -84,7 +84,7 @@ def _complete(entry: Any) -> bool:
 
 FORMAT, VERSION = "aw-study-answers", 1
 CHOICES = {KIND_PAIR: ("x", "y", "tie"), KIND_PHOTO: ("1", "2", "3", "4", "5", "none")}
-# As JSON and CSV have it: whether the outline was shown.
+# the values in JSON and CSV -> whether the outline was shown
 OUTLINES: dict[str | bool | None, bool | None] = {
     True: True,
     False: False,
@@ -96,8 +96,8 @@ OUTLINES: dict[str | bool | None, bool | None] = {
 LARGEST = 5_000_000  # bytes; ten times the size of a thousand answers
 LONGEST = 80  # characters of a rater's id or name, as in the page
 _COLUMNS = ("study", "rater", "name", "question", "answer", "left", "ms", "outline")
-# Seconds on a question below which nobody can have looked: one photo, or two renders and a photo. Such
-# answers are read, counted and left out of every score.
+# Nobody can look at a question in less than these seconds: at one photo, or at two renders and a photo. Such
+# answers are read and counted, but left out of every score.
 TOO_FAST_S = {KIND_PHOTO: 0.7, KIND_PAIR: 1.0}
 
 
@@ -110,17 +110,15 @@ class Answer:
     left: str  # "x" or "y": the render shown on the left; empty for photos
     seconds: float  # spent on the question
     too_fast: bool = False  # see `TOO_FAST_S`
-    outline: bool | None = (
-        None  # whether the distractor's outline was shown; None: not recorded, or no outline
-    )
+    outline: bool | None = None  # whether the outline was shown; None: not recorded, or there is none
 
 
 @dataclass(frozen=True)
 class Rater:
-    """One answer file."""
+    """One rater and the answers in the rater's file."""
 
     rater: str  # random id, made by the page
-    name: str  # as typed; may be any text
+    name: str  # as typed; it may be any text
     path: Path
     answers: tuple[Answer, ...]
 
@@ -132,12 +130,12 @@ def read_answers(
 
     Args:
         paths: files and folders.
-        key: of the study.
+        key: key of the study.
         notice: called with a message about ignored files of a folder.
 
     Raises:
-        AwError: no file; or a file that is empty, malformed, of another study or of a repeated rater, or that
-            answers an unknown question; names the file.
+        AwError: there is no file, or one is empty, malformed, of another study or of a repeated rater, or
+            answers an unknown question; the error names the file.
     """
     raters: dict[str, Rater] = {}
     for path in _files(paths, notice):
@@ -152,12 +150,12 @@ def read_answers(
 
 
 def _files(paths: Sequence[Path], notice: Callable[[str], None]) -> list[Path]:
-    found: list[Path] = []
+    files: list[Path] = []
     for path in paths:
         if not path.is_dir():
-            found.append(path)
+            files.append(path)
             continue
-        # The folder may also hold the key and earlier scores.
+        # the folder may also hold the key and earlier scores
         inside = [
             p
             for p in sorted(path.iterdir())
@@ -167,23 +165,25 @@ def _files(paths: Sequence[Path], notice: Callable[[str], None]) -> list[Path]:
         ]
         if not inside:
             raise AwError(f"no answer file (*.json, *.csv) in {path}; copy the raters' files there")
-        found += inside
-        ours = (".key.json", ".html", ".htm")
+        files += inside
+        study_files = (".key.json", ".html", ".htm")
         ignored = [
             p.name
             for p in sorted(path.iterdir())
-            if p not in inside and not p.name.startswith((".", "scores.")) and not p.name.endswith(ours)
+            if p not in inside
+            and not p.name.startswith((".", "scores."))
+            and not p.name.endswith(study_files)
         ]
         if ignored:
             notice(
                 f"{path}: ignored {shortlist(ignored)}; answer files are *.json or *.csv in the folder itself"
             )
-    twice = {p.resolve() for p in found if sum(p.resolve() == q.resolve() for q in found) > 1}
+    twice = {p.resolve() for p in files if sum(p.resolve() == q.resolve() for q in files) > 1}
     if twice:
         raise AwError(f"given twice: {shortlist(sorted(map(str, twice)))}; give each answer file once")
-    if not found:
+    if not files:
         raise AwError("no answer files given: name the files that raters saved, or a folder of them")
-    return found
+    return files
 
 
 def _read(path: Path, key: Key) -> Rater:
@@ -199,7 +199,7 @@ def _read(path: Path, key: Key) -> Rater:
         raise AwError(f"cannot read {path}: {error.strerror}") from None
     if not text.strip():
         raise AwError(f"{path} is empty: ask the rater to save again")
-    # Detect the format by content, since mail programs and phones rename files.
+    # the content decides on the format, since mail programs and phones rename files
     data = _json(path, text) if text.lstrip()[:1] in ("{", "[") else _csv(path, text)
     if data["study"] != key.study:
         raise AwError(
@@ -230,7 +230,16 @@ def _read(path: Path, key: Key) -> Rater:
     return Rater(rater, name[:LONGEST], path, answers)
 
 
-def _json(path: Path, text: str) -> dict[str, Any]:
+class AnswerFile(TypedDict):
+    """The content of an answer file; its values are not checked yet."""
+
+    study: object
+    rater: object
+    name: object
+    answers: list[Any]
+
+
+def _json(path: Path, text: str) -> AnswerFile:
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -247,15 +256,16 @@ def _json(path: Path, text: str) -> dict[str, Any]:
         raise AwError(
             f"{path} has version {_short(data.get('version'))}, this program reads {VERSION}; update it"
         )
-    return {k: data.get(k, "") for k in ("study", "rater", "name", "answers")}
+    study, rater, name = (data.get(k, "") for k in ("study", "rater", "name"))
+    return {"study": study, "rater": rater, "name": name, "answers": data["answers"]}
 
 
-def _csv(path: Path, text: str) -> dict[str, Any]:
+def _csv(path: Path, text: str) -> AnswerFile:
     try:
         rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
     except csv.Error as error:
         raise AwError(f"{path} is malformed CSV ({error}): ask the rater to save again") from None
-    # Pages of before the outline was recorded lack the last column.
+    # pages of early versions did not record the outline, and lack the last column
     if not rows or tuple(rows[0]) not in (_COLUMNS, _COLUMNS[:-1]):
         raise AwError(
             f"{path} is no answer file: its first line must be {','.join(_COLUMNS)}, followed by rows"
@@ -265,7 +275,7 @@ def _csv(path: Path, text: str) -> dict[str, Any]:
     for column in ("study", "rater", "name"):
         if len({row[column] for row in rows}) > 1:
             raise AwError(f"{path} contains more than one {column}: give one file per rater")
-    # The page writes '=x for a name =x, so that spreadsheets do not evaluate it.
+    # the page writes '=x for a name =x, so that spreadsheets do not calculate it
     name = rows[0]["name"]
     name = name[1:] if name[:1] == "'" and name[1:].lstrip()[:1] in ("=", "+", "-", "@") else name
     return {"study": rows[0]["study"], "rater": rows[0]["rater"], "name": name, "answers": rows}

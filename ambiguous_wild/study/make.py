@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TypedDict
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.models import open_scene
-from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.store import check_names, read_runs
+from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
@@ -25,22 +25,22 @@ from ambiguous_wild.study.answers import KEY_FORMAT, KEY_VERSION, KIND_PAIR, KIN
 
 @dataclass(frozen=True)
 class PhotoQuestion:
-    """How hard is it to tell the distractor from the scene?"""
+    """The question how hard it is to tell the distractor from the scene."""
 
     scene: str
     view: str
     photo: Path
-    mask: Path | None  # PNG, white = distractor; raters can show its outline
+    mask: Path | None  # PNG, white = distractor; raters can show the outline
 
     @property
     def group(self) -> str:
-        """Questions are chosen evenly over the groups."""
+        """The group of the question; questions are chosen evenly over groups."""
         return self.scene
 
 
 @dataclass(frozen=True)
 class PairQuestion:
-    """Which of two renders is better?"""
+    """The question which of two renders is better."""
 
     scene: str
     view: str
@@ -57,49 +57,46 @@ Question = PhotoQuestion | PairQuestion
 
 
 def scene_photos(folder: Path, *, outline: bool = True) -> list[PhotoQuestion]:
-    """All training photos of a scene, except those without distractors in the ground truth.
+    """Return questions on the training photos of a scene, except those whose exact mask is empty.
 
     Raises:
-        AwError: no scene, or no photo with distractors.
+        AwError: there is no scene, or no photo with distractors.
     """
     scene = load_scene(folder, verify="quick")
-    found = []
+    questions = []
     for view in scene.train:
         mask = scene.root / "truth" / "distractor" / f"{_stem(view.name)}.png"
-        known = mask.is_file()
-        if known and not (read_gray(mask) >= 128).any():
+        has_mask = mask.is_file()
+        if has_mask and not (read_gray(mask) >= 128).any():
             continue
-        shown = mask if known and outline else None
-        found.append(PhotoQuestion(scene.name, view.name, view.image_path, shown))
-    if not found:
+        shown = mask if has_mask and outline else None
+        questions.append(PhotoQuestion(scene.name, view.name, view.image_path, shown))
+    if not questions:
         raise AwError(
             f"no training photo of {folder} has a distractor in the ground truth: there is nothing to ask; "
             "give a scene with distractors"
         )
-    return found
+    return questions
 
 
 def render_pairs(
     folder: Path, *, methods: Sequence[str] = (), scenes: Sequence[str] = (), truth: bool = True
 ) -> list[PairQuestion]:
-    """All pairs of methods on all test views that both rendered; of several seeds the first is used.
+    """Return all pairs of methods on all test views that both rendered, with the first seed of each.
 
     Args:
         folder: output of `aw bench -o`.
-        methods: only these; empty = all.
-        scenes: only these; empty = all.
+        methods: names of methods to compare; empty = all.
+        scenes: names of scenes to use; empty = all.
         truth: show the test photo next to the renders.
 
     Raises:
-        AwError: no runs, an unknown name, fewer than two methods on a scene, renders or photos missing.
+        AwError: no runs, an unknown name, less than two methods on a scene, or missing renders or photos.
     """
     frame = read_runs(folder).runs
     frame = frame[frame["status"] == "ok"]
     for kind, asked in (("method", methods), ("scene", scenes)):
-        known = sorted(set(frame[kind]))
-        for name in asked:
-            if name not in known:
-                raise unknown(kind, name, known)
+        check_names(kind, asked, sorted(set(frame[kind])))
     if methods:
         frame = frame[frame["method"].isin(methods)]
     if scenes:
@@ -153,7 +150,7 @@ def _test_photos(run: Path) -> dict[str, Path]:
 
 
 def sample_questions(questions: Sequence[Question], limit: int, rng: np.random.Generator) -> list[Question]:
-    """At most `limit` questions, spread evenly over their groups, in random order."""
+    """Choose at most `limit` questions, spread evenly over their groups, in random order."""
     groups: dict[str, list[Question]] = {}
     for question in questions:
         groups.setdefault(question.group, []).append(question)
@@ -171,11 +168,11 @@ def _stem(name: str) -> str:
     return str(PurePosixPath(name).with_suffix(""))
 
 
-OUTLINE = (255, 220, 0)  # sRGB; drawn over a black edge, to be visible on any background
+OUTLINE = (255, 220, 0)  # sRGB; drawn over a black edge, so that it is visible on any background
 
 
 def outlined(photo: Path, mask: Path) -> np.ndarray:  # [H, W, 3] uint8
-    """The photo with the distractor's outline."""
+    """Draw the outline of the distractor on the photo."""
     image = read_png_rgb(photo).copy()
     height, width = image.shape[:2]
     inside = cv2.resize(read_gray(mask), (width, height), interpolation=cv2.INTER_NEAREST) >= 128
@@ -187,10 +184,10 @@ def outlined(photo: Path, mask: Path) -> np.ndarray:  # [H, W, 3] uint8
 
 
 def same_size(paths: tuple[Path, ...]) -> list[np.ndarray]:
-    """The images of one question; their sizes must be equal, or size would reveal the method.
+    """Read the images of one question, whose sizes must be equal: size would reveal the method.
 
     Raises:
-        AwError: unreadable, or of different sizes.
+        AwError: an image is unreadable, or sizes differ.
     """
     images = [read_png_rgb(p) for p in paths]
     sizes = {f"{i.shape[1]}x{i.shape[0]}" for i in images}
@@ -210,10 +207,10 @@ class StudySettings:
     """Settings of a study."""
 
     title: str = "Picture study"  # shown to raters
-    limit: int = 40  # most questions of each kind
-    side: int = 1000  # px, most of an image's longer side
+    limit: int = 40  # largest number of questions of each kind
+    side: int = 1000  # px, longest side of an image
     quality: int = 92  # of JPEG
-    seed: int = 0  # of the choice of questions, and of which render is x
+    seed: int = 0  # for the choice of questions, and of the render that is x
 
 
 @dataclass(frozen=True)
@@ -246,20 +243,20 @@ def make_study(
     if not chosen:
         raise AwError("a study needs at least one question: give RUNS, --scene or both")
     album = _Album(settings, rng)
-    asked, answers = [], {}
+    asked: list[ShownQuestion] = []
+    answers = {}
     for question in progress(chosen):
         token = album.token()
         if isinstance(question, PhotoQuestion):
-            shown, entry = _photo(question, album)
+            images, entry = _photo(question, album)
         else:
-            shown, entry = _pair(question, album, rng)
-        asked.append({"id": token, **shown})
+            images, entry = _pair(question, album, rng)
+        asked.append({"id": token, "kind": entry["kind"], "images": images})
         answers[token] = entry
-    # The id depends on the images: the same questions on other renders are another study.
+    # the id depends on the images: the same questions on other renders are another study
     identity = study_id(settings.title, asked, answers, album.hashes)
-    data = {"study": identity, "title": settings.title, "questions": asked, "images": album.images}
-    text = page_html(data)
-    write_text(page, text)  # first, so that there is no key without its page
+    text = page_html({"study": identity, "title": settings.title, "questions": asked, "images": album.images})
+    write_text(page, text)  # before the key, so that there is no key without a page
     write_json(
         key,
         {
@@ -276,7 +273,7 @@ def make_study(
 
 
 class _Album:
-    """Images by random token; an image that is used twice is stored once."""
+    """The images of a page by random token; an image that is used twice is stored once."""
 
     def __init__(self, settings: StudySettings, rng: np.random.Generator) -> None:
         self._settings, self._rng = settings, rng
@@ -297,7 +294,7 @@ class _Album:
         return self._tokens[name]
 
     def _encoded(self, image: np.ndarray) -> str:
-        """Encoded from pixels, so without EXIF or file name; small colour details are compared, too."""
+        """Encode the pixels alone, without EXIF or file name, and with full resolution of colour."""
         width = image.shape[1] * self._settings.side // max(image.shape[:2])
         small = narrowed(image, max(1, width))
         return data_uri("jpeg", jpeg_bytes(small, self._settings.quality, full_colour=True))
@@ -307,29 +304,45 @@ class _Album:
         return {t: hashlib.sha256(uri.encode()).hexdigest() for t, uri in self.images.items()}
 
 
-def _photo(question: PhotoQuestion, album: _Album) -> tuple[dict[str, Any], dict[str, str]]:
-    """What the page shows, and the entry of the key."""
-    shown = {"photo": album.add(str(question.photo), read_png_rgb(question.photo))}
+class ShownQuestion(TypedDict):
+    """A question as the page shows it."""
+
+    id: str  # token
+    kind: str
+    images: dict[str, str]  # "photo", "outline", or "x", "y", "truth" -> token of the image
+
+
+class PageData(TypedDict):
+    """What the page's script reads."""
+
+    study: str
+    title: str
+    questions: list[ShownQuestion]
+    images: dict[str, str]  # token -> data URI
+
+
+def _photo(question: PhotoQuestion, album: _Album) -> tuple[dict[str, str], dict[str, str]]:
+    """Return tokens of the images that the page shows, and the entry of the key."""
+    images = {"photo": album.add(str(question.photo), read_png_rgb(question.photo))}
     if question.mask is not None:
-        shown["outline"] = album.add(f"{question.mask} outlined", outlined(question.photo, question.mask))
-    entry = {"kind": KIND_PHOTO, "scene": question.scene, "view": question.view}
-    return {"kind": KIND_PHOTO, "images": shown}, entry
+        images["outline"] = album.add(f"{question.mask} outlined", outlined(question.photo, question.mask))
+    return images, {"kind": KIND_PHOTO, "scene": question.scene, "view": question.view}
 
 
 def _pair(
     question: PairQuestion, album: _Album, rng: np.random.Generator
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """What the page shows, and the entry of the key."""
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return tokens of the images that the page shows, and the entry of the key."""
     order = [1, 0] if rng.integers(2) else [0, 1]
     paths = tuple(question.renders[i] for i in order)
     sources = paths if question.truth is None else (*paths, question.truth)
-    images = same_size(sources)
-    shown = {slot: album.add(str(p), i) for slot, p, i in zip(("x", "y", "truth"), sources, images)}
+    pixels = same_size(sources)
+    images = {slot: album.add(str(p), i) for slot, p, i in zip(("x", "y", "truth"), sources, pixels)}
     entry = {"kind": KIND_PAIR, "scene": question.scene, "view": question.view,
              "x": question.methods[order[0]], "y": question.methods[order[1]]}  # fmt: skip
-    return {"kind": KIND_PAIR, "images": shown}, entry
+    return images, entry
 
 
-def page_html(data: dict[str, Any]) -> str:
-    """The HTML page with its data, escaped so that it cannot end its script element."""
+def page_html(data: PageData) -> str:
+    """Return the HTML page with its data, escaped so that it cannot end its script element."""
     return fill_page(Path(__file__).parent, data, ("page.js",))

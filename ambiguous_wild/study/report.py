@@ -50,7 +50,7 @@ def write_scores(scores: Scores, out: Path) -> None:
 
 
 def markdown_of(scores: Scores) -> str:
-    """The scores as Markdown; names of methods, scenes and raters are escaped."""
+    """Return the scores as Markdown; names of methods, scenes and raters are escaped."""
     raters = scores["raters"]
     answers = sum(r["answers"] for r in raters)
     parts = [f"# {markdown_text(scores['title'])}", ""]
@@ -76,7 +76,7 @@ def markdown_of(scores: Scores) -> str:
     limits = scores["too_fast_s"]
     parts += [
         f"{fast} of {counted(answers, 'answer')} took less than {limits[KIND_PHOTO]:g} s (photos) or "
-        f"{limits[KIND_PAIR]:g} s (renders), too little to look, and are left out of the scores.",
+        f"{limits[KIND_PAIR]:g} s (renders), too short to look, and are left out of the scores.",
         "",
     ]
     parts.append(
@@ -86,50 +86,50 @@ def markdown_of(scores: Scores) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _preference(found: Preference) -> list[str]:
+def _preference(scores: Preference) -> list[str]:
     parts = [
         "",
         "## Which render is better",
         "",
-        f"{found['questions']} questions, {found['answers']} answers.",
+        f"{scores['questions']} questions, {scores['answers']} answers.",
         "",
     ]
-    if found["ranking"]:
+    if scores["ranking"]:
         rows = [
             (r["rank"], r["method"], _with(r["strength"], r["low"], r["high"], 2), _ranks(r))
-            for r in found["ranking"]
+            for r in scores["ranking"]
         ]
         parts += _table(("rank", "method", "Bradley-Terry strength (log odds)", "possible ranks"), rows)
-    parts += ["", found["ranking_note"].capitalize() + "."] if found["ranking_note"] else []
-    shares = [(m["method"], _share(m["share"], m), m["n"], m["ties"]) for m in found["methods"]]
+    parts += ["", scores["ranking_note"].capitalize() + "."] if scores["ranking_note"] else []
+    shares = [(m["method"], _share(m["share"], m), m["n"], m["ties"]) for m in scores["methods"]]
     parts += ["", "Share of the decided answers that prefer the method:", ""]
     parts += _table(("method", "share", "decided", "ties"), shares)
-    pairs = [(p["method"], p["against"], _share(p["share"], p), p["n"], p["ties"]) for p in found["pairs"]]
+    pairs = [(p["method"], p["against"], _share(p["share"], p), p["n"], p["ties"]) for p in scores["pairs"]]
     parts += ["", *_table(("method", "against", "share", "decided", "ties"), pairs)]
-    if len({s["scene"] for s in found["scenes"]}) > 1:
+    if len({s["scene"] for s in scores["scenes"]}) > 1:
         by_scene = [
-            (s["scene"], s["method"], _share(s["share"], s), s["n"], s["ties"]) for s in found["scenes"]
+            (s["scene"], s["method"], _share(s["share"], s), s["n"], s["ties"]) for s in scores["scenes"]
         ]
         parts += ["", *_table(("scene", "method", "share", "decided", "ties"), by_scene)]
-    left = found["left"]
-    parts += ["", f"Agreement: {_agreement(found['agreement'], 'nominal')}."]
+    left = scores["left"]
+    parts += ["", f"Agreement: {_agreement(scores['agreement'], 'nominal')}."]
     parts += [f"The left image was preferred in {_share(left['share'], left)} of the decided answers."]
     return parts
 
 
-def _ambiguity(found: Ambiguity) -> list[str]:
+def _ambiguity(scores: Ambiguity) -> list[str]:
     rows = [
         (s["scene"], _with(s["mean"], s["mean_low"], s["mean_high"], 2, "{}"),
          _share(s["hard"], s), s["n"], s["none"], s["outlined"])
-        for s in found["scenes"]
+        for s in scores["scenes"]
     ]  # fmt: skip
     head = ("scene", "mean", f"share rated {HARD} or 5", "ratings", "no moving object seen", "outline shown")
     return [
         "", "## How hard the distractor is to see", "",
-        f"{found['questions']} questions, {found['answers']} answers; 1: easy to see, 5: like the scene.",
+        f"{scores['questions']} questions, {scores['answers']} answers; 1: easy to see, 5: like the scene.",
         "",
         *_table(head, rows),
-        "", f"Agreement: {_agreement(found['agreement'], 'interval metric')}.",
+        "", f"Agreement: {_agreement(scores['agreement'], 'interval metric')}.",
     ]  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
 
 
 def _share(share: float | None, cell: Counted) -> str:
-    """A share in percent with the intervals of its cell."""
+    """Return a share in percent with the intervals of its cell."""
     text = _with(_percent(share), _percent(cell["low"]), _percent(cell["high"]), 1, unit=" %")
     low, high = _percent(cell["raters_low"]), _percent(cell["raters_high"])
     return text if share is None or low is None else f"{text} {{{low:.1f}, {high:.1f}}}"
@@ -166,17 +166,20 @@ def _ranks(row: Ranked) -> str:
     )
 
 
-def _agreement(found: AgreementScore, kind: str) -> str:
-    if found["alpha"] is None or found["equal"] is None:
-        return f"Krippendorff's alpha is missing: {found['note']}"
+def _agreement(score: AgreementScore, kind: str) -> str:
+    if score["alpha"] is None or score["equal"] is None:
+        return f"Krippendorff's alpha is missing: {score['note']}"
     return (
-        f"Krippendorff's alpha {found['alpha']:.3f} ({kind}), {100 * found['equal']:.0f} % of pairs of "
-        f"answers equal, over {found['questions']} questions with two or more raters"
+        f"Krippendorff's alpha {score['alpha']:.3f} ({kind}), {100 * score['equal']:.0f} % of pairs of "
+        f"answers equal, over {score['questions']} questions with two or more raters"
     )
 
 
-def _rows(scores: Scores) -> Iterable[dict[str, Any]]:
-    """One row per number; names are escaped for spreadsheets."""
+ScoreRow = dict[str, str | float | None]  # by `COLUMNS`
+
+
+def _rows(scores: Scores) -> Iterable[ScoreRow]:
+    """Yield one row for each number; names are escaped for spreadsheets."""
     pairs, photos = scores[KIND_PAIR], scores[KIND_PHOTO]
     if pairs is not None:
         for one in pairs["ranking"]:
@@ -198,25 +201,25 @@ def _rows(scores: Scores) -> Iterable[dict[str, Any]]:
         yield _row(KIND_PHOTO, "alpha", value=photos["agreement"]["alpha"])
 
 
-def _share_row(level: str, name: str, against: str, found: Share, ties: int) -> dict[str, Any]:
-    return _row(KIND_PAIR, level, name, against, value=found["share"], **_intervals(found), ties=ties)
+def _share_row(level: str, name: str, against: str, share: Share, ties: int) -> ScoreRow:
+    return _row(KIND_PAIR, level, name, against, value=share["share"], **_intervals(share), ties=ties)
 
 
-def _rating_rows(level: str, name: str, scene: str, found: Ratings) -> Iterable[dict[str, Any]]:
-    means = {"raters_low": found["mean_low"], "raters_high": found["mean_high"]}
-    yield _row(KIND_PHOTO, f"{level} mean", name, scene, value=found["mean"], n=found["n"], **means)
-    yield _row(KIND_PHOTO, f"{level} hard", name, scene, value=found["hard"], **_intervals(found))
+def _rating_rows(level: str, name: str, scene: str, ratings: Ratings) -> Iterable[ScoreRow]:
+    means = {"raters_low": ratings["mean_low"], "raters_high": ratings["mean_high"]}
+    yield _row(KIND_PHOTO, f"{level} mean", name, scene, value=ratings["mean"], n=ratings["n"], **means)
+    yield _row(KIND_PHOTO, f"{level} hard", name, scene, value=ratings["hard"], **_intervals(ratings))
 
 
-def _intervals(found: Counted) -> dict[str, float | None]:
+def _intervals(score: Counted) -> dict[str, float | None]:
     return {
-        "n": found["n"],
-        "low": found["low"],
-        "high": found["high"],
-        "raters_low": found["raters_low"],
-        "raters_high": found["raters_high"],
+        "n": score["n"],
+        "low": score["low"],
+        "high": score["high"],
+        "raters_low": score["raters_low"],
+        "raters_high": score["raters_high"],
     }
 
 
-def _row(kind: str, level: str, name: str = "", against: str = "", **numbers: Any) -> dict[str, Any]:
+def _row(kind: str, level: str, name: str = "", against: str = "", **numbers: float | None) -> ScoreRow:
     return {"kind": kind, "level": level, "name": name, "against": against, **numbers}

@@ -1,6 +1,6 @@
-"""Scores from answers and key: shares, ranking, ratings, agreement.
+"""Compute the scores of a study from answers and key, as they are written to scores.json.
 
-The scores as they are written to scores.json; agreement of raters and Bradley-Terry ranking.
+They are shares of preference, a Bradley-Terry ranking, ratings, and the agreement of raters.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Counted(TypedDict):
 
 
 class Share(Counted):
-    """Share of decided answers; ties are not counted."""
+    """A share of decided answers, without ties."""
 
     share: float | None
 
@@ -45,13 +45,13 @@ class MethodShare(Share):
 
 
 class SceneShare(MethodShare):
-    """The same on one scene."""
+    """How often raters preferred a method on one scene."""
 
     scene: str
 
 
 class PairShare(MethodShare):
-    """The same against one other method."""
+    """How often raters preferred a method to one other method."""
 
     against: str
 
@@ -125,7 +125,7 @@ class Ambiguity(TypedDict):
 
 
 class RaterSummary(TypedDict):
-    """One rater."""
+    """The numbers of one rater."""
 
     rater: str
     name: str
@@ -154,7 +154,7 @@ def agreement(
     *,
     ordered: bool,  # answers are numbers with distances: 1 is closer to 2 than to 5
 ) -> AgreementScore:
-    """Krippendorff's alpha, nominal or (`ordered`) interval, over questions with two or more answers.
+    """Compute Krippendorff's alpha, nominal or (`ordered`) interval, over questions with several answers.
 
     Source: Krippendorff, Computing Krippendorff's Alpha-Reliability (2011); computed by NLTK.
 
@@ -199,7 +199,7 @@ def _nltk() -> tuple[Callable[..., Any], Callable[..., float], Callable[..., flo
     return AnnotationTask, binary_distance, interval_distance
 
 
-# Regularisation, as if each pair had this fraction of one more answer for each side. It keeps the strength of
+# Regularisation, like this fraction of an extra answer for each side of every pair. It keeps the strength of
 # a method that won every answer finite, and changes others by less than the printed digits.
 PRIOR = 0.1
 
@@ -208,14 +208,14 @@ def bradley_terry(
     methods: list[str],
     wins: np.ndarray,  # [raters, methods, methods], wins[r, i, j]: r preferred i to j; a tie is 0.5 each
 ) -> tuple[list[Ranked], str]:
-    """Maximum-likelihood strengths (choix); intervals by leaving out one rater at a time.
+    """Compute maximum-likelihood strengths (choix), with intervals by leaving out one rater at a time.
 
-    Raters are resampled, because answers of one rater are correlated (jackknife, Student's t with raters - 1
-    degrees of freedom).
+    Raters are left out, not answers, because the answers of one rater are correlated (jackknife, Student's t
+    with raters - 1 degrees of freedom).
 
     Returns:
-        The methods from best to worst, and a note ("" = none). No strengths if some groups of methods were
-        never compared.
+        The methods from best to worst, and a note ("" = none). There are no strengths if some groups of
+        methods were never compared with each other.
 
     Raises:
         AwError: choix is not installed.
@@ -276,17 +276,17 @@ Counts = np.ndarray  # [raters, 2]: successes, trials
 
 
 def score(key: Key, raters: list[Rater], seed: int = 0) -> Scores:
-    """All scores of a study, as written to scores.json; None = not defined.
+    """Compute all scores of a study, as written to scores.json; None = not defined.
 
-    Answers that were too fast are left out of every score and counted in each rater's summary.
+    Answers that were too fast are left out of every score, and counted in each rater's summary.
 
     Args:
-        key: of the study.
+        key: key of the study.
         raters: at least one, from `read_answers`.
-        seed: of the bootstrap over raters.
+        seed: seed of the bootstrap over raters.
     """
     kept = [replace(r, answers=tuple(a for a in r.answers if not a.too_fast)) for r in raters]
-    kept = [r for r in kept if r.answers]  # whoever has none left changes no interval
+    kept = [r for r in kept if r.answers]  # a rater without answers must not change intervals
     return {
         "study": key.study,
         "title": key.title,
@@ -312,11 +312,11 @@ def _rater(rater: Rater, key: Key) -> RaterSummary:
 
 
 def share(counts: Counts, seed: int) -> Share:
-    """A share with two 95 % intervals: Wilson's (independent answers) and a bootstrap over raters.
+    """Compute a share with two 95 % intervals: Wilson's (independent answers), and a bootstrap over raters.
 
     Args:
         counts: successes and trials of each rater.
-        seed: of the bootstrap.
+        seed: seed of the bootstrap.
     """
     from scipy.stats import binomtest
 
@@ -363,8 +363,7 @@ def _preference(key: Key, raters: list[Rater], seed: int) -> Preference | None:
     }
 
 
-# (winner, loser, scene, tie); for a tie the methods x and y
-Vote = tuple[str, str, str, bool]
+Vote = tuple[str, str, str, bool]  # (winner, loser, scene, tie); for a tie the methods x and y
 
 
 def _vote(entry: dict[str, str], answer: Answer) -> Vote:

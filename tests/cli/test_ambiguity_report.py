@@ -86,7 +86,7 @@ def test_without_a_background_colour_is_refused_or_left_out_on_request(scene: Pa
     assert "--background none" in error(scene, "-o", tmp_path / "out") and not (tmp_path / "out").exists()
     words = [str(scene), "-o", str(tmp_path / "out"), "--background", "none"]
     done = CliRunner().invoke(command, words, catch_exceptions=False)
-    assert "colour: no verdict, for no distractor's background is known" in done.stdout
+    assert "colour: no verdict, because no background of a distractor is known" in done.stdout
     assert "100 % of the distractor pixels is unknown" in done.stdout
     assert json.loads((tmp_path / "out/ambiguity.json").read_text())["class"] in (
         "unknown",

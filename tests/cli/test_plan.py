@@ -42,7 +42,7 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
 def test_a_run_too_short_for_probes_is_told_so(scene, tmp_path):
     done = aw("plan", scene, "-o", tmp_path / "plan.json", "--iterations", "500")
     assert done.returncode == 0, done.stderr
-    assert "masks not tried: a tenth of the run is too short for probes" in done.stdout
+    assert "masks not tried: probes may take a tenth of the run, which is too short for them" in done.stdout
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert not plan["probed"] and plan["cost"] is None
 
@@ -63,11 +63,11 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
         (["plan", "SCENE", "-o", "SCENE/plan.json"], "would change the scene"),
         (["plan", "SCENE/nothing"], "there is no scene folder"),
         (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "poss"], "did you mean 'poses'"),
-        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "stands alone"),
+        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "cannot be combined"),
         (["bench", "--method", "refinesplat", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
         (
             ["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "plan.json", "--effects", "none"],
-            "--plan plan.json would not be read: 3dgs with --effects none; add --effects auto",
+            "--plan plan.json would not be used: 3dgs with --effects none; add --effects auto",
         ),
     ],
 )  # fmt: skip

@@ -46,7 +46,7 @@ def test_a_result_says_where_test_photos_may_hold_distractors(tmp_path):
     (cell,) = plan_cells(["3dgs"], [write_tiny_scene(tmp_path / "scene")], [0], TrainConfig(iterations=1))
     assert "test_photos" not in cell.result()["facts"]
     mixed = replace(cell, scene=replace(cell.scene, info={**cell.scene.info, "split": "every-8"}))
-    assert "every 8th photo tests" in mixed.result()["facts"]["test_photos"]
+    assert "every 8th photo is a test photo" in mixed.result()["facts"]["test_photos"]
     chosen = replace(cell, scene=replace(cell.scene, info={**cell.scene.info, "split": "list"}))
     assert "test_photos" not in chosen.result()["facts"]
 

@@ -27,8 +27,8 @@ from ambiguous_wild.report.cost_curves import (
     timeline,
 )
 from ambiguous_wild.report.cost_plots import draw_all, spread_out
-from ambiguous_wild.report.cost_reach import first_time, times_to_reach
-from ambiguous_wild.report.cost_read import CostRun, CostRuns, read_cost_runs
+from ambiguous_wild.report.cost_runs import CostRun, CostRuns, read_cost_runs
+from ambiguous_wild.report.cost_targets import first_time, times_to_reach
 from tests.harness.fake_cost import cost_run
 from tests.harness.fake_runs import failed
 

@@ -152,12 +152,12 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     _, job = cell
     other = write_tiny_scene(tmp_path / "other", distractors=False)
     (other / "test_list.txt").write_text("test_0.png\n")
-    assert "another state of ambiguous_wild" in jobs.run_job(replace(job, code="x")).error
+    assert "the code of ambiguous_wild differs" in jobs.run_job(replace(job, code="x")).error
     assert "would be another run" in jobs.run_job(replace(job, scene=str(other))).error
     changed = [replace(s, content=s.content + b"\nenvironment: {A: b}\n") for s in job.sources]
     registry.registered.clear()
     assert "would be another run" in jobs.run_job(replace(job, sources=tuple(changed))).error
-    with pytest.raises(AwError, match=r"does not see .*--transfer store"):
+    with pytest.raises(AwError, match=r"cannot see .*--transfer store"):
         jobs.check_storage(replace(job, token=str(tmp_path / "absent")), wait_s=0.0)
 
 

@@ -130,5 +130,5 @@ def test_the_session_hands_the_gpus_on_and_warns_where_they_are_shared(four_gpus
     used.in_process(cells)
     used.run(cells, Path(), None)
     assert given[1] == jobs and given[-1] == ["4", "5", "6", "7"]
-    begins = f"warning: {jobs} cells at a time share 4 GPUs"
+    begins = f"warning: {jobs} cells at a time share the memory and the time of 4 GPUs"
     assert any(line.startswith(begins) for line in said) is warned

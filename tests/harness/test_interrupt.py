@@ -77,7 +77,7 @@ def test_a_second_one_ends_at_once(
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(training.evaluate, "render_and_measure", pressed)
-    with pytest.raises(Stopped, match="goes on") as told:
+    with pytest.raises(Stopped, match="to resume") as told:
         train(scene, tmp_path / "runs", PressesAt(5))
     run = tmp_path / "runs" / "wall" / "3dgs" / "seed0"
     assert "dB" not in str(told.value) and not (run / "stopped").exists()

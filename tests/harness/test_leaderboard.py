@@ -163,16 +163,16 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "render": (repaint, "was changed: psnr of test_0.png"),
     "render gone": (lambda r: (r / "renders/test/test_0.png").unlink(), "is partial, it lacks renders"),
     "image unlisted": (lambda r: change_result(r, easy_images), "is partial: test_1.png was rendered"),
-    "image dropped": (drop_image, "is partial: measured are 1 images"),
+    "image dropped": (drop_image, "is partial: 1 images were measured"),
     "render damaged": (lambda r: (r / "renders/test/test_0.png").write_bytes(b"x"), "test_0.png"),
-    "model": (lambda r: (r / "point_cloud.ply").write_bytes(b"p"), "point_cloud.ply is not of the size"),
+    "model": (lambda r: (r / "point_cloud.ply").write_bytes(b"p"), "the size of point_cloud.ply differs"),
     "no environment": (lambda r: (r / "env.json").unlink(), "it lacks env.json"),
     "config": (lambda r: change_config(r, fewer_iterations, hashed=False), "hashes to"),
     "seed": (lambda r: change_config(r, lambda c: c["train"].update(seed=4), hashed=True), "seed is '4'"),
     "no config": (lambda r: (r / "config.yaml").unlink(), "config.yaml is absent"),
-    "code": (anonymous, "has no hash of its code"),
+    "code": (anonymous, "has no hash of it"),
     "photo": (retouch_photo, "name the right one with --scene"),
-    "path": (lambda r: change_result(r, outside), "outside itself"),
+    "path": (lambda r: change_result(r, outside), "outside of its folder"),
     "failed": (fail, "a failed run has no numbers"),
     "unfinished": (lambda r: (r / "metrics.json").unlink(), "has no metrics.json"),
     "not JSON": (lambda r: (r / "metrics.json").write_text("{"), "is damaged"),
@@ -203,7 +203,7 @@ def test_other_numbers_for_a_cell_need_replace(one: Path, tmp_path: Path) -> Non
     board = tmp_path / "board"
     worse = write_run(tmp_path / "more", tmp_path / "wall", noise=30.0)
     both = add(board, one, worse)  # neither wins by standing first
-    assert both.exit_code == 2 and both.stdout.count("the same cell with other numbers") == 2
+    assert both.exit_code == 2 and both.stdout.count("the same cell with different numbers") == 2
     assert not board.exists()
     add(board, one)
     before = content(board)
@@ -224,7 +224,7 @@ def test_another_scene_of_the_same_name_is_refused(one: Path, tmp_path: Path) ->
     (scene / "test_list.txt").write_text(names[0] + "\n")
     other = write_run(tmp_path / "more", scene, "refinesplat")
     done = add(tmp_path / "board", other)
-    assert done.exit_code == 2 and "their numbers do not compare" in done.stdout
+    assert done.exit_code == 2 and "their numbers cannot be compared" in done.stdout
 
 
 def test_without_its_scene_a_run_is_marked_and_needs_a_dataset(one: Path, tmp_path: Path) -> None:
@@ -299,7 +299,7 @@ def test_check_finds_what_was_changed_by_hand(runs: Path, tmp_path: Path) -> Non
     found = aw("check", "--board", tmp_path)
     assert found.exit_code == 2
     for part in (
-        "same numbers in all digits",
+        "agree in all digits",
         "same configuration hash",
         "tiny-set.csv row 7 (3dgs on wall with seed 7 (100 iterations)) was changed by hand",
     ):

@@ -75,8 +75,8 @@ def edit_index(board: Path) -> None:
 
 EDITS = {
     "row": (edit, "tiny-set.csv row 2 (3dgs on wall with seed 0 (100 iterations)) was changed by hand"),
-    "all": (edit_all, "all.csv is not what"),
-    "row dropped": (drop_row, "all.csv is not what"),
+    "all": (edit_all, "all.csv does not match"),
+    "row dropped": (drop_row, "all.csv does not match"),
     "index": (edit_index, "index.csv row 2 was changed by hand"),
 }
 
@@ -160,7 +160,7 @@ def test_every_metric_of_pictures_is_computed_again(one: Path, tmp_path: Path) -
         (one / "metrics.json").write_text(good)
         if all(metric in row for row in rows):
             change_result(one, without(metric, at))
-            assert f"is partial: no {metric} of test_{at}.png" in add(tmp_path / "board", one).stdout
+            assert f"is partial: it has no {metric} of test_{at}.png" in add(tmp_path / "board", one).stdout
             (one / "metrics.json").write_text(good)
     change_result(one, lambda r: r["per_image"][1].update(psnr_valid=40.0))  # that photo has no mask
     assert "no such pixel" in add(tmp_path / "board", one).stdout
@@ -188,7 +188,7 @@ def no_ssim(result: dict) -> None:
 
 
 IMPOSSIBLE: dict[str, tuple[Callable[[dict], object], str]] = {
-    "no ssim": (no_ssim, "no ssim of test_0.png, test_1.png, which every run measures"),
+    "no ssim": (no_ssim, "it has no ssim of test_0.png, test_1.png, which every run measures"),
     "ssim null": (set_image("ssim_inria", None), "no ssim_inria of test_0.png"),
     "train_s": (lambda r: r["cost"].update(train_s=-5), "cost.train_s is -5"),
     "fps": (lambda r: r["cost"].update(fps="inf"), "cost.fps is inf"),
@@ -196,7 +196,7 @@ IMPOSSIBLE: dict[str, tuple[Callable[[dict], object], str]] = {
     "ssim": (set_image("ssim", 1.2), "ssim of test_0.png is 1.2"),
     "flip": (set_image("flip", -0.1), "flip of test_0.png is -0.1"),
     "lpips": (set_image("lpips_vgg", "inf"), "lpips_vgg of test_0.png is inf"),
-    "psnr": (set_image("psnr", "inf"), "infinite only where picture and photo are equal"),
+    "psnr": (set_image("psnr", "inf"), "infinite only if picture and photo are equal"),
     "psnr below": (set_image("psnr", "-inf"), "psnr of test_0.png is -inf"),
 }
 
@@ -230,7 +230,7 @@ def test_test_photos_for_renders_are_refused(one: Path, tmp_path: Path) -> None:
     ideal = {"psnr": "inf", "ssim": 1.0, "ssim_inria": 1.0}
     change_result(one, lambda r: r["per_image"][1].update(ideal))
     done = add(tmp_path / "board", one)
-    assert done.exit_code == 2 and "every pixel of test_1.png is its photo's" in done.stdout
+    assert done.exit_code == 2 and "every pixel of test_1.png equals the photo's" in done.stdout
 
 
 def set_command(text: str) -> Callable[[dict], object]:
@@ -258,12 +258,12 @@ def test_a_command_is_quoted_whatever_the_configuration_holds(one: Path, tmp_pat
     (one / "config.yaml").write_text(yaml.safe_dump(config))
     change_result(one, lambda r: r.update(config_hash=config["config_hash"], options=config["options"]))
     done = add(tmp_path / "board", one)
-    assert done.exit_code == 2 and "which no command can show" in done.stdout
+    assert done.exit_code == 2 and "the invisible character" in done.stdout
 
 
 def test_one_run_under_two_datasets_is_refused(board: Path, one: Path) -> None:
     done = add(board, one, "--dataset", "Other")
-    assert done.exit_code == 2 and "is there already as 3dgs on wall" in done.stdout
+    assert done.exit_code == 2 and "is on the board as 3dgs on wall" in done.stdout
     assert [e.dataset for e in read_board(board)] == ["Tiny set"] and check(board).problems == ()
 
 

@@ -227,8 +227,8 @@ def findings_stand_at_their_cells(page: Browser) -> None:
     assert page.run("$('source').options.length") == 2
     assert names(page, "others-table") == ["A", "B"]
     marked = page.run("[...document.querySelectorAll('#others-table .asked')].map((c) => c.title)")
-    assert any("where they give" in t for t in marked) and any("22.0" in t for t in marked)
-    assert "where they give" in said(page, "findings")
+    assert any("but the parts give" in t for t in marked) and any("22.0" in t for t in marked)
+    assert "but the parts give" in said(page, "findings")
     assert page.run("document.querySelectorAll('#others-table .flag').length") == len(marked) >= 3
     choose(page, "source", "tab:two")
     assert column(page, 1, "others-table")[0].startswith("22.0")

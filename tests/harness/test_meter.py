@@ -209,28 +209,28 @@ def test_a_rollback_keeps_what_was_spent_and_seen(tmp_path, monkeypatch):
 def test_runs_count_each_other_and_forget_the_dead(tmp_path):
     one, two = Presence("cpu", tmp_path), Presence("cpu", tmp_path)
     other_gpu = Presence("GPU-1234", tmp_path)
-    with one.here():
+    with one.announced():
         assert one.count() == 1
-        with two.here(), other_gpu.here():
+        with two.announced(), other_gpu.announced():
             assert one.count() == two.count() == 2
             assert other_gpu.count() == 1
         assert one.count() == 1
     code = (
         "import os, sys\nfrom pathlib import Path\n"
         "from ambiguous_wild.harness.meter import Presence\n"
-        "p = Presence('cpu', Path(sys.argv[1]))\np.here().__enter__()\nprint(p.count(), flush=True)\n"
+        "p = Presence('cpu', Path(sys.argv[1]))\np.announced().__enter__()\nprint(p.count(), flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
     assert done.stdout == "1\n"
-    with one.here():
+    with one.announced():
         assert one.count() == 1
     assert not list(tmp_path.rglob("*.lock"))
 
 
 def test_two_runs_at_once_are_contended(tmp_path, monkeypatch):
     here, m = Machine(monkeypatch), meter(tmp_path)
-    with Presence("cpu", tmp_path).here():
+    with Presence("cpu", tmp_path).announced():
         assert measured(m, here.work) == ("contended", "2 runs shared the machine")
 
 

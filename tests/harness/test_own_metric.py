@@ -82,9 +82,12 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     ("text", "said"),
     [
         (OWN.replace("* 1", "* wrong"), "NameError: name 'wrong' is not defined (my_metric.py, line 5)"),
-        (OWN.replace("return", "x ="), "metric grey_error: it returned NoneType, not one number"),
-        (OWN.replace("render.std()", "render - 1"), "metric contrast: it returned ndarray, not one number"),
-        (OWN.replace('"grey_error", "grey', '"psnr", "grey'), "metric 'psnr' is one of ours"),
+        (OWN.replace("return", "x ="), "metric grey_error: the function returned NoneType, not one number"),
+        (
+            OWN.replace("render.std()", "render - 1"),
+            "metric contrast: the function returned ndarray, not one number",
+        ),
+        (OWN.replace('"grey_error", "grey', '"psnr", "grey'), "metric 'psnr' is built in"),
         (OWN.replace('"grey_error", "grey', '"Grey error", "grey'), "'Grey error' cannot name a metric"),
         (OWN.replace('"lower"', '"low"'), "'grey_error': better is 'low': write 'higher', 'lower' or None"),
         (OWN.replace('"lower", 1', '"lower", 0.1'), "digits is 0.1: write a whole number"),

@@ -12,7 +12,7 @@ import pytest
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness import effects_plan, residual_probe
 from ambiguous_wild.harness import effects_plan as decide_module
-from ambiguous_wild.harness.choosing import check_wanted
+from ambiguous_wild.harness.chosen_effects import check_wanted
 from ambiguous_wild.harness.effects_plan import (
     FEW_PHOTOS,
     OUTWARD,
@@ -316,7 +316,7 @@ def test_what_stands_out_must_stay_when_a_longer_probe_has_learnt_the_rest(monke
 def test_words_and_lists():
     assert check_wanted("auto") == check_wanted("none") == ()
     assert check_wanted("poses, exposure") == ("exposure", "poses")
-    for wrong, message in (("auto,poses", "stands alone"), (" , ", "is empty"), ("exposur", "did you mean")):
+    for wrong, message in (("auto,poses", "be combined"), (" , ", "is empty"), ("exposur", "did you mean")):
         with pytest.raises(AwError, match=message):
             check_wanted(wrong)
 

@@ -61,7 +61,7 @@ def test_a_rollback_is_a_fact_of_the_result(run):
 
 
 def test_a_run_without_findings_is_named(tmp_path):
-    with pytest.raises(AwError, match="its watchdog found nothing"):
+    with pytest.raises(AwError, match="all its values were finite"):
         replay(tmp_path)
 
 

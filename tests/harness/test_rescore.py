@@ -179,7 +179,7 @@ def test_bench_says_that_kept_runs_could_be_rescored(
     report = bench("3dgs", scene, callbacks=again, **words)
     assert f"lack lpips_alex, which can be measured now: aw rescore {tmp_path / 'runs'}" in again.lines[-1]
     assert could_be_measured([report.runs[0].result]) == ["lpips_alex"]
-    assert bench_module._rescorable(report)
+    assert bench_module._rescore_hint(report)
 
 
 def measured_lpips(sizes: list[tuple[int, int]], half: bool = False) -> tuple[list[ImageRow], dict[str, str]]:

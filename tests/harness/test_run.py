@@ -91,8 +91,8 @@ def far_principal_point(root):
     [
         (no_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
         (user_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
-        (points_behind, "of one colour: no Gaussian lies in front"),
-        (far_principal_point, "of one colour: no Gaussian lies in front"),
+        (points_behind, "a single colour each: no Gaussian is in front"),
+        (far_principal_point, "a single colour each: no Gaussian is in front"),
     ],
 )
 def test_a_run_that_learns_or_shows_nothing_fails_with_the_reason(spoil, reason, tmp_path):
@@ -112,7 +112,7 @@ def test_what_to_do_where_a_default_followed_the_weights(scene, tmp_path):
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(written))))
     (tmp_path / "point_cloud.ply").touch()
     refuse_other_config(tmp_path, old)
-    with pytest.raises(AwError, match=r"as before with --set robustsplat\.features=sceneconv$"):
+    with pytest.raises(AwError, match=r"--set robustsplat\.features=sceneconv keeps the earlier value$"):
         refuse_other_config(tmp_path, new)
 
 
@@ -202,7 +202,7 @@ def test_a_folder_that_is_not_ours_is_left_alone(scene, tmp_path):
     mine.parent.mkdir(parents=True)
     mine.write_text("all I have")
     for overwrite in ("missing", "always"):
-        with pytest.raises(AwError, match="no run of ours"):
+        with pytest.raises(AwError, match="no run of this program"):
             bench(scene, tmp_path, "3dgs", overwrite=overwrite)
     assert mine.read_text() == "all I have"
 
@@ -319,7 +319,7 @@ def test_settings_of_somebody_elses_program_do_not_make_a_folder_ours(scene, tmp
     folder = tmp_path / "scene" / "3dgs" / "seed0"
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text("a: 1\n")
-    with pytest.raises(AwError, match="no run of ours"):
+    with pytest.raises(AwError, match="no run of this program"):
         bench(scene, tmp_path, "3dgs", overwrite="always")
     assert (folder / "config.yaml").read_text() == "a: 1\n"
 

@@ -95,9 +95,9 @@ def test_half_of_a_budget_is_each_passes(scene, tmp_path):
     from ambiguous_wild.splat.pace import TrainConfig
 
     cell = SimpleNamespace(method=get_method("dronesplat+2passes"), train=TrainConfig(budget_s=30.0))
-    assert passes.of_one_pass(cell).budget_s == 15.0
+    assert passes.config_of_one_pass(cell).budget_s == 15.0
     once = SimpleNamespace(method=get_method("dronesplat"), train=TrainConfig(budget_s=30.0))
-    assert passes.of_one_pass(once).budget_s == 30.0
+    assert passes.config_of_one_pass(once).budget_s == 30.0
 
 
 def test_costs_of_both_by_hand():

@@ -60,7 +60,7 @@ def test_a_run_starts_from_points_thinned_to_what_it_may_hold_and_is_another_run
     (line,) = (line for line in heard.lines if "starts from" in line)
     kept = heard.starts[0]
     assert f"3dgs starts from {kept:,} of the 20,000 points of dense.ply, chosen at random" in line
-    assert 400 < kept < 20_000 * START_SHARE and f"hold {round(kept / START_SHARE):,}"[:-2] in line
+    assert 400 < kept < 20_000 * START_SHARE and f"have {round(kept / START_SHARE):,}"[:-2] in line
     result = json.loads((report.runs[0].folder / "metrics.json").read_text())
     assert result["facts"]["start"].startswith("dense.ply (")
 

@@ -83,7 +83,7 @@ def test_every_number_survives(value: float) -> None:
         ({"status": "failed"}, "must say its error"),
         ({"per_image": [{"psnr": 3.0}]}, "missing required field `name`"),
         ({"per_image": [3]}, r"\$\.per_image\[0\]"),
-        ({"per_image": [{"name": "a"}, {"name": "a"}]}, "is there twice"),
+        ({"per_image": [{"name": "a"}, {"name": "a"}]}, "is listed twice"),
         ({"per_image": [{"name": "a", "psnr": "high"}]}, r"got `str` - at `\$\.per_image\[0\]\.psnr"),
         ({"per_image": [{"name": "a", "psnr": True}]}, r"\.psnr`"),
         ({"per_image": [{"name": "a", "of_a_plugin": [1.0]}]}, "got `array`"),

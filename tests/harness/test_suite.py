@@ -52,7 +52,7 @@ def test_a_suite_end_to_end(name, large, tmp_path):
     assert info["dataset"] == suite.dataset
     assert info["factor"] == (suite.factor or 8)
     missing = [s for s in suite.scenes if scene_id(s) not in {p.name for p in (tmp_path / "runs").iterdir()}]
-    assert (f"not here: {', '.join(missing)}" in done.stdout) == bool(missing)
+    assert (f"scenes not found: {', '.join(missing)}" in done.stdout) == bool(missing)
     again = aw(*words, "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1")
     assert again.returncode == 0 and "imported" not in again.stderr
 

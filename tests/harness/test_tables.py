@@ -166,7 +166,7 @@ def test_an_infinite_psnr_enters_no_mean_and_no_rank(tmp_path: Path) -> None:
     )
     assert cell(table, "a", "psnr").value == 20.0 and cell(table, "a", "psnr").rank == 2
     assert cell(table, "b", "psnr").value == 22.5 and cell(table, "b", "psnr").rank == 1
-    assert "psnr of a on one: mean of 1 of 2 values, the others are not finite" in to_text(table)
+    assert "psnr of a on one: mean of 1 of 2 values; the others are not finite" in to_text(table)
     only = table_of(tmp_path / "only", fake_result("a", psnr=(math.inf,)), fake_result("b", psnr=(20.0,)))
     assert cell(only, "a", "psnr").state == "missing" and cell(only, "b", "psnr").rank is None
 
@@ -220,7 +220,7 @@ def test_a_method_with_an_unfinished_seed_shows_its_mean_but_no_rank(tmp_path: P
     assert cell(table, "a", "psnr", 1).value == 50.0
     ranks = [[cell(table, m, "psnr", block).rank for m in "abc"] for block in range(3)]
     assert ranks == [[None, 1, 2], [None, 1, 2], [1, 2, 3]]  # mean, one, two
-    assert "not ranked: a on one: 1 run of it incomplete" in table[-1].notes
+    assert "not ranked: a on one: 1 run incomplete" in table[-1].notes
 
 
 def test_who_knows_the_truth_is_not_ranked(tmp_path: Path) -> None:
@@ -304,7 +304,7 @@ def test_a_null_without_a_reason_is_noted(tmp_path: Path) -> None:
     older = fake_result("c", per_image=[{"name": "0.png", "psnr": 20.0}], missing={})
     table = table_of(tmp_path, fake_result("a", per_image=images, missing={}), fake_result("b"), older)
     assert cell(table, "a", "ssim").state == cell(table, "c", "ssim").state == "missing"
-    assert "missing: ssim for c on yard: not measured there; 'aw rescore' adds it" in table[-1].notes
+    assert "missing: ssim for c on yard: it was not measured; 'aw rescore' adds it" in table[-1].notes
     assert "missing: ssim, no reason given, for 1.png (a on yard)" in table[-1].notes
 
 

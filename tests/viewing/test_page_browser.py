@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.harness.models import Viewer, view_runs
+from ambiguous_wild.harness.trained_models import Viewer, view_runs
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.viewing.model import Renderer, RenderSettings
 from ambiguous_wild.viewing.video import fitted

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.models import Viewer, read_render_settings, view_runs
+from ambiguous_wild.harness.trained_models import Viewer, read_render_settings, view_runs
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
@@ -181,7 +181,7 @@ def test_another_model_or_another_state_of_the_scene_is_refused(tmp_path: Path) 
     with pytest.raises(AwError, match="was measured on another state of"):
         view_runs([run], tmp_path / "out")
     done = aw("export", run, "--format", "spz")
-    assert "loss not measured" in done.stderr and "another state of" in done.stderr
+    assert "loss is not measured" in done.stderr and "another state of" in done.stderr
     done = aw("video", run, "-o", tmp_path / "v.mp4")
     assert done.returncode == 2 and "another state of" in done.stderr and done.stderr.count("\n") == 1
 

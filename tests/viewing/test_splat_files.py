@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Place
-from ambiguous_wild.harness.models import read_models
+from ambiguous_wild.harness.trained_models import read_models
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import read_splats

@@ -1,4 +1,4 @@
-"""What `aw export`, `aw video` and `aw view --live` do, as calls."""
+"""Export and film the models of runs, and watch a training, as `aw export`, `aw video`, `aw view --live`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.harness.bench import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
-from ambiguous_wild.harness.models import find_models, open_scene, read_files, read_models
+from ambiguous_wild.harness.trained_models import find_models, open_scene, read_files, read_models
 from ambiguous_wild.io.files import check_output, refuse_files_there
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene
@@ -53,15 +53,15 @@ def export_runs(
 
     Args:
         paths: run folders, folders of runs, or splat files.
-        formats: of `viewing.export.FORMATS`.
+        formats: names in `viewing.model.FORMATS`.
         output: folder for all files, named after the models' labels; None = RUN/export, or beside a file.
-        loss: render the test views to measure what rounding costs. Without scene or test views only sizes
+        loss: render the test views to measure the loss by rounding; without scene or test views only sizes
             are reported.
         scene_folder: where the scene lies; None = where the runs say.
-        threads: of the kernels; None = all.
-        overwrite: replace files of these names in `output`; those in RUN/export are replaced anyway.
+        threads: threads of the kernels; None = all cores.
+        overwrite: replace files of these names in `output`; those in RUN/export are always replaced.
         up: axis of the files that points up, see `viewing.model.export`; None = the scene's coordinates.
-        say: told what is left out, and why.
+        say: gets a line about each run that is left out.
 
     Returns:
         (label of the model, its files), in the order of the runs' paths.
@@ -72,26 +72,26 @@ def export_runs(
     """
     files, notes = read_files(paths)
     runs = [path for path in paths if not path.is_file()]
-    found, more = find_models(runs) if runs else ([], [])
+    trained, more = find_models(runs) if runs else ([], [])
     for note in (*notes, *more):
         say(note)
-    models = [*(f.model for f in found), *files]
-    homes = [f.run for f in found] + [model.ply.parent for model in files]
-    scenes = [f.scene for f in found] + [found[0].scene if found else ""] * len(files)
+    models = [*(t.model for t in trained), *files]
+    homes = [t.run for t in trained] + [model.ply.parent for model in files]
+    scenes = [t.scene for t in trained] + [trained[0].scene if trained else ""] * len(files)
     stems = [re.sub(r"(\.compressed)?\.\w+$", "", model.label) for model in files]
-    names = _file_names(scenes, [f.model.label for f in found] + stems)
+    names = _file_names(scenes, [t.model.label for t in trained] + stems)
     folders = [home / FOLDER if output is None else output for home in homes]
     for folder in folders:
         check_output(folder / "file")
-    if not overwrite:  # what lies in a run is ours
-        for folder, name in list(zip(folders, names))[len(found) if output is None else 0 :]:
+    if not overwrite:  # files in RUN/export are replaced anyway
+        for folder, name in list(zip(folders, names))[len(trained) if output is None else 0 :]:
             wanted = [name + FORMATS[form][0] for form in formats if form in FORMATS]
             refuse_files_there(folder, wanted, "--overwrite")
     if loss:
         prepare_cpu(threads, say)
     reports = []
     for number, (model, folder, name) in enumerate(zip(models, folders, names)):
-        run = homes[number] if number < len(found) else None
+        run = homes[number] if number < len(trained) else None
         scene: Scene | None = None
         try:
             if run is not None and (loss or up is not None):
@@ -102,7 +102,7 @@ def export_runs(
         except AwError as error:
             if up is not None or run is None:
                 raise
-            say(f"{model.label}: loss not measured: {error}")
+            say(f"{model.label}: the loss is not measured: {error}")
         if up is not None and scene is None:
             raise AwError(f"{model.ply}: --up needs the cameras of its scene: name its folder with --scene")
         space = None if up is None or scene is None else space_of(scene)
@@ -114,8 +114,7 @@ def export_runs(
 
 
 def _file_names(scenes: Sequence[str], labels: Sequence[str]) -> list[str]:
-    """A file name for each model: letters, digits and a few signs of its label, after its scene's name where
-    there are several scenes, made unique by a number."""
+    """Return a unique file name for each model, from its label and, with several scenes, the scene's name."""
     several = len(set(scenes)) > 1
     taken: dict[str, int] = {}
     names = []
@@ -133,7 +132,7 @@ PATHS = ("test", "orbit")
 
 @dataclass(frozen=True)
 class Video:
-    """What was written."""
+    """The video that was written."""
 
     path: Path
     gif: Path | None
@@ -167,14 +166,15 @@ def video_runs(
         output: the .mp4 file.
         path: "test" (through the test cameras), "orbit", or a file of a viewer.
         seconds, fps: length and frames per second.
-        width: of each method's picture, px; None = the photos'.
-        columns: pictures in a row.
-        gif: also an animation of the video, played faster so that it lasts `gif_seconds`.
-        gif_seconds, gif_width: its length and width, px.
-        scene: name of the scene, where the runs are of several.
-        scene_folder: where it lies; None = where the runs say.
-        threads: of the kernels; None = all.
-        say, tick: told what is done.
+        width: width of each method's picture, px; None = that of the photos.
+        columns: number of pictures in a row.
+        gif: path of an animation, the video played faster so that it lasts `gif_seconds`; None = none.
+        gif_seconds, gif_width: length and width in px of the animation.
+        scene: name of the scene to show, if the runs are of several.
+        scene_folder: where the scene lies; None = where the runs say.
+        threads: threads of the kernels; None = all cores.
+        say: gets notes about the models.
+        tick: called with (frames done, frames).
 
     Raises:
         AwError: no run with a model, several scenes, no scene, no camera path, or no place for the file.
@@ -222,8 +222,8 @@ def _cameras(scene: Scene, path: str | Path, frames: int, width: int | None) -> 
     return from_file(Path(path), scene, frames, size)
 
 
-class Watched(Callbacks):
-    """Shows every step of a run to a live view."""
+class ShowInView(Callbacks):
+    """Callbacks that show every step of a run in a live view."""
 
     def __init__(self, view: LiveView, say: Callable[[str], None] = lambda text: None) -> None:
         self.view, self._say = view, say
@@ -232,7 +232,7 @@ class Watched(Callbacks):
         self._say(text)
 
     def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
-        assert one_by_one, "only then is tick called"
+        assert one_by_one, "tick is called only in this process"
 
     def started(self, cell: Cell, folder: Path) -> None:
         self._say(f"{run_name(cell)} -> {folder}")
@@ -241,9 +241,9 @@ class Watched(Callbacks):
         self.view.tick(trainer)
 
     def ended(self, cell: Cell, report: CellReport) -> None:
-        told = f"{run_name(cell)}: {outcome_line(report)}"
-        self.view.end(told)
-        self._say(told)
+        line = f"{run_name(cell)}: {outcome_line(report)}"
+        self.view.end(line)
+        self._say(line)
 
 
 def watch(
@@ -265,14 +265,14 @@ def watch(
     """Train a method on a scene and show it in a browser.
 
     Args:
-        scene: its folder.
+        scene: folder of the scene.
         method: as `aw bench --method`.
-        output: folder of the run, as `aw bench -o`; a run that stopped goes on.
+        output: folder of the run, as `aw bench -o`; a stopped run is resumed.
         iterations, max_gaussians, seed, threads, device: as in `bench`.
-        host, port: where the page is served.
+        host, port: address of the page.
         paused: pause after the first step.
-        say: told the address and the outcome.
-        view: a view to use instead of a new one; it stays open.
+        say: gets the address and the outcome.
+        view: a view to use instead of a new one; it is not closed.
 
     Raises:
         AwError: viser is missing, the port is taken, or the run failed.
@@ -292,7 +292,7 @@ def watch(
             threads=threads,
             device=device,  # type: ignore[arg-type]
             jobs=1,
-            callbacks=Watched(shown, say),
+            callbacks=ShowInView(shown, say),
         )
     finally:
         if view is None:

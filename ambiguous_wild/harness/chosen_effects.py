@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.methods.registry import MethodEntry
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def scene_protocol(scene: Scene) -> Literal["full", "half"]:
-    """Which part of a test photo is measured.
+    """Return which part of a test photo is measured, from scene.json.
 
     Raises:
         AwError: scene.json names a protocol that does not exist.
@@ -27,13 +27,13 @@ def scene_protocol(scene: Scene) -> Literal["full", "half"]:
     protocol = _evaluation(scene).get("protocol", "full")
     if protocol not in ("full", "half"):
         raise AwError(
-            f"{scene.root}: scene.json has the protocol {str(protocol)[:40]!r}; full and half are known"
+            f"{scene.root}: scene.json has the protocol {str(protocol)[:40]!r}; it must be full or half"
         )
     return protocol
 
 
 def published_effects(scene: Scene) -> tuple[str, ...]:
-    """The effects that are fitted to a test photo.
+    """Return the effects that are fitted to a test photo, from scene.json.
 
     Raises:
         AwError: scene.json names an effect that does not exist.
@@ -42,39 +42,40 @@ def published_effects(scene: Scene) -> tuple[str, ...]:
     return check_effects(str(name) for name in names) if isinstance(names, list) else ()
 
 
-def _evaluation(scene: Scene) -> Mapping[str, Any]:
-    known = scene.info.get("evaluation")
-    return known if isinstance(known, dict) else {}
+def _evaluation(scene: Scene) -> Mapping[str, object]:
+    section = scene.info.get("evaluation")
+    return section if isinstance(section, dict) else {}
 
 
-MIXED = "test photos may hold distractors"  # begins what results, tables and pages say of such a scene
+MIXED = "test photos may hold distractors"  # begins the note on such a scene in results, tables and pages
 
 
 def mixed_tests(scene: Scene) -> str:
-    """What to say of a scene whose test photos nobody chose as clean; empty for every other.
+    """Return a note for a scene whose test photos were not chosen as clean; empty for every other scene.
 
     Where `aw build-scene` is given no test photos, every 8th photo tests, and scene.json says so.
     """
     split = str(scene.info.get("split", ""))
     if not split.startswith("every-"):
         return ""
-    return f"{MIXED}: every {split.removeprefix('every-')}th photo tests, and what is in it counts as truth"
+    every = split.removeprefix("every-")
+    return f"{MIXED}: every {every}th photo is a test photo, and everything in it counts as truth"
 
 
 WORDS = ("auto", "none", "all")
-NOT_OURS = "an external program takes none"  # why a method trains without the effects of its bench
+NOT_OURS = "an external program takes none"  # why a method trains without the effects that others have
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """The effects of one run, and why these."""
+    """The effects of one run, and the request and plan that they come from."""
 
     effects: tuple[str, ...] = ()
     asked: str = ""  # empty: no effects were asked for, and no effects.json is written
     plan: Plan | None = None
 
     def write(self, path: Path) -> None:
-        """effects.json of the run."""
+        """Write effects.json of the run."""
         if not self.asked:
             return
         from ambiguous_wild.io.files import write_json
@@ -84,10 +85,10 @@ class Chosen:
 
 
 def check_wanted(wanted: str) -> tuple[str, ...]:
-    """The names in a list of effects, in the order in which they act; none for a word such as "auto".
+    """Return the effects in a list, in the order in which they act; empty for a word such as "auto".
 
     Raises:
-        AwError: no word and no list of effects.
+        AwError: the text is neither such a word nor a list of effects.
     """
     if wanted in WORDS:
         return ()
@@ -96,12 +97,12 @@ def check_wanted(wanted: str) -> tuple[str, ...]:
         raise AwError("--effects is empty: write auto, none, all, or names with commas (docs/effects.md)")
     mixed = [name for name in names if name in WORDS]
     if mixed:
-        raise AwError(f"--effects {wanted!r}: {mixed[0]!r} stands alone")
+        raise AwError(f"--effects {wanted!r}: {mixed[0]!r} cannot be combined with other names")
     return check_effects(names)
 
 
 def chosen_by(planned: Sequence[str], scene: Scene, method: MethodEntry) -> Chosen:
-    """What one method trains with under `--effects auto`: the same for all that can take effects.
+    """Return the effects of one method under `--effects auto`: the same for all that can take effects.
 
     Args:
         planned: effects that the plan of the scene calls for.
@@ -117,10 +118,10 @@ def chosen_by(planned: Sequence[str], scene: Scene, method: MethodEntry) -> Chos
 
 
 def takes_effects(method: MethodEntry) -> bool:
-    """Whether the method trains on our trainer: effects are parts of that, and a program has its own."""
+    """Return whether the method takes effects: they are parts of our trainer, which programs do not use."""
     return method.program is None
 
 
 def describe(effects: Sequence[str]) -> str:
-    """For a line of text."""
+    """Return the effects as text for a line, "none" without any."""
     return ", ".join(f"SH degree {DEGREES[e]}" if e in DEGREES else e for e in effects) or "none"

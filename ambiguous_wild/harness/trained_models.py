@@ -1,21 +1,20 @@
-"""The models of finished runs, with their scene, ready to be shown together; and the page of `aw view`."""
+"""Find the trained models of finished runs with their scene, and show them on the page of `aw view`."""
 
 from __future__ import annotations
 
 import html
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.cell import refuse_other_scene, scene_identity
-from ambiguous_wild.harness.choosing import mixed_tests
+from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
-from ambiguous_wild.harness.store import CONFIG, read_config, run_folders
+from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
@@ -36,7 +35,7 @@ class TrainedModel:
     scene_hash: str
     model: Model
     half: bool  # measured on the right half of each test photo
-    note: str = ""  # how it is drawn, where that may not be as in training
+    note: str = ""  # how it is drawn, where that may differ from training
 
 
 @dataclass(frozen=True)
@@ -45,22 +44,22 @@ class SceneModels:
 
     scene: Scene
     models: tuple[Model, ...]
-    notes: tuple[str, ...]  # what is not shown, and why; what a number means
+    notes: tuple[str, ...]  # which runs are not shown, and why; the meaning of numbers
 
 
 def read_models(
     paths: Sequence[Path], *, scene: str | None = None, scene_folder: Path | None = None
 ) -> SceneModels:
-    """The models of the runs below some folders and of splat files, and the scene they are of.
+    """Read the models of the runs below some folders and of splat files, and their scene.
 
     Args:
         paths: run folders, folders of runs, or splat files.
-        scene: name of the scene, where the runs are of several.
-        scene_folder: where it lies; None = where the runs say. Files without runs: without it, a scene
-            without photos.
+        scene: name of the scene to show, if the runs are of several.
+        scene_folder: where the scene lies; None = where the runs say. For splat files alone, None gives a
+            scene without photos.
 
     Raises:
-        AwError: no run, no model in any, runs of several scenes, or the scene is not where it was.
+        AwError: no run, no model in any, runs of several scenes, or a scene that has been moved.
     """
     files, notes = read_files(paths)
     folders = [path for path in paths if not path.is_file()]
@@ -69,33 +68,31 @@ def read_models(
         if scene_folder is None:
             notes.append(f"no --scene: the cameras are on a circle around {files[0].ply.name}, y down")
         return SceneModels(opened, tuple(model.within(opened.place) for model in files), tuple(notes))
-    found, more = find_models(folders if files else paths)
+    trained, more = find_models(folders if files else paths)
     notes += more
-    names = sorted({f.scene for f in found})
+    names = sorted({t.scene for t in trained})
     if scene is not None:
-        found = [f for f in found if f.scene == scene]
-        if not found:
+        trained = [t for t in trained if t.scene == scene]
+        if not trained:
             raise unknown("scene", scene, names)
     elif len(names) > 1:
         raise AwError(f"these runs are of {len(names)} scenes ({shortlist(names)}): choose one with --only")
-    if len({f.scene_hash for f in found}) > 1:
-        runs = shortlist(sorted(str(f.run) for f in found), 3)
-        raise AwError(
-            f"scene {found[0].scene!r} is not the same for all of these runs: {runs}; name them one by one"
-        )
-    if any(f.half for f in found):
+    if len({t.scene_hash for t in trained}) > 1:
+        runs = shortlist(sorted(str(t.run) for t in trained), 3)
+        raise AwError(f"scene {trained[0].scene!r} differs between these runs: {runs}; name them one by one")
+    if any(t.half for t in trained):
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
-    opened = open_scene(found[0].run, scene_folder)
+    opened = open_scene(trained[0].run, scene_folder)
     notes += [mixed] if (mixed := mixed_tests(opened)) else []
-    models = (*(f.model for f in found), *(model.within(opened.place) for model in files))
+    models = (*(t.model for t in trained), *(model.within(opened.place) for model in files))
     return SceneModels(opened, models, tuple(notes))
 
 
 def read_files(paths: Sequence[Path]) -> tuple[list[Model], list[str]]:
-    """The models of the splat files among the paths, of one label each, and notes.
+    """Read the models of the splat files among the paths, with unique labels, and notes on them.
 
     Raises:
-        AwError: a file that is none.
+        AwError: a file is no splat file.
     """
     read = [file_model(path) for path in dict.fromkeys(paths) if path.is_file()]
     count = Counter(model.label for model, _ in read)
@@ -104,14 +101,14 @@ def read_files(paths: Sequence[Path]) -> tuple[list[Model], list[str]]:
 
 
 def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
-    """Finished runs that have a model, in the order of their paths, and a line for each other run.
+    """Find the finished runs that have a model, in the order of their paths; write a line on each other run.
 
-    Labels tell runs of the same method apart by seed, then by folder.
+    Labels distinguish runs of the same method by seed, then by folder.
 
     Raises:
         AwError: no such folder, or no run with a model in any of them.
     """
-    found: list[TrainedModel] = []
+    trained: list[TrainedModel] = []
     notes: list[str] = []
     for root in paths:
         if not root.is_dir():
@@ -120,49 +117,49 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
                 "splat file"
             )
         for run in dict.fromkeys(run_folders(root)):
-            if any(f.run.samefile(run) for f in found):
+            if any(t.run.samefile(run) for t in trained):
                 continue
             try:
-                found.append(_found(run))
+                trained.append(_read_model(run))
             except AwError as error:
                 notes.append(f"not shown: {error}")
                 continue
-            if found[-1].note:
-                notes.append(found[-1].note)
-    if not found:
+            if trained[-1].note:
+                notes.append(trained[-1].note)
+    if not trained:
         why = f" ({notes[0]})" if notes else ""
         raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
-    return _with_labels(found), notes
+    return _with_labels(trained), notes
 
 
 def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) -> Scene:
-    """The scene of a run, with the photos it was trained on.
+    """Open the scene of a run, with the photos it was trained on.
 
     Args:
-        run: its folder.
+        run: the run's folder.
         folder: where the scene lies; None = where the run says.
-        verify: whether its files are compared with their hashes, and the scene with the one that the run saw.
+        verify: compare the files with their hashes, and the scene with the one that the run used.
 
     Raises:
-        AwError: it is not there, damaged, or another state of the scene than the run saw.
+        AwError: the scene is absent, damaged, or in another state than the run used.
     """
-    asked = read_config(run).get("scene")
-    if not isinstance(asked, dict):
+    config = read_config(run).get("scene")
+    if not isinstance(config, dict):
         raise AwError(f"{run} has no {CONFIG} that names its scene: restore it, or run 'aw bench' again")
-    path = Path(str(asked.get("path"))) if folder is None else folder
+    path = Path(str(config.get("path"))) if folder is None else folder
     if not path.is_dir():
         raise AwError(
             f"the scene of {run} is not at {path}: move the scene back "
             "('aw view', 'aw video' and 'aw export' take its folder: --scene)"
         )
-    factor = asked.get("factor")
+    factor = config.get("factor")
     scene = load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)
     if verify:
-        refuse_other_scene(run, path, scene_identity(scene), str(asked.get("sha256")))
+        refuse_other_scene(run, path, scene_identity(scene), str(config.get("sha256")))
     return scene
 
 
-def _found(run: Path) -> TrainedModel:
+def _read_model(run: Path) -> TrainedModel:
     result = read_result(run / RESULT)
     if result["status"] != "ok":
         raise AwError(f"{run} failed: {result['error']}")
@@ -186,11 +183,11 @@ def _found(run: Path) -> TrainedModel:
     return TrainedModel(run, result["scene"], result["scene_hash"], model, half, note)
 
 
-def read_render_settings(config: Mapping[str, Any]) -> tuple[RenderSettings, str]:
-    """How the run's method draws, from its recipe with the run's options and effects; and a note, or "".
+def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
+    """Return how the run's method draws, with the run's options and effects; and a note, or "".
 
-    A method that is not registered here is drawn as plain 3DGS. The name is the run's, which may be a
-    stranger's: no file that it refers to is imported.
+    An unknown method is drawn as plain 3DGS. The run may come from a stranger: no file that its name refers
+    to is imported.
     """
     name = str(config.get("method", ""))
     options = config.get("options")
@@ -203,21 +200,21 @@ def read_render_settings(config: Mapping[str, Any]) -> tuple[RenderSettings, str
         chosen = from_plain(type(entry.options()), options if isinstance(options, dict) else {}, "options")
         parts = entry.build(chosen)
     except AwError:
-        known = "drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
-        return RenderSettings(), f"{name}: its recipe is not known here: {known}"
+        advice = "it is drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
+        return RenderSettings(), f"{name} is an unknown method: {advice}"
     antialias = parts.antialias or "antialias" in (config.get("effects") or ())
     return RenderSettings(parts.sh_degree, antialias, parts.blur, parts.background), ""
 
 
-def _with_labels(found: list[TrainedModel]) -> list[TrainedModel]:
-    """Labels that are one model's each among those of its scene: by seed where need be, then by folder."""
-    labels = [f.model.label for f in found]
-    for names in ([f"{f.model.label}, {f.run.name}" for f in found], [str(f.run) for f in found]):
-        count = Counter((f.scene, label) for f, label in zip(found, labels))
+def _with_labels(trained: list[TrainedModel]) -> list[TrainedModel]:
+    """Make labels unique among the models of a scene: by seed where that is needed, then by folder."""
+    labels = [t.model.label for t in trained]
+    for names in ([f"{t.model.label}, {t.run.name}" for t in trained], [str(t.run) for t in trained]):
+        count = Counter((t.scene, label) for t, label in zip(trained, labels))
         labels = [
-            name if count[f.scene, label] > 1 else label for f, label, name in zip(found, labels, names)
+            name if count[t.scene, label] > 1 else label for t, label, name in zip(trained, labels, names)
         ]
-    return [replace(f, model=replace(f.model, label=label)) for f, label in zip(found, labels)]
+    return [replace(t, model=replace(t.model, label=label)) for t, label in zip(trained, labels)]
 
 
 def view_runs(
@@ -235,11 +232,11 @@ def view_runs(
     Args:
         paths: run folders, or folders of runs, all of one scene.
         output: folder of the page.
-        scene: name of the scene, where the runs are of several.
-        scene_folder: where it lies; None = where the runs say.
-        most_gaussians: a larger model is reduced to so many, with a note on the page.
-        title: of the page; None = the scene's name.
-        say: told what is done.
+        scene: name of the scene to show, if the runs are of several.
+        scene_folder: where the scene lies; None = where the runs say.
+        most_gaussians: a larger model is reduced to this number, with a note on the page.
+        title: title of the page; None = the scene's name.
+        say: gets a line about each step.
 
     Raises:
         AwError: no run with a model, several scenes, no scene, or another page in the folder.
@@ -258,13 +255,13 @@ def view_runs(
 
 
 class Viewer:
-    """The page of one or more runs, shown by a notebook in a frame of its own."""
+    """The page of one or more runs, which a notebook shows in a frame."""
 
     def __init__(self, paths: Sequence[Path], *, height: int = 640, scene_folder: Path | None = None) -> None:
         """
         Args:
             paths: run folders, or folders of runs, all of one scene.
-            height: of the frame, px.
+            height: height of the frame, px.
             scene_folder: where the scene lies; None = where the runs say.
 
         Raises:
@@ -279,7 +276,7 @@ class Viewer:
         return f"Viewer of {', '.join(self.labels)}; a notebook shows it, 'aw view' writes it to a file"
 
     def _repr_html_(self) -> str:
-        """A frame without access to the notebook's page; its scripts run."""
+        """Return a frame whose scripts run, but have no access to the notebook's page."""
         page = html.escape(self.page, quote=True)
         return (
             f'<iframe sandbox="allow-scripts" srcdoc="{page}" '

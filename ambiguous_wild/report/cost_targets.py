@@ -1,7 +1,7 @@
-"""How long it takes to reach a given PSNR, and what accuracy costs on a scene, in one line.
+"""Compute the time to reach a given PSNR, and one line for each scene on what accuracy costs.
 
-The time of a PSNR is that of whichever method is there first, on the mean over its seeds. In the line,
-references do not count, nor do runs that were not alone where others were.
+The line takes the time of the method that is fastest, in the mean over its seeds. It leaves out references,
+and runs that were not alone if others were.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.report.cost_curves import Curve, Summary, scenes_of, summary
-from ambiguous_wild.report.cost_read import CostRun, why_unranked
+from ambiguous_wild.report.cost_runs import CostRun, why_unranked
 
-BELOW_BEST = (3.0, 1.0, 0.5)  # dB below what the best curve ends at, where no target is given
+BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
 
 
 @dataclass(frozen=True)
 class Target:
-    """A PSNR to reach; relative to the best curve of each scene, or the same everywhere."""
+    """A PSNR to reach, relative to the best curve of each scene, or the same everywhere."""
 
     db: float  # below the best, or absolute
     relative: bool
@@ -32,35 +32,35 @@ class Target:
 
 @dataclass(frozen=True)
 class Reach:
-    """When a curve reaches a target."""
+    """The time at which a curve reaches a target."""
 
     scene: str | None  # None: the mean over all scenes
     curve: str
     length: str
     target: str
-    psnr: float  # dB to reach; NaN: differs from scene to scene, or nothing to be relative to
-    minutes: Summary  # of training; missing unless every run reaches it
-    reached: int  # runs that do
+    psnr: float  # dB of the target; NaN: it differs between scenes, or there is no best curve
+    minutes: Summary  # of training; missing unless every run reaches the target
+    reached: int  # number of runs that reach it
     runs: int
-    bound: bool  # some had reached it by their first probe: the time is an upper bound
+    bound: bool  # some runs had reached it by their first probe: the time is an upper bound
     unranked: str = ""  # why these times are not ranked; then they are shown from `low` to `high` minutes
     low: float = math.nan
     high: float = math.nan
-    missing: str = ""  # why there is no mean, whatever the runs reached: a scene without a run, or no probes
+    missing: str = ""  # why there is no mean: a scene without a run, or a run without probes
 
 
 def times_to_reach(
     curves: Sequence[Curve], targets: Sequence[float] = (), *, setup: bool = False
 ) -> list[Reach]:
-    """For every scene, curve and target; then for the mean over scenes, where there are several.
+    """Compute the times for every scene, curve and target; first for the mean over several scenes.
 
-    Of curves that differ in length alone the one that is there first counts, and its length is told: a
-    short training is often there before the long one, whose schedule takes its time.
+    Among curves that differ only in length, the fastest is taken and its length given: a short training often
+    reaches a target before a long one, whose schedule is slower.
 
     Args:
         curves: from `curves_of`.
-        targets: in dB; empty = `BELOW_BEST` below the best of each scene that is not shown the truth.
-        setup: count what comes before the first step too.
+        targets: in dB; empty = `BELOW_BEST` below the best curve of each scene that is no reference.
+        setup: add the set-up before the first step to the time.
     """
     wanted = [Target(t, False) for t in dict.fromkeys(targets)] or [Target(t, True) for t in BELOW_BEST]
     scenes = scenes_of(curves)
@@ -82,20 +82,20 @@ def times_to_reach(
 
 
 def _soonest(rows: Sequence[Reach]) -> Reach:
-    """Of several lengths the one that is there first; where none always is, the one that most often is."""
-    there = [row for row in rows if math.isfinite(row.minutes.mean)]
-    if there:
-        return min(there, key=lambda row: row.minutes.mean)
+    """Return the fastest of several lengths; if none always reaches the target, the one most often does."""
+    complete = [row for row in rows if math.isfinite(row.minutes.mean)]
+    if complete:
+        return min(complete, key=lambda row: row.minutes.mean)
     return max(
         reversed(rows), key=lambda row: (row.runs > 0, not row.missing, row.reached / max(row.runs, 1))
     )
 
 
 def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
-    """Seconds of training until the run reaches `psnr` dB, by a straight line between two probes.
+    """Return the seconds until the run reaches `psnr` dB, interpolated linearly between two probes.
 
     Returns:
-        (seconds, whether it had reached it by its first probe); NaN if it never does.
+        (seconds, whether its first probe had reached it already); NaN if it never does.
     """
     if math.isnan(psnr):
         return math.nan, False
@@ -121,16 +121,16 @@ def _level(target: Target, curves: Sequence[Curve], scene: str) -> float:
 
 def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, float], setup: bool) -> Reach:
     runs = [run for name in level for run in curve.on(name)]
-    found = {id(run): first_time(run, level[run.scene]) for run in runs}
+    times = {id(run): first_time(run, level[run.scene]) for run in runs}
 
     def minutes(run: CostRun) -> float:
-        return (found[id(run)][0] + (run.setup_s if setup else 0.0)) / 60.0
+        return (times[id(run)][0] + (run.setup_s if setup else 0.0)) / 60.0
 
     missing, mean = _missing(curve, level, runs), Summary()
     if not missing:
         mean = summary(curve, tuple(level), minutes)
-        if any(run.blind for run in runs):
-            mean = Summary(mean.mean)  # the spread of upper bounds means nothing
+        if any(run.unprobed for run in runs):
+            mean = Summary(mean.mean)  # the spread of upper bounds has no meaning
     return Reach(
         scene,
         curve.name,
@@ -138,9 +138,9 @@ def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, flo
         target.text,
         next(iter(level.values())) if len(level) == 1 or not target.relative else math.nan,
         mean,
-        sum(math.isfinite(at) for at, _ in found.values()),
+        sum(math.isfinite(at) for at, _ in times.values()),
         len(runs),
-        any(early for _, early in found.values()),
+        any(early for _, early in times.values()),
         why_unranked(runs),
         min((m for m in map(minutes, runs) if math.isfinite(m)), default=math.nan),
         max((m for m in map(minutes, runs) if math.isfinite(m)), default=math.nan),
@@ -149,13 +149,13 @@ def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, flo
 
 
 def _missing(curve: Curve, scenes: Iterable[str], runs: Sequence[CostRun]) -> str:
-    """Why there is no mean of these runs; empty where there may be one."""
-    gone = [scene for scene in scenes if not curve.on(scene)]
-    if gone:
-        return f"no run on {', '.join(gone)}"
-    blind = [run.blind for run in runs if run.blind]
-    # The end of a run is a bound on when it got there, and no mean is taken of bounds and times.
-    return shortlist(blind, 2) if blind and len(blind) < len(runs) else ""
+    """Return why there can be no mean of these runs; empty if there can."""
+    lacking = [scene for scene in scenes if not curve.on(scene)]
+    if lacking:
+        return f"no run on {', '.join(lacking)}"
+    unprobed = [run.unprobed for run in runs if run.unprobed]
+    # an unprobed run gives an upper bound at its end, and bounds and times are not averaged together
+    return shortlist(unprobed, 2) if unprobed and len(unprobed) < len(runs) else ""
 
 
 MOST = 0.9  # of the best PSNR
@@ -164,21 +164,21 @@ LAST_DB = 1.0
 
 @dataclass(frozen=True)
 class Answer:
-    """The line of one scene, as numbers."""
+    """The numbers in the line of one scene."""
 
     scene: str
     best: float  # dB, the highest mean over seeds at the end of a training
     best_curve: str
-    most_s: float  # seconds until 90 % of it; NaN where no training was probed so low
+    most_s: float  # seconds until 90 % of the best PSNR; NaN if no training has a probe as low
     most_spread_s: float  # sample deviation over seeds; NaN for one seed
     most_curve: str
-    bound: bool  # it was there at the first probe: most_s is an upper bound
+    bound: bool  # it was reached at the first probe: most_s is an upper bound
     last_s: float  # seconds from 1 dB below the best to the best
     ranked: bool  # False: some times are of runs that were not alone
 
     @property
     def text(self) -> str:
-        """ "on yard 90 % of the best PSNR (28.4 dB) takes 41 s (3dgs), the last dB 6 min (refinesplat)"."""
+        """For example "on yard 90 % of the best PSNR (28.4 dB) takes 41 s (3dgs), the last dB 6 min"."""
         spread = "" if math.isnan(self.most_spread_s) else f" ± {self.most_spread_s:.1f} s"
         most = (
             "not measured" if math.isnan(self.most_s) else f"takes {self._most}{spread} ({self.most_curve})"
@@ -193,40 +193,35 @@ class Answer:
 
 
 def duration(seconds: float) -> str:
-    """Seconds below two minutes, else minutes."""
+    """Return a time as seconds below two minutes, else as minutes."""
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.3g} min"
 
 
 def answers(curves: Sequence[Curve], *, setup: bool = False) -> list[Answer]:
-    """One a scene with a finished run.
+    """Compute the answer for each scene with a finished run.
 
     Args:
         curves: from `curves_of`.
-        setup: count what comes before the first step too.
+        setup: add the set-up before the first step to the time.
     """
     rivals = [curve for curve in curves if not knows_truth(curve.method)]
     alone = [curve for curve in rivals if not why_unranked(curve.runs)]
-    found = []
-    for scene in scenes_of(rivals):
-        here = [c for c in alone or rivals if c.on(scene)]
-        answer = _answer(scene, here, setup)
-        if answer is not None:
-            found.append(answer)
-    return found
+    by_scene = (_answer(s, [c for c in alone or rivals if c.on(s)], setup) for s in scenes_of(rivals))
+    return [answer for answer in by_scene if answer is not None]
 
 
 def _answer(scene: str, curves: Sequence[Curve], setup: bool) -> Answer | None:
     ends = {id(c): summary(c, (scene,), lambda run: run.psnr).mean for c in curves}
-    known = [c for c in curves if math.isfinite(ends[id(c)])]
-    if not known:
+    finished = [c for c in curves if math.isfinite(ends[id(c)])]
+    if not finished:
         return None
-    best_curve = max(known, key=lambda c: ends[id(c)])
+    best_curve = max(finished, key=lambda c: ends[id(c)])
     best = ends[id(best_curve)]
-    # each of its seeds ends above or below their mean: the end of the training is when the mean is there
-    there = summary(best_curve, (scene,), lambda run: run.train_s + (run.setup_s if setup else 0.0)).mean
-    here = [Curve(c.name, c.method, c.length, tuple(c.on(scene))) for c in known]
-    most = _first(here, MOST * best, setup)
-    own = [c for c in here if c.name == best_curve.name and c.length == best_curve.length]
+    # seeds end above or below their mean, so the mean is reached at the end of the training
+    end_s = summary(best_curve, (scene,), lambda run: run.train_s + (run.setup_s if setup else 0.0)).mean
+    on_scene = [Curve(c.name, c.method, c.length, tuple(c.on(scene))) for c in finished]
+    most = _first(on_scene, MOST * best, setup)
+    own = [c for c in on_scene if c.name == best_curve.name and c.length == best_curve.length]
     before = _first(own, best - LAST_DB, setup)
     return Answer(
         scene,
@@ -236,12 +231,12 @@ def _answer(scene: str, curves: Sequence[Curve], setup: bool) -> Answer | None:
         math.nan if most is None else 60.0 * most.minutes.spread,
         "" if most is None else most.curve,
         most is not None and most.bound,
-        math.nan if before is None or before.bound else there - 60.0 * before.minutes.mean,
-        not any(why_unranked(c.runs) for c in here),
+        math.nan if before is None or before.bound else end_s - 60.0 * before.minutes.mean,
+        not any(why_unranked(c.runs) for c in on_scene),
     )
 
 
 def _first(curves: Sequence[Curve], psnr: float, setup: bool) -> Reach | None:
-    """The row of whichever curve reaches it first with all its seeds."""
+    """Return the row of the curve that is first to reach `psnr` with all its seeds."""
     rows = [row for row in times_to_reach(curves, [psnr], setup=setup) if math.isfinite(row.minutes.mean)]
     return min(rows, key=lambda row: row.minutes.mean, default=None)

@@ -1,7 +1,7 @@
-"""Runs as the cost report reads them: settings, result, and PSNR over time.
+"""Read runs for the cost report: settings, result, and PSNR over time.
 
-Unlike a comparison, this takes many runs of one method on one scene with one seed: they differ in length,
-effects or options, and their differences are what is measured.
+Unlike a comparison, this takes many runs of one method on one scene with one seed. They differ in length,
+effects or options, and the report measures these differences.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,23 +18,23 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, RunResult, mean_of, read_result
-from ambiguous_wild.harness.store import read_config, run_folders
+from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, Options, RunResult, mean_of, read_result
+from ambiguous_wild.harness.store import ReadConfig, check_names, find_runs, read_config
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.metrics import stats
 
-# of the training: they change how a run is kept and watched, not its result
+# settings of training that are no part of `CostRun.rest`: compared on their own, or without any effect
 BOOKKEEPING = ("seed", "checkpoint_every_s", "probes", "iterations", "budget_s")
-SETTINGS = ("resolution", "max_gaussians")  # of the training: they change the result as options do
+SETTINGS = ("resolution", "max_gaussians")  # settings of training that are compared like options
 NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")
 
 
 @dataclass(frozen=True, order=True)
 class Length:
-    """How long a run was asked to train."""
+    """The length of training that was asked for."""
 
-    budget_s: float  # 0.0: as many iterations as below
-    iterations: int  # 0: a budget
+    budget_s: float  # 0.0: the length is a number of iterations
+    iterations: int  # 0: the length is a budget
 
     @property
     def text(self) -> str:
@@ -55,15 +55,15 @@ class CostRun:
     scene: str
     seed: int
     asked: str  # effects as they were asked for: "auto", "all", or their names
-    effects: frozenset[str]  # that were on
-    options: tuple[tuple[str, Any], ...]  # of the method, flat
+    effects: frozenset[str]  # effects that were on
+    options: tuple[tuple[str, Any], ...]  # (dotted name, value) of the method's options
     length: Length
-    rest: str  # hash of whatever else decides the result: scene, device, code, protocol
+    rest: str  # hash of everything else that decides the result: scene, device, code, protocol
     psnr: float  # dB, mean over the test images; NaN: failed or not measured
     images: dict[str, float]  # PSNR by test image
     train_s: float
-    setup_s: float  # features and masks before the first step; short where a cache held them
-    numbers: dict[str, float]  # see NUMBERS, and metrics of one's own; NaN where not measured
+    setup_s: float  # features and masks before the first step; short if they were cached
+    numbers: dict[str, float]  # see NUMBERS, and the user's metrics; NaN = not measured
     points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
     timing: Timing
     samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
@@ -71,37 +71,37 @@ class CostRun:
     scene_hash: str = ""
     reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
-    blind: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
+    unprobed: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
 
     @property
     def base(self) -> str:
-        """The method's own name: an ablation calls its runs method@group-variant."""
+        """The method's name without the variant of an ablation, method@group-variant."""
         host, at, part = self.method.partition("@")
         return host if at and "=" not in part else self.method
 
 
 @dataclass(frozen=True)
 class CostRuns:
-    """Every run below some folders. Times are reference seconds where every finished run was calibrated."""
+    """All runs below some folders. Times are reference seconds if every finished run was calibrated."""
 
     runs: tuple[CostRun, ...]
-    notes: tuple[str, ...]  # what could not be read, failed or is not finished
+    notes: tuple[str, ...]  # runs that could not be read, failed or are not finished
     reference: bool = False  # times are reference seconds; False: wall seconds
 
 
 def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> CostRuns:
-    """Every run below the folders, each once.
+    """Read every run below the folders, each once.
 
     Args:
-        folders: of `aw bench` or `aw ablate`, or folders of such folders.
-        scenes: only these; empty = all.
+        folders: outputs of `aw bench` or `aw ablate`, or folders of them.
+        scenes: names of the scenes to read; empty = all.
 
     Raises:
-        AwError: no such folder, no finished run, an unknown scene, or one run twice.
+        AwError: no such folder, no finished run, an unknown scene, or two copies of a run.
     """
     runs: list[CostRun] = []
     notes: list[str] = []
-    for folder in _each_once(folders):
+    for folder in find_runs(folders):
         path = next((folder / n for n in (RESULT, FAILED) if (folder / n).exists()), None)
         if path is None:
             notes.append(f"not finished, left out: {folder}")
@@ -110,12 +110,7 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
             runs.append(_run(folder, read_result(path)))
         except AwError as error:
             notes.append(f"left out: {error}")
-    known = sorted({run.scene for run in runs})
-    for name in scenes:
-        if name not in known:
-            from ambiguous_wild.core.errors import unknown
-
-            raise unknown("scene", name, known)
+    check_names("scene", scenes, sorted({run.scene for run in runs}))
     runs = [run for run in runs if not scenes or run.scene in scenes]
     if all(math.isnan(run.psnr) for run in runs):
         raise AwError(
@@ -127,7 +122,9 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
     notes += [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in runs if r.error]
     reference = _all_calibrated(runs)
     if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
-        notes.append("wall seconds: some runs were not calibrated, or on another kind of device")
+        notes.append(
+            "times are wall seconds: some runs were not calibrated, or ran on another kind of device"
+        )
     return CostRuns(tuple(map(_in_reference, runs) if reference else runs), tuple(notes), reference)
 
 
@@ -138,7 +135,7 @@ def _all_calibrated(runs: Iterable[CostRun]) -> bool:
 
 
 def _in_reference(run: CostRun) -> CostRun:
-    """The run with every time in seconds of the reference machine."""
+    """Return the run with every time in seconds of the reference machine."""
     if run.error:
         return run
     total = run.timing.reference_s
@@ -157,21 +154,10 @@ def _in_reference(run: CostRun) -> CostRun:
 
 
 def why_unranked(runs: Iterable[CostRun]) -> str:
-    """Why times of these runs are not ranked: a run that was not alone; empty where they are."""
+    """Return why times of these runs are not ranked: a run was not alone; empty if they are ranked."""
     timings = [run.timing for run in runs if not run.error]
     wrong = [timing for timing in timings if timing.verdict != "alone"]
     return f"{len(wrong)} of {len(timings)} runs {wrong[0].verdict}: {wrong[0].reason}" if wrong else ""
-
-
-def _each_once(folders: Sequence[Path]) -> list[Path]:
-    """The run folders below; one folder may lie in another that is given too."""
-    found: dict[Path, Path] = {}
-    for root in folders:
-        if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
-        for folder in run_folders(root):
-            found.setdefault(folder.resolve(), folder)
-    return list(found.values())
 
 
 def _run(folder: Path, result: RunResult) -> CostRun:
@@ -192,7 +178,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         "images": sorted(images),
     }
     points, damage = _points(folder / "timeline.csv", train_s, psnr)
-    unprobed = f"no probes in {folder / 'timeline.csv'}" if len(points) < 2 else ""
+    no_probes = f"no probes in {folder / 'timeline.csv'}" if len(points) < 2 else ""
     return CostRun(
         folder=folder,
         method=result["method"],
@@ -216,17 +202,17 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         scene_hash=result["scene_hash"],
         reproduce=str(result.get("reproduce", "")),
         error=result["error"] or "",
-        blind="" if result["error"] else damage or unprobed,
+        unprobed="" if result["error"] else damage or no_probes,
     )
 
 
-def _settings(train: Mapping[str, Any]) -> dict[str, Any]:
-    """Resolution and number of Gaussians, where config.yaml has them; "auto" is the method's own."""
-    known = {name: train[name] for name in SETTINGS if name in train}
-    return {name: "auto" if value is None else value for name, value in known.items()}
+def _settings(train: ReadConfig) -> Options:
+    """Return resolution and number of Gaussians if config.yaml has them; None becomes "auto"."""
+    present = {name: train[name] for name in SETTINGS if name in train}
+    return {name: "auto" if value is None else value for name, value in present.items()}
 
 
-def _length(train: Mapping[str, Any], cost: Cost) -> Length:
+def _length(train: ReadConfig, cost: Cost) -> Length:
     budget = _number(train.get("budget_s"))
     if budget > 0.0:
         return Length(budget, 0)
@@ -235,16 +221,16 @@ def _length(train: Mapping[str, Any], cost: Cost) -> Length:
 
 
 def _asked(folder: Path) -> str:
-    """The word given to --effects (auto, all), or empty: with a word, effects differ between scenes."""
+    """Return the word given to --effects (auto, all), with which effects differ between scenes; else ""."""
     try:
-        said = json.loads((folder / "effects.json").read_text(encoding="utf-8")).get("asked", "")
+        asked = json.loads((folder / "effects.json").read_text(encoding="utf-8")).get("asked", "")
     except (OSError, ValueError, AttributeError, RecursionError):
         return ""
-    return said if said in ("auto", "all") else ""
+    return asked if asked in ("auto", "all") else ""
 
 
 def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[tuple[float, float], ...], str]:
-    """The probes of a timeline, with the measured PSNR as the last of them; and what is wrong with it."""
+    """Read the probes of a timeline, followed by the measured PSNR; and a message if the file is damaged."""
     points, damage = [], ""
     try:
         with open(path, newline="", encoding="utf-8") as f:
@@ -261,7 +247,7 @@ def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[tuple[float,
     except (ValueError, csv.Error) as error:
         points, damage = [], f"{path} is damaged ({error})"
     if math.isfinite(train_s) and math.isfinite(psnr):
-        # The timeline rounds to milliseconds; the last probe is the result, measured before it was saved.
+        # The timeline rounds to milliseconds. Its last probe is the result itself, before it was saved.
         points = [p for p in points if p[0] < train_s - 0.002] + [(train_s, psnr)]
     return tuple(sorted(points)), damage
 
@@ -278,7 +264,7 @@ def _refuse_twice(runs: Iterable[CostRun]) -> None:
         seen[key] = run.folder
 
 
-def _mapping(value: Any) -> dict[str, Any]:
+def _mapping(value: object) -> ReadConfig:
     return value if isinstance(value, dict) else {}
 
 
@@ -289,6 +275,6 @@ def _number(value: Any) -> float:
         return math.nan
 
 
-def _options(tree: dict[str, Any]) -> dict[str, Any]:
-    """Options by their dotted names; lists as what can be compared and hashed."""
+def _options(tree: Options) -> Options:
+    """Return options by their dotted names, with lists as tuples, which can be hashed."""
     return {k: tuple(map(str, v)) if isinstance(v, list) else v for k, v in flatten(tree).items()}

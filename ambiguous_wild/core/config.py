@@ -1,4 +1,4 @@
-"""Frozen dataclasses as configs: strict keys, plain data, and a hash as identity."""
+"""Frozen dataclasses as configs: strict keys, plain data, and a hash as identity; types of plain data."""
 
 from __future__ import annotations
 
@@ -9,17 +9,23 @@ import math
 import re
 import types
 import typing
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias, TypeVar
 
 from ambiguous_wild.core.errors import AwError, unknown
+
+# A value that a JSON file can hold, and such values by name: results of a run, facts about it.
+Json: TypeAlias = "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None"
+Facts: TypeAlias = dict[str, Json]
+# What a checkpoint holds of one object: nested dicts of tensors and plain values, see splat/checkpoint.py.
+State: TypeAlias = dict[str, Any]
 
 T = TypeVar("T")
 _POWER_OF_TEN = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 
 
 def to_plain(config: Any) -> Any:
-    """The config as dicts, lists and scalars, ready for YAML or JSON."""
+    """Return the config as dicts, lists and scalars, ready for YAML or JSON."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         return {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if isinstance(config, Mapping):
@@ -29,9 +35,9 @@ def to_plain(config: Any) -> Any:
     return config
 
 
-def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, by dotted keys."""
-    flat: dict[str, Any] = {}
+def flatten(tree: Mapping[str, T], prefix: str = "") -> dict[str, T]:
+    """Turn nested mappings into one with dotted keys."""
+    flat: dict[str, T] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping):
             flat |= flatten(value, f"{prefix}{key}.")
@@ -67,11 +73,11 @@ def from_plain(cls: type[T], data: Mapping[str, Any], where: str = "config") -> 
 
 
 def with_options(config: T, options: Mapping[str, str], where: str = "option") -> T:
-    """The config with ``key=value`` strings of the command line applied; dots reach nested configs.
+    """Return the config with ``key=value`` strings of the command line applied; dots reach nested configs.
 
     Raises:
-        AwError: unknown key, a value that does not parse as the key's type, or a negative one of a key that
-            is positive by default.
+        AwError: unknown key, a value that does not parse as the key's type, or a negative value for a key
+            whose default is positive.
     """
     names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
     hints = typing.get_type_hints(type(config))
@@ -93,16 +99,16 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
             key = f"{head}.{next(iter(inside))}"
             raise AwError(f"{where} {key!r}: {head!r} has no keys of its own")
         values[head] = with_options(inner, inside, f"{where} {head}")
-    # All at once: limits between two options apply to the result only.
-    made = dataclasses.replace(config, **values)  # type: ignore[type-var]
+    # Apply all options at once: limits between two of them hold for the result only.
+    changed = dataclasses.replace(config, **values)  # type: ignore[type-var]
     for name, value in values.items():
         if _positive(getattr(config, name)) and _number(value) and not value >= 0:
             raise AwError(f"{where} {name} is at least 0, got {value:g}")
-    return made
+    return changed
 
 
 def check_limits(config: Any, where: str, **limits: tuple[float, float]) -> None:
-    """Refuse numbers out of range; in a tuple each number, and None passes.
+    """Refuse numbers out of range. Each number of a tuple is checked; None passes.
 
     Args:
         config: the dataclass instance.
@@ -125,7 +131,7 @@ def _number(value: Any) -> bool:
 
 
 def _positive(value: Any) -> bool:
-    # rates, weights, counts and times: what is positive by default is not meant to be negative
+    # rates, weights, counts and times that are positive by default must not become negative
     return _number(value) and value > 0
 
 

@@ -23,7 +23,7 @@ from ambiguous_wild.core.errors import AwError
 
 AMBIGUOUS_ABOVE = 0.7  # cosine; stated by the paper for DINOv2 features
 LOOKALIKE_ABOVE = 0.25  # share of distractor pixels, for weight-free features; see docs/ambiguity.md
-USUAL = 0.05  # quantile of static regions' best matches; a match above it is usual
+USUAL = 0.05  # quantile of static regions' best matches; a higher match is usual
 MIN_SHARE = 0.002  # of a photo's pixels; smaller regions are ignored
 _ANCHOR_REGIONS = 2000  # most static regions used for the anchors, evenly chosen
 
@@ -135,19 +135,19 @@ def matches(
     if len(distractors) != len(statics):
         raise AwError(f"{len(distractors)} photos of distractors, {len(statics)} of static regions")
     units, photo, label = _stacked(statics)
-    found = []
+    by_photo = []
     for k, regions in enumerate(distractors):
         rows = np.flatnonzero(photo != k) if len(statics) > 1 else np.arange(len(photo))
         norms = np.linalg.norm(regions.means, axis=1)
-        here = []
+        in_photo = []
         for r in np.flatnonzero(norms > 0) if len(rows) else []:
             cosines = units[rows] @ (regions.means[r] / norms[r])
             best = int(rows[np.argmax(cosines)])
             cosine = float(np.clip(cosines.max(), -1.0, 1.0))
             which, px = int(regions.labels[r]), int(regions.pixels[r])
-            here.append(RegionMatch(which, px, cosine, int(photo[best]), int(label[best])))
-        found.append(here)
-    return found
+            in_photo.append(RegionMatch(which, px, cosine, int(photo[best]), int(label[best])))
+        by_photo.append(in_photo)
+    return by_photo
 
 
 def anchors(
@@ -165,7 +165,7 @@ def anchors(
 
 
 def usual_match(statics: Sequence[Regions]) -> float:
-    """The cosine that 95 % of static regions reach with their best match in another photo; NaN without."""
+    """The cosine that 95 % of static regions reach with their best match in another photo, else NaN."""
     units, photo, _ = _stacked(statics)
     if len(np.unique(photo)) < 2:
         return math.nan
@@ -182,15 +182,15 @@ def _best_in_other_photos(units: np.ndarray, photo: np.ndarray) -> list[float]:
     return [float((units @ units[k])[photo != photo[k]].max()) for k in _sampled(units)]
 
 
-def photo_cosine(found: Sequence[RegionMatch]) -> float:
+def photo_cosine(matched: Sequence[RegionMatch]) -> float:
     """Cosine of a photo's most similar distractor; NaN without distractors."""
-    return max((m.cosine for m in found), default=math.nan)
+    return max((m.cosine for m in matched), default=math.nan)
 
 
-def mean_cosine(found: Sequence[RegionMatch]) -> float:
+def mean_cosine(matched: Sequence[RegionMatch]) -> float:
     """Mean cosine over distractor regions, weighted by pixels; NaN without regions."""
-    pixels = sum(m.pixels for m in found)
-    return sum(m.pixels * m.cosine for m in found) / pixels if pixels else math.nan
+    pixels = sum(m.pixels for m in matched)
+    return sum(m.pixels * m.cosine for m in matched) / pixels if pixels else math.nan
 
 
 def _cells(shape: tuple[int, ...], h: int, w: int) -> np.ndarray:  # [H, W] int

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,7 @@ class Gaussians:
     opacity_logits: Tensor  # [N]
     sh0: Tensor  # [N, 3] coefficient of the constant harmonic
     sh_rest: Tensor  # [N, (D + 1)^2 - 1, 3] the others, D = largest degree (0 to 3)
+    _: KW_ONLY
     # [N, ...] what a method carries with each Gaussian, by name; density control copies and drops it too
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import torch
@@ -35,6 +35,7 @@ class Cotangents:
     extra: Tensor | None = None  # [H, W, 3] a second one of the image, added; its statistic is kept apart
     alpha: Tensor | None = None  # [H, W]
     depth: Tensor | None = None  # [H, W]
+    _: KW_ONLY
     own: Own = field(default_factory=dict)  # collected on the way by effects that act on pictures
 
     def __add__(self, other: Cotangents) -> Cotangents:
@@ -67,6 +68,7 @@ class Gradients:
     opacity_logits: Tensor  # [N]
     sh0: Tensor  # [N, 3]
     sh_rest: Tensor  # [N, K, 3]
+    _: KW_ONLY
     screen: Tensor  # [N, 2]
     screen_extra: Tensor | None = None  # [N, 2]
     screen_abs: Tensor | None = None  # [N, 2] "absolute": |.| of every pixel before the sum (AbsGS)

@@ -18,13 +18,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.dronesplat import nearest, unit_range
 from ambiguous_wild.methods.masking_common import residual, resized
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect, RowAdam
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
@@ -47,7 +48,7 @@ class SlowAverage(Effect):
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
         gaussians.settle()
         for name, tensor in gaussians.items():
-            gaussians.extra[slow(name)].lerp_(tensor, self.share)
+            gaussians.attributes[slow(name)].lerp_(tensor, self.share)
 
 
 class SlowDensity(DensityControl):
@@ -56,8 +57,8 @@ class SlowDensity(DensityControl):
     def _split_half(self, parents: Gaussians) -> Gaussians:
         child = super()._split_half(parents)
         for name in ("means", "log_scales"):
-            if slow(name) in child.extra:
-                child.extra[slow(name)].copy_(getattr(child, name))
+            if slow(name) in child.attributes:
+                child.attributes[slow(name)].copy_(getattr(child, name))
         return child
 
 
@@ -68,9 +69,9 @@ def slow(name: str) -> str:
 
 def slow_gaussians(gaussians: Gaussians) -> Gaussians | None:
     """The average as a model of its own; None where it is not carried. Its tensors are those of `extra`."""
-    if slow("means") not in gaussians.extra:
+    if slow("means") not in gaussians.attributes:
         return None
-    found: dict[str, Any] = {name: gaussians.extra[slow(name)] for name in PARAMETERS}
+    found: dict[str, Any] = {name: gaussians.attributes[slow(name)] for name in PARAMETERS}
     return Gaussians(**found)
 
 

@@ -64,7 +64,7 @@ class Twin(Fields):
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
         self.data = data
-        start = replace(static, extra={}).clone()
+        start = replace(static, attributes={}).clone()
         density = DensityControl(self.config.density, data.scene.extent, data.seed + 1)
         return {TWIN: FieldStart(start, rates, density, most=None)}
 

@@ -174,7 +174,7 @@ class Forest(Fields):
         self.nets.require_setup()
         rng, count = np.random.default_rng([data.seed, 0xF0]), min(self.config.points, len(static))
         rows = torch.from_numpy(np.sort(rng.choice(len(static), count, replace=False))).to(static.device)
-        return {TRANSIENT: FieldStart(replace(static.select(rows), extra={}), rates)}
+        return {TRANSIENT: FieldStart(replace(static.select(rows), attributes={}), rates)}
 
     def drawn(self, shot: Shot) -> Sequence[str]:
         return () if shot.view is None else (TRANSIENT,)

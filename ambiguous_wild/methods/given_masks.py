@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.parts import MaskPolicy, State
+from ambiguous_wild.splat.parts import MaskPolicy
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 

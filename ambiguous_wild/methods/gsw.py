@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import d_keep, hashed_uniform
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
@@ -39,7 +39,7 @@ from ambiguous_wild.splat.effects.placing import (
 )
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -177,9 +177,13 @@ class GswAppearance(Learnt):
         }
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        photo, means, intrinsic = self._seen(shot), visible.means.detach(), visible.extra["gsw_intrinsic"]
+        photo, means, intrinsic = (
+            self._seen(shot),
+            visible.means.detach(),
+            visible.attributes["gsw_intrinsic"],
+        )
         maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
-        places, box = visible.extra["gsw_places"], visible.extra["gsw_box"]
+        places, box = visible.attributes["gsw_places"], visible.attributes["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
         width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of what is read
         own, inside = at_pixels(maps[FREE], means, shot.camera, width, box)

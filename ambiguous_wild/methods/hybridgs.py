@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import MaskedShares
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 

@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform
 from ambiguous_wild.methods.wildgaussians import FeatureDistance, fourier
 from ambiguous_wild.splat.backend import backend_of
@@ -30,7 +30,7 @@ from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_
 from ambiguous_wild.splat.effects.placing import directions, in_picture
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import Parts, State
+from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 from ambiguous_wild.vision.backends import check_features
@@ -120,7 +120,7 @@ class Codes(Learnt):
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         photo = leaf["light"].expand(len(visible.base), CODE)
         towards = directions(visible.means.detach(), shot.camera)
-        inputs = torch.cat([visible.base, visible.extra["nexus_light"], photo, towards], dim=1)
+        inputs = torch.cat([visible.base, visible.attributes["nexus_light"], photo, towards], dim=1)
         if shot.view is not None and self.config.dropout:
             kept = hashed_uniform(inputs.numel(), (self.seed, shot.iteration), inputs.device)
             kept = (kept >= self.config.dropout).reshape(inputs.shape) / (1.0 - self.config.dropout)
@@ -173,7 +173,7 @@ class Doubt(WarmUpMask):
         g, seen = step.gaussians, self._seen(step)
         with torch.set_grad_enabled(learn):
             leaf = {name: value.requires_grad_(learn) for name, value in self.codes._leaf(step).items()}
-            codes = g.extra["nexus_doubt"][seen].detach().requires_grad_(learn)
+            codes = g.attributes["nexus_doubt"][seen].detach().requires_grad_(learn)
             doubts = self.codes.doubts(codes, leaf)
         drawn = step.draw(gaussians=as_colour(g, seen, doubts.detach()), without=COLOURING)
         with torch.set_grad_enabled(learn):
@@ -195,7 +195,7 @@ class Doubt(WarmUpMask):
         inputs = [codes, *leaf.values()]
         with torch.enable_grad():
             found = torch.autograd.grad(doubts, inputs, back.sh0[seen, 0] / SH_C0, allow_unused=True)
-        d_codes = torch.zeros_like(g.extra["nexus_doubt"])
+        d_codes = torch.zeros_like(g.attributes["nexus_doubt"])
         d_codes[seen] = found[0]
         own = {name: d for name, d in zip(leaf, found[1:]) if d is not None}
         if not self.config.through_geometry:
@@ -203,7 +203,8 @@ class Doubt(WarmUpMask):
             back = replace(back, **still)
         gradients = replace(
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
-            screen=torch.zeros_like(back.screen), extra={"nexus_doubt": d_codes}, own={self.codes.name: own},
+            screen=torch.zeros_like(back.screen), attributes={"nexus_doubt": d_codes},
+            own={self.codes.name: own},
         )  # fmt: skip
         return judged, gradients
 

@@ -25,6 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.config import State
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods import masking_common
 from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, load_adam_state
@@ -32,7 +33,7 @@ from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, ups
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
-from ambiguous_wild.splat.parts import Parts, Schedule, State
+from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import BY_MACHINE, DINO, check_features, first_here, make_features, parse
 from ambiguous_wild.vision.precompute import photo_features

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.mask_net import enlarged
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
@@ -27,7 +27,7 @@ from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_
 from ambiguous_wild.splat.effects.placing import directions, harmonics, ray_directions
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -110,7 +110,7 @@ class SplatfactoColours(Learnt):
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         photo = leaf["photo"].expand(len(visible.means), PHOTO)
-        hidden = F.relu(mlp(torch.cat([photo, visible.extra["splatfacto_feature"]], dim=1), leaf, "net"))
+        hidden = F.relu(mlp(torch.cat([photo, visible.attributes["splatfacto_feature"]], dim=1), leaf, "net"))
         basis = _up_to(harmonics(directions(visible.means.detach(), shot.camera), 3), shot.nominal // 2000)
         rest = mlp(hidden, leaf, "rest").reshape(-1, 15, 3)
         return 0.5 + basis[:, :1] * mlp(hidden, leaf, "dc") + (basis[:, 1:, None] * rest).sum(dim=1)

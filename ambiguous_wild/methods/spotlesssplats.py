@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.dronesplat import label_means, nearest
 from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.methods.masking_common import (
@@ -37,7 +37,7 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features

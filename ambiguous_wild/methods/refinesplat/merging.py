@@ -241,7 +241,7 @@ def merge_members(members: Gaussians, cluster: Tensor) -> Gaussians:
         opacity_logits=(mean_alpha.log() - (-mean_alpha).log1p()).float(),
         sh0=mixed(members.sh0).float(),
         sh_rest=mixed(members.sh_rest).float(),
-        extra={name: mixed(values).float() for name, values in members.extra.items()},
+        attributes={name: mixed(values).float() for name, values in members.attributes.items()},
     )
 
 

@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, upsampled
@@ -32,7 +33,7 @@ from ambiguous_wild.methods.refinesplat.threshold import Variant
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import Parts, Schedule, State
+from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.moving import moving_labels, moving_map

@@ -20,7 +20,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, TypedDict
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -64,17 +64,6 @@ class Finding:
         return f"{self.what}{which} is not finite at {when}, view {self.view}"
 
 
-class Rollback(TypedDict):
-    """One return to a checkpoint, as the results of a run report it."""
-
-    iteration: int  # of the finding
-    epoch: int  # of the finding; its photo is left out for the rest of it
-    view: int
-    photo: str
-    what: str  # the finding
-    to: int  # iteration of the checkpoint
-
-
 class NonFinite(AwError):
     """Training met a value that is not a finite number; `seen` holds what the step saw."""
 
@@ -96,7 +85,7 @@ class Watchdog:
         """
         self.folder, self.action, self.seed, self.photos = folder, action, seed, photos
         self.every = EVERY
-        self.rollbacks: list[Rollback] = []
+        self.rollbacks: list[Facts] = []
 
     # -- looking ----------------------------------------------------------------------------------
 
@@ -160,7 +149,7 @@ class Watchdog:
         """Whether the run rolls back after a finding."""
         return self.action == "rollback" and len(self.rollbacks) < MOST_ROLLBACKS
 
-    def note_rollback(self, error: NonFinite, earlier: list[Rollback], *, epoch: int, iteration: int) -> None:
+    def note_rollback(self, error: NonFinite, earlier: list[Facts], *, epoch: int, iteration: int) -> None:
         """Note that the run was rolled back: the photo is left out for the rest of its epoch.
 
         Args:
@@ -169,7 +158,7 @@ class Watchdog:
             epoch: epoch of the finding.
             iteration: iteration of the checkpoint.
         """
-        rollback: Rollback = {
+        rollback: Facts = {
             "iteration": error.finding.iteration,
             "epoch": epoch,
             "view": error.view,
@@ -224,10 +213,10 @@ class Watchdog:
         """Return the rollbacks for the run's results; empty if there were none."""
         return {"rollbacks": self.rollbacks} if self.rollbacks else {}
 
-    def state_dict(self) -> list[Rollback]:
+    def state_dict(self) -> list[Facts]:
         return self.rollbacks
 
-    def load_state_dict(self, rollbacks: list[Rollback]) -> None:
+    def load_state_dict(self, rollbacks: list[Facts]) -> None:
         self.rollbacks = list(rollbacks)
         self.every = 1 if rollbacks else EVERY
 

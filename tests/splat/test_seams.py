@@ -141,7 +141,7 @@ def test_rows_are_checked():
         g.carrying({"means": torch.zeros(4, 3)})
     with pytest.raises(AwError, match="must be \\[4"):
         g.carrying({"more": torch.zeros(3, 3)})
-    with pytest.raises(AwError, match="only one side has the attributes .*more"):
+    with pytest.raises(AwError, match=r"only one side has the attributes .*more"):
         g.carrying({"more": torch.zeros(4)}).cat(g)
 
 

@@ -58,7 +58,7 @@ def drawn_with(effect, g, values=None):
         if name in effect._adam:
             effect._adam[name].values[1 if effect._leaves[name].per_photo else 0] = value
         elif name in g.attributes:
-            g = replace(g, attributes={**g.extra, name: value})
+            g = replace(g, attributes={**g.attributes, name: value})
         else:
             g = replace(g, **{name: value})
     shot = Shot(iteration=1, nominal=1e4, view=1, camera=camera())

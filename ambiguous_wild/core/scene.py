@@ -37,14 +37,14 @@ class SceneInfo(TypedDict, total=False):
     factor: int  # downsampling that the scene was built for
     images: str  # folder of that factor
     license: str
-    dataset: str  # as result tables call it
+    dataset: str  # name of the data set in result tables
     evaluation: Facts  # how the dataset's papers measure: protocol, effects
     build_key: str
     inputs: Facts  # what it was built from
-    files: dict[str, FileEntry]  # by path relative to the scene
+    files: dict[str, FileEntry]  # path relative to the scene -> its entry
     loaded_factor: int  # added by `load_scene`: downsampling of the pictures that it opened
     missing: dict[str, list[str]]  # added by `load_scene`: listed photos without a pose, by side of the split
-    warnings: list[str]  # of the build; replaced by those of `load_scene`
+    warnings: list[str]  # warnings of the build; `load_scene` replaces them
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ class Traits:
     density: str = ""
     state: str = ""  # what is learnt or stored beside the Gaussians of 3DGS
     cpu_only: bool = False  # True: it needs a statistic that gsplat does not offer
-    source: Source = ""  # of the facts: the authors' code, a part of it, or summaries of the paper
+    # the facts come from the authors' code, a part of it, or summaries of the paper; "" = not stated
+    source: Source = ""
     published: str = ""  # features or instances that the release uses
 
 

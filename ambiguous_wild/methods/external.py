@@ -302,7 +302,7 @@ class Description:
     scene_files: Facts = field(default_factory=dict)  # text files that the program needs in {scene}
     photos: Photos = "all"  # what {scene} holds: "all", "train" alone, or as "nerf-w"
     drawn_by: Literal["program", "us"] = "program"  # "us": our renderer draws the test views from `ply`
-    timeout_h: float = 0.0  # of each command; 0 = none
+    timeout_h: float = 0.0  # limit of each command; 0 = none
 
 
 PACKAGED = Path(__file__).parent / "descriptions"

@@ -47,7 +47,7 @@ class ForestSplatsConfig:
 
     density: DensityConfig = field(default_factory=DensityConfig)
     points: int = 5000  # transient Gaussians; their number stays
-    width: int = 64  # of the deforming net; published 256
+    width: int = 64  # units of the deforming net's hidden layers; published 256
     side: int = 160  # px, the longer side of the photo that the mask net sees
     segments: int = 30  # superpixels
     filled: float = 0.2  # superpixels with this mean mask are masked as a whole
@@ -92,15 +92,15 @@ class Nets(Learnt):
 
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
         position, w, rate = 4 * (1 + 2 * OCTAVES), self.config.width, self.config.lr_bend
-        found: dict[str, Leaf] = {}
+        leaves: dict[str, Leaf] = {}
         for i in range(LAYERS):
             inputs = position if i == 0 else w + position if i == SKIP + 1 else w
-            found |= mlp_leaves(f"bend{i}", (inputs, w), rng, rate)
+            leaves |= mlp_leaves(f"bend{i}", (inputs, w), rng, rate)
         for key, leaf in mlp_leaves("moved", (w, 10), rng, rate).items():
-            found[key] = replace(leaf, values=0.01 * leaf.values)
+            leaves[key] = replace(leaf, values=0.01 * leaf.values)
         for name, channels in (("stem", (3, 32, 32, 32)), ("near", (32, 64, 128)), ("far", (32, 64, 128))):
-            found |= conv_leaves(name, channels, rng, self.config.lr_mask)
-        return found | conv_leaves("last", (128, 1), rng, self.config.lr_mask, side=1)
+            leaves |= conv_leaves(name, channels, rng, self.config.lr_mask)
+        return leaves | conv_leaves("last", (128, 1), rng, self.config.lr_mask, side=1)
 
     def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
         """Deform the transient Gaussians for this photo."""

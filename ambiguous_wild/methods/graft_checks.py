@@ -117,7 +117,7 @@ def _check_required_effects(host: Member, donors: Mapping[str, Member]) -> None:
             f"the fields of {host.name} need its effects, which effects={donors['effects'].name} replaces: "
             f"leave effects={donors['effects'].name} out"
         )
-    unfit = {}  # by place the method whose masks or losses need effects that the graft lacks
+    unfit = {}  # place -> method whose masks or losses need effects that the graft lacks
     masking, losing = donors.get("mask", host), donors.get("regulariser", host)
     if lacks(masking.parts.mask.required_effect()):
         unfit["mask"] = masking

@@ -113,7 +113,7 @@ class GswConfig:
     width: int = 16  # channels of its first level
     lr_unet: float = 2e-3  # decays to a tenth
     lr_colour: float = 5e-4  # for 70 000 iterations; higher in shorter runs
-    lr_places: float = 1.0  # of free coordinates, and of boxes in px; decays to a hundredth
+    lr_places: float = 1.0  # rate of free coordinates, and of boxes in px; decays to a hundredth
     residual: bool = True  # the net's output is added to the intrinsic colour; published: it is the colour
     lr_intrinsic: float = 2.5e-3  # as 3DGS's colours; published 1.25e-4, for 70 000 iterations
     dropout: float = 0.1  # share of samples
@@ -185,7 +185,7 @@ class GswAppearance(Learnt):
         maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
         places, box = visible.attributes["gsw_places"], visible.attributes["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
-        width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of what is read
+        width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of the picture read
         own, inside = at_pixels(maps[FREE], means, shot.camera, width, box)
         if shot.fitting or photo is None:
             usual = self._usual(shot, leaf, means, box)

@@ -61,7 +61,7 @@ def percentile(histogram: Tensor, share: float) -> float | Tensor:
     total = histogram.sum()
     # a little below the target for rounding, so that 0.6 of 10 equal counts is six of them
     reached = torch.cumsum(histogram, 0) >= share * total * (1.0 - 1e-12)
-    first = reached.int().argmax()  # of equal values the first
+    first = reached.int().argmax()  # the first of equal values
     edge = ((first + 1).to(histogram) / len(histogram)).masked_fill(total <= 0, 1.0)
     return backend_of(histogram.device).number(edge)
 
@@ -162,7 +162,7 @@ class PausingMask(WarmUpMask):
 
 
 class MaskedShares(dict[int, float | Tensor]):
-    """For each view the share of its pixels that was masked when it was last seen."""
+    """The share of each view's pixels that was masked when it was last seen."""
 
     def take(self, view: int, keep: Tensor) -> None:
         """Store the masked share of a keep map [H, W]; on an accelerator it is read later."""

@@ -65,7 +65,7 @@ class MipDensity(DensityControl):
 
 
 class AbsoluteMipDensity(MipDensity):
-    """Also grows as many Gaussians by the absolute gradient as by the signed one."""
+    """Density control that also grows by the absolute gradient, as many Gaussians as by the signed one."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": (), "abs_sum": ()}

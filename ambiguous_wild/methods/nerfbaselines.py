@@ -39,7 +39,7 @@ class Options:
     iterations_key: str = ""  # the method's key for its length, set to --iterations; empty = its own length
     seed_key: str = ""  # the method's key for its seed; empty = it gets no seed
     evaluate: bool = False  # run its own metrics too, which need torch in its environment
-    timeout_h: float = 0.0  # of each command; 0 = none
+    timeout_h: float = 0.0  # limit of each command; 0 = none
 
 
 def nerfbaselines_entry(method: str) -> MethodEntry:

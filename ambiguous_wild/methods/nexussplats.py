@@ -53,7 +53,7 @@ class NexusSplatsConfig:
     mask_start: float = 2000.0
     min_mask_start: int = 300  # iterations: earlier renders show too little
     boundary: bool = False  # photo collections: the lower middle of a picture is masked more easily
-    normal_units: float = 80.0  # of hand-made features: distance, in units of blur, that is 1
+    normal_units: float = 80.0  # hand-made features: the distance, in units of blur, that counts as 1
     prior: float = 0.5  # weight of the mean ln sigma
     volume: float = 0.01  # weight of the mean volume of a Gaussian
     # whether the loss of the uncertainty also moves Gaussians, as published with anchors. Without anchors it
@@ -62,8 +62,9 @@ class NexusSplatsConfig:
     light_width: int = 64  # published 256, for ten Gaussians at once
     doubt_width: int = 64  # published 128, likewise
     dropout: float = 0.2
-    lr_code: float = 1e-3  # of photos and doubts; for photos and nets higher in runs below 30 000 iterations
-    lr_light: float = 5e-3  # of a Gaussian's light
+    # codes of photos and doubts; runs below 30 000 iterations have higher rates of photos and nets
+    lr_code: float = 1e-3
+    lr_light: float = 5e-3  # rate of a Gaussian's light
     lr_net: float = 5e-4
 
     def __post_init__(self) -> None:

@@ -167,7 +167,7 @@ class RobustSplatMask(PausingMask):
         self.shares = MaskedShares()
         self.loss_sum: float | Tensor = 0.0  # sum of mask losses
         self.loss_count = 0.0
-        self._coarse_cameras: dict[int, tuple[Camera, Camera]] = {}  # of the step, and coarse
+        self._coarse_cameras: dict[int, tuple[Camera, Camera]] = {}  # view -> its camera in both sizes
 
     def setup(self, data: TrainData) -> None:
         self.data = data

@@ -47,12 +47,12 @@ class SplatfactoWConfig:
     """Options; times in nominal iterations (of 30 000; published for 55 000)."""
 
     density: DensityConfig = field(default_factory=_density)
-    width: int = 256  # of the net's hidden layers
+    width: int = 256  # units of the net's hidden layers
     background: bool = True
     lr_photo: float = 0.02
     lr_feature: float = 0.02
     lr_net: float = 2e-3
-    lr_rest: float = 1e-4  # of the head for higher harmonics
+    lr_rest: float = 1e-4  # rate of the head for higher harmonics
     mask_start: float = 6000.0
     most_masked: float = 0.4  # largest share of masked pixels
     never_masked: float = 0.4  # upper share of the picture that is never masked, a prior of tourist photos
@@ -87,7 +87,7 @@ class SplatfactoColours(Learnt):
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
         photo = torch.tensor(0.1 * rng.normal(size=(len(data.photos), PHOTO)), dtype=torch.float32)
         lr, w, rest = self.config.lr_net, self.config.width, self.config.lr_rest
-        found = {"photo": Leaf(photo, self.config.lr_photo, 0.015, per_photo=True)}
+        leaves = {"photo": Leaf(photo, self.config.lr_photo, 0.015, per_photo=True)}
         nets = {
             "net": ((PHOTO + FEATURE, w, w), lr, 0.05), "dc": ((w, 3), lr, 0.05),
             "rest": ((w, 45), rest, 0.05), "sky": ((PHOTO, 128, 128), lr, 0.05),
@@ -96,8 +96,8 @@ class SplatfactoColours(Learnt):
         for name, (widths, rate, final) in nets.items():
             for key, leaf in mlp_leaves(name, widths, rng, rate).items():
                 values = torch.zeros_like(leaf.values) if name.endswith("rest") else leaf.values
-                found[key] = replace(leaf, values=values, final=final)
-        return found
+                leaves[key] = replace(leaf, values=values, final=final)
+        return leaves
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
         zeros = torch.zeros(len(gaussians), FEATURE, device=gaussians.device)

@@ -82,7 +82,7 @@ class SpotLessDensity(DensityControl):
 
 
 class PruningDensity(SpotLessDensity):
-    """Also removes Gaussians on which pictures hardly depended since the last round."""
+    """Density control that also removes Gaussians on which pictures hardly depended since the last round."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"squared"})
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": (), "use_sum": ()}

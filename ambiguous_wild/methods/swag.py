@@ -148,12 +148,12 @@ class SwagConfig:
     """Options, all of them ours; times in nominal iterations (of 30 000)."""
 
     density: DensityConfig = field(default_factory=DensityConfig)
-    levels: int = 8  # of the hash grid, with two features each
-    entries: int = 2**14  # of each level
+    levels: int = 8  # levels of the hash grid, with two features each
+    entries: int = 2**14  # entries of each level
     coarsest: int = 16  # cells along a side of the first level
     finer: float = 1.5  # ratio of cells from level to level
-    width: int = 64  # of the net's three hidden layers
-    temperature: float = 0.1  # of the gate
+    width: int = 64  # units of the net's three hidden layers
+    temperature: float = 0.1  # temperature of the gate
     gate_start: float = 3000.0
     start_logit: float = -4.0  # logit of being off, at the start
     off: float = 0.01  # weight of the mean gate in the loss

@@ -130,7 +130,7 @@ class Divergence(PausingMask):
 
     def __init__(self, config: T3dgsConfig) -> None:
         self.config, self.features, self.shares = config, make_features(config.features), MaskedShares()
-        self.bank: dict[int, Tensor] = {}  # by view its last mask, [H, W] bool
+        self.bank: dict[int, Tensor] = {}  # view -> its last mask, [H, W] bool
 
     def setup(self, data: TrainData) -> None:
         self.features.fit(data.photos)

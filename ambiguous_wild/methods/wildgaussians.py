@@ -106,8 +106,8 @@ class WildGaussiansConfig:
     lr_photo: float = 0.01
     lr_gaussian: float = 5e-3
     lr_net: float = 1e-3
-    width: int = 128  # of both hidden layers
-    scale: float = 0.1  # of the MLP's output; at 0.01 a run of 700 iterations gains 0.8 dB, at 0.1 2.0
+    width: int = 128  # units of both hidden layers
+    scale: float = 0.1  # factor of the MLP's output; at 0.01 a run of 700 iterations gains 0.8 dB, at 0.1 2.0
 
     def __post_init__(self) -> None:
         check_features(self.features)

@@ -27,7 +27,7 @@ COLOUR_METRIC = "colour_share_rgb_l2_below_0.3"
 class ColourCounts:
     """Pixel counts of one photo, or sums over several."""
 
-    pixels: int  # of the photo
+    pixels: int  # number of pixels of the photo
     distractor: int  # pixels that distractors cover
     known: int  # distractor pixels with a known background
     close: int  # known ones that differ from the background by less than the threshold

@@ -217,7 +217,7 @@ def flip_map(
 
 
 def _linear(image: np.ndarray) -> np.ndarray:
-    """sRGB to linear RGB."""
+    """Convert sRGB to linear RGB."""
     return np.where(image > 0.04045, ((image + 0.055) / 1.055) ** 2.4, image / 12.92)
 
 

@@ -24,7 +24,7 @@ from ambiguous_wild.core.errors import AwError
 AMBIGUOUS_ABOVE = 0.7  # cosine; stated by the paper for DINOv2 features
 LOOKALIKE_ABOVE = 0.25  # share of distractor pixels, for weight-free features; see docs/ambiguity.md
 USUAL = 0.05  # quantile of static regions' best matches; a higher match is usual
-MIN_SHARE = 0.002  # of a photo's pixels; smaller regions are ignored
+MIN_SHARE = 0.002  # smaller shares of a photo's pixels are ignored
 _ANCHOR_REGIONS = 2000  # most static regions used for the anchors, evenly chosen
 
 
@@ -48,7 +48,7 @@ class Regions:
 class RegionMatch:
     """One distractor region and its most similar static region."""
 
-    label: int  # of the distractor region
+    label: int  # label of the distractor region
     pixels: int
     cosine: float  # in [-1, 1]
     photo: int  # index of the photo with the static region
@@ -107,7 +107,7 @@ class ChannelStatistics:
 def region_means(
     features: np.ndarray,  # [h, w, C], a coarser grid over the same photo
     labels: np.ndarray,  # [H, W] int, 0 = no region
-    min_share: float = 0.0,  # of the photo; smaller regions are left out
+    min_share: float = 0.0,  # share of the photo; smaller regions are left out
 ) -> Regions:
     """Mean feature of each region; a cell is weighted by the number of its pixels in the region."""
     h, w, channels = features.shape
@@ -124,7 +124,7 @@ def matches(
     distractors: Sequence[Regions],  # one per photo
     statics: Sequence[Regions],  # one per photo
 ) -> list[list[RegionMatch]]:
-    """For each distractor region the most similar static region of another photo.
+    """Find the most similar static region of another photo for each distractor region.
 
     Only other photos are used, because a distractor's features leak into its surroundings. A scene of one
     photo is compared with itself. Regions with a zero feature are left out.
@@ -178,7 +178,7 @@ def _sampled(units: np.ndarray) -> range:
 
 
 def _best_in_other_photos(units: np.ndarray, photo: np.ndarray) -> list[float]:
-    """For each sampled region the cosine of its best match in another photo."""
+    """Return the cosine of each sampled region with its best match in another photo."""
     return [float((units @ units[k])[photo != photo[k]].max()) for k in _sampled(units)]
 
 

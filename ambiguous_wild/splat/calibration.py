@@ -30,7 +30,7 @@ from ambiguous_wild.splat.rendered import Cotangents
 class Size:
     """The work of a calibration kernel."""
 
-    name: str  # as written into the record of a run
+    name: str  # name in the record of a run
     reference_s: float  # seconds on the reference machine
     gaussians: int
     width: int
@@ -169,7 +169,7 @@ def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
     gradients = rendered.backward(loss.d_image)
     rendered.backward(Cotangents(loss.d_image, extra=loss.d_image))
     rendered.backward(loss.d_image, frozenset({"absolute"}))
-    # with as many tensors as the watchdog passes, of gradients and of parameters
+    # the watchdog passes as many tensors of gradients and of parameters
     all_finite([tensor for name, tensor in gaussians.items() if name != "sh_rest"])
     all_finite([tensor for _, tensor in gaussians.items()])
     optimiser.step(gradients, rendered.visible)

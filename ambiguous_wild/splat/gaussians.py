@@ -59,9 +59,9 @@ class Gaussians:
     # [N, ...] further tensors of a method, by name; density control copies and drops their rows too
     attributes: Mapping[str, Tensor] = field(default_factory=dict)
 
-    # updates that an optimiser has put off for rows that no view saw; None = `sh_rest` is up to date. The
-    # renderer has them made for the rows about to be drawn. `dataclasses.replace` keeps them; copies are up
-    # to date.
+    # Updates that an optimiser has put off for rows that no view saw; None = `sh_rest` is up to date. The
+    # renderer applies them to the rows that it is about to draw. `dataclasses.replace` keeps them; copies are
+    # up to date.
     postponed: Postponed | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -183,7 +183,7 @@ class Gaussians:
             )
         from scipy.spatial import cKDTree
 
-        distances = cKDTree(xyz).query(xyz, k=4)[0][:, 1:]  # of the three nearest other points
+        distances = cKDTree(xyz).query(xyz, k=4)[0][:, 1:]  # distances to the three nearest other points
         scale = np.sqrt((distances**2).mean(axis=1)).clip(min=1e-7)  # coincident points stay finite
         n = len(xyz)
         quats = torch.zeros(n, 4)

@@ -261,7 +261,7 @@ def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splat
 
 @functools.cache
 def _background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:
-    """[1, 3], copied once."""
+    """Return the background [1, 3] on the device; it is copied once."""
     return torch.tensor([background], dtype=torch.float32).to(device)
 
 

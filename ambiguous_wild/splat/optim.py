@@ -36,7 +36,7 @@ class SplatAdam:
     def __init__(
         self,
         gaussians: Gaussians,
-        # by names of Gaussians.rows(); an attribute without a rate is not learnt
+        # rates by name in Gaussians.rows(); an attribute without a rate is not learnt
         learning_rates: Mapping[str, float],
         *,
         lazy: bool = True,  # False steps every row of sh_rest at once: the same bits, more memory traffic

@@ -43,7 +43,7 @@ class TorchFacts(TypedDict):
     version: str
     built: str | None  # version of CUDA that it is built for; None = a CPU build
     cuda: bool  # whether it can use a GPU
-    names: list[str]  # of the GPUs that it sees
+    names: list[str]  # names of the GPUs that it sees
     toolkit: str | None  # folder of the CUDA toolkit that it compiles with
     error: str  # why a CUDA build sees no GPU
 

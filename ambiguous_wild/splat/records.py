@@ -70,7 +70,7 @@ class GpuClock(Clock):
         elapsed_s: float = 0.0,
         parts_s: dict[str, float] | None = None,
         *,
-        event: Callable[[], Any] | None = None,  # with record, synchronize, elapsed_time in ms
+        event: Callable[[], Any] | None = None,  # makes an event: record, synchronize, elapsed_time in ms
     ) -> None:
         super().__init__(elapsed_s, parts_s)
         self._event = event or (lambda: torch.cuda.Event(enable_timing=True))
@@ -198,7 +198,7 @@ class DensityLog:
     """Rounds of growth in order, and positions of the Gaussians that they made."""
 
     rounds: list[Round] = field(default_factory=list)
-    added: Places = field(default_factory=Places)  # by cloning and splitting
+    added: Places = field(default_factory=Places)  # Gaussians added by cloning and splitting
     merged: Places = field(default_factory=Places)  # Gaussians that replaced merged ones
 
     def begin(self, iteration: int) -> None:

@@ -250,7 +250,7 @@ class Broken:
 
     iteration: int
     keep: Tensor | None
-    method_cotangents: Cotangents | None  # of the method's own losses on the render
+    method_cotangents: Cotangents | None  # cotangents of the method's own losses on the render
 
 
 class Sentinel:

@@ -250,7 +250,7 @@ class EntropyAwareDensity(DensityControl):
         stay[rows] = False
         gaussians = self.keep_rows(gaussians, optimiser, stay)
         gaussians = gaussians.cat(new)
-        optimiser.append(len(new))  # with zero moments
+        optimiser.append(len(new))  # new Gaussians start with zero moments
         self._match(gaussians)
         self.merged += len(rows) - len(new)
         self.log.merge(len(rows) - len(new), new.means)

@@ -114,7 +114,7 @@ class Labels:
         self.known = np.isfinite(areas)  # [views, K]
         self.areas = torch.from_numpy(areas).to(device)  # [views, K] float64 px, NaN for missing ones
         self.static_flags = torch.from_numpy(flags).to(device)  # [views, K]
-        # by view, if it has any: static instances by structure from motion, [H, W] bool
+        # view -> its instances that structure from motion shows to be static, [H, W] bool; absent if none
         self.static = {
             view: torch.from_numpy(np.r_[False, flags[view]][label]).to(device)
             for view, label in enumerate(clean)
@@ -184,7 +184,7 @@ def make_masks(
         inside = labels.of_pixel[view].view(shape) > 0
         judging = torch.where(inside, (pixels * of_instance).sqrt_(), pixels)
         regions.append(judging)
-    # with the default settings two sets of regions, computed at once
+    # the default settings compute two sets of regions at once
     connected = list(hysteresis(torch.stack([r.double() for r in regions]), weak, strong)) if regions else []
     global_ = nothing
     if config.use_global:
@@ -230,14 +230,14 @@ class MaskStore:
         # features are judged on their whole grid
         unseen = self.pixels.unseen_on_host if structure else [None] * len(photos)
         self.labels = Labels(labels, static, unseen, device)
-        # by view the factor of its evidence, [H, W]; absent if it is 1
+        # view -> factor of its evidence, [H, W]; absent if it is 1
         self.factors = {
             view: sized(look.factor(photos[view].shape[:2]), device)
             for view, look in looks.items()
             if look.weight != 1
         }
         self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
-        self.keeps: dict[int, Tensor] = {}  # by view, if it has a mask: [H, W] float32
+        self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] float32, if it has one
         wide, views = torch.float64, len(photos)
         # [views, K] mean of every instance when its mask was last made, NaN for missing ones
         self.means = torch.full((views, self.labels.most), torch.nan, dtype=wide, device=device)
@@ -305,14 +305,14 @@ class MaskStore:
 
     @property
     def judged(self) -> dict[int, Judged]:
-        """By view its instances when its mask was last made."""
+        """Each view's instances when its mask was last made."""
         means, distances, areas = (t.cpu().numpy() for t in (self.means, self.distances, self.labels.areas))
         known = self.labels.known
         return {v: Judged(*(rows[v, known[v]] for rows in (means, distances, areas))) for v in self.keeps}
 
     @property
     def shares(self) -> dict[int, tuple[float, float, float, float]]:
-        """By view the shares masked in all, locally and globally, and T_ent."""
+        """Each view's shares masked in all, locally and globally, and T_ent."""
         rows = self._shares.tolist()
         return {view: tuple(rows[view]) for view in self.keeps}
 

@@ -73,7 +73,7 @@ def instances() -> str:
 
 @dataclass(frozen=True)
 class PaperConfig(RefineSplatConfig):
-    """All parts of the paper; its networks if this machine has them, see `features`, `instances`."""
+    """All parts of the paper; its networks depend on this machine, see `features`, `instances`."""
 
     mask: MaskConfig = MASK
     first_look: FirstLookConfig = FirstLookConfig(on=False)  # noqa: RUF009

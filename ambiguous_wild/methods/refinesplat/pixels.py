@@ -169,7 +169,7 @@ class PixelEvidence:
         self.unrelated = unrelated_residual([torch.from_numpy(photo) for photo in photos], config.base)
         # normal residual of each view's static pixels; NaN before the first `look`
         self.normal = torch.full((len(photos),), torch.nan, dtype=torch.float64, device=device)
-        # by view its residual, averaged over its visits, [H, W] float16
+        # view -> its residual, averaged over its visits, [H, W] float16
         self.before: dict[int, Tensor] = {}
 
     def look(

@@ -123,9 +123,9 @@ class RefineSplatMask(PausingMask):
         self.config = config
         self.features = features or make_features(config.features)
         self.instances = instances or _instances(config)
-        self.visits: dict[int, int] = {}  # by view the number of steps since masks began
-        self.points: dict[str, MotionPoints] = {}  # by name of the photo
-        self.looks: dict[int, FirstLook] = {}  # by view its comparison with other photos, if there is one
+        self.visits: dict[int, int] = {}  # view -> number of steps since masks began
+        self.points: dict[str, MotionPoints] = {}  # photo's name -> its moving and static features
+        self.looks: dict[int, FirstLook] = {}  # view -> its comparison with other photos, if any
 
     def setup(self, data: TrainData) -> None:
         self.data = data
@@ -143,7 +143,7 @@ class RefineSplatMask(PausingMask):
             config, photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
             data.device, self.compare, data.photos,
         )  # fmt: skip
-        # by view its keep map before masks begin, [H, W] float32; absent if everything is kept
+        # view -> its keep map before masks begin, [H, W] float32; absent if everything is kept
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
             for view, look in self.looks.items()
@@ -238,12 +238,12 @@ class RefineSplatMask(PausingMask):
 
     @property
     def shares(self) -> dict[int, tuple[float, float, float, float]]:
-        """By view the shares masked in all, locally and globally, and T_ent, when its mask was last made."""
+        """Each view's shares masked in all, locally and globally, and T_ent, when its mask was last made."""
         return self.masks.shares
 
     @property
     def judged(self) -> dict[int, Judged]:
-        """By view its instances when its mask was last made."""
+        """Each view's instances when its mask was last made."""
         return self.masks.judged
 
     def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:

@@ -240,4 +240,4 @@ def learnt(
     gradient = dl_dt * dt_dw2 * (w2 * (1.0 - w2))
     step = gradient.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0).clamp_(-1.0, 1.0)
     moved = (theta - RATE * step).clamp_(-THETA_LIMIT, THETA_LIMIT)
-    return torch.where(candidate.sum() >= 2, moved, theta)  # with fewer candidates w2 has no influence
+    return torch.where(candidate.sum() >= 2, moved, theta)  # w2 has no influence on fewer candidates

@@ -37,7 +37,7 @@ from ambiguous_wild.splat.step import Shot, TrainData
 class Leaf:
     """A tensor that an effect learns."""
 
-    values: Tensor  # of any shape; with `per_photo` [train photos, ...]
+    values: Tensor  # any shape; [train photos, ...] if `per_photo`
     rate: float  # learning rate of Adam
     final: float = 1.0  # the rate decays exponentially to this share
     per_photo: bool = False  # a row for every photo, and one for a test photo

@@ -110,7 +110,7 @@ def judged(data: TrainData, renders: Sequence[torch.Tensor], backend: str, sigma
     flat, bad = np.concatenate(truth), np.concatenate(guilty)
     return {
         "instances": config.instances,
-        "identities": found.found.count,
+        "identities": found.association.count,
         "instances_per_photo": fmean(inputs.counts),
         "pixels": {name: auc(np.concatenate(v), flat) for name, v in pixels.items()},
         "by_instance": {name: auc(np.concatenate(v), bad) for name, v in grouped.items()},

@@ -33,7 +33,7 @@ class Lamps(Learnt):
         return {"lit": GaussianAttribute(share, rate=0.005)}
 
     def forward(self, visible, leaf, shot):
-        light = visible.extra["lit"] @ leaf["lamps"]  # [M, 3]; zero lamps leave the colours as they are
+        light = visible.attributes["lit"] @ leaf["lamps"]  # [M, 3]; zero lamps leave the colours as they are
         return visible.base * (1.0 + light)
 
 

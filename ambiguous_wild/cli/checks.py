@@ -59,7 +59,7 @@ print(json.dumps({"version": pycolmap.__version__}))
 class Probe:
     """The facts a process printed, or the error."""
 
-    facts: dict[str, Any] | None
+    facts: Any  # the JSON object that it printed; None if it failed
     error: str = ""
 
 

@@ -1,7 +1,4 @@
-"""The error class for everything that a user can correct.
-
-Commands that install optional dependencies, for this installation.
-"""
+"""The error that a user can correct, and words for its message: install commands, counts, short lists."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from pathlib import Path
 
 
 def install_command(extra: str) -> str:
-    """The pip command for the extra, from the checkout that is running, else by the package's name.
+    """Return the pip command that installs an extra: from the running checkout, else by the package's name.
 
     Args:
         extra: a name under [project.optional-dependencies], e.g. ``"cuda"``.
@@ -25,13 +22,13 @@ def install_command(extra: str) -> str:
 
 
 def torch_command(version: str) -> str:
-    """The commands that replace a CPU build of torch by a CUDA build.
+    """Return the commands that replace a CPU build of torch by a CUDA build.
 
     Both have the same version apart from the part after "+", so pip must remove one before it installs the
     other.
 
     Args:
-        version: of torch, e.g. ``"2.13.0+cpu"``.
+        version: the installed torch's, e.g. ``"2.13.0+cpu"``.
     """
     pip, release = f"{sys.executable} -m pip", version.partition("+")[0]
     pinned = _pinned(Path(__file__).resolve().parents[2])
@@ -60,30 +57,30 @@ class AwError(Exception):
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwError:
-    """The error for an unknown name; it gives the nearest known one.
+    """Return the error for an unknown name; its message suggests the nearest known name.
 
     Args:
-        kind: of the name, e.g. ``"method"``.
+        kind: what is named, e.g. ``"method"``.
         name: as the user wrote it.
         choices: the known names.
-        hint: how to see all of them, e.g. ``"'aw methods' lists them"``.
+        hint: how to list all known names, e.g. ``"'aw methods' lists them"``.
     """
     known = sorted(choices)
     lowered = {choice.casefold(): choice for choice in reversed(known)}
-    near = difflib.get_close_matches(name.casefold(), lowered, n=1, cutoff=0.5)
-    if near:
-        tail = f"did you mean {lowered[near[0]]!r}?"
+    match = difflib.get_close_matches(name.casefold(), lowered, n=1, cutoff=0.5)
+    if match:
+        suggestion = f"did you mean {lowered[match[0]]!r}?"
     elif len(known) <= 12:
-        tail = "there is: " + ", ".join(known) if known else "there is none"
+        suggestion = "there is: " + ", ".join(known) if known else "there is none"
     else:
-        some = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
-        tail = f"the nearest of {len(known)}: {', '.join(some)}"
-    return AwError(f"unknown {kind} {name!r}: {tail}" + (f" ({hint})" if hint else ""))
+        nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
+        suggestion = f"the nearest of {len(known)}: {', '.join(nearest)}"
+    return AwError(f"unknown {kind} {name!r}: {suggestion}" + (f" ({hint})" if hint else ""))
 
 
 @contextlib.contextmanager
 def logged_to(handler: logging.Handler) -> Iterator[None]:
-    """Meanwhile what this package logs, of any level, goes to the handler, which is closed at the end."""
+    """Send all log messages of this package, of any level, to the handler meanwhile; close it at the end."""
     logger = logging.getLogger("ambiguous_wild")
     logger.setLevel(logging.DEBUG)
     logger.addHandler(handler)
@@ -95,12 +92,12 @@ def logged_to(handler: logging.Handler) -> Iterator[None]:
 
 
 def counted(number: int, noun: str) -> str:
-    """``"1 rater"``, ``"3 raters"``."""
+    """Return the number with its noun: ``"1 rater"``, ``"3 raters"``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def shortlist(names: Iterable[str], limit: int = 5) -> str:
-    """``"a.jpg, b.jpg and 3 more"``: names in a message of one line."""
+    """Join names for a message of one line: ``"a.jpg, b.jpg and 3 more"``."""
     listed = [str(n) for n in names]
     if len(listed) <= limit:
         return ", ".join(listed)

@@ -10,11 +10,11 @@ LONGEST = 100  # bytes of UTF-8; file systems allow 255, and suffixes are added 
 
 
 def check_name(kind: str, name: str) -> str:
-    """The name without surrounding blanks, if it can be printed and be part of a path.
+    """Return the name without surrounding blanks, if it can be printed and be part of a path.
 
     Args:
-        kind: for the error, e.g. ``"scene name"``.
-        name: as given.
+        kind: what is named, for the error, e.g. ``"scene name"``.
+        name: as the user gave it.
 
     Raises:
         AwError: empty, longer than 100 bytes, starting with a dot, or holding ``/``, ``\\`` or a character
@@ -35,12 +35,12 @@ def check_name(kind: str, name: str) -> str:
 
 
 def is_text(value: str) -> bool:
-    """Whether it can be written as UTF-8: JSON and command lines may hold lone surrogates."""
+    """Whether the text can be written as UTF-8: JSON and command lines may hold lone surrogates."""
     return not any("\ud800" <= c <= "\udfff" for c in value)
 
 
 def _unprintable(char: str) -> bool:
-    """Control, format and surrogate characters, and line and paragraph separators."""
+    """Whether it is a control, format or surrogate character, or a line or paragraph separator."""
     return unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 

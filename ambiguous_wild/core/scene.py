@@ -5,20 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 
 Split = Literal["train", "test"]
-_FEW_POINTS = 500  # no surface follows from fewer
-_FAR_CAMERA = 30.0  # times the median distance of the cameras from their middle: a wrong pose
-_FEW_CAMERAS = 0.1  # of the cameras: more of them are another part of the capture
-_FAR_PLACE = 100.0  # times a scene's size from the origin: float32 still has a hundredth of a pixel
-_ORDINARY = (0.1, 1000.0)  # sizes at which the nearest depth and the formats' ranges fit
-_SIZE = 4.0  # about that of scenes of structure from motion
+_FEW_POINTS = 500  # fewer points do not describe a surface
+_FAR_CAMERA = 30.0  # times the cameras' median distance from their middle; farther away a pose is wrong
+_FEW_CAMERAS = 0.1  # share of the cameras; if more lie far away, they are another part of the capture
+_FAR_PLACE = 100.0  # times a scene's size; at this distance float32 still resolves 0.01 px
+_ORDINARY = (0.1, 1000.0)  # scene sizes that suit the nearest depth and the ranges of file formats
+_SIZE = 4.0  # other scenes are scaled to about this size, which structure from motion often gives
 
 
 class FileEntry(TypedDict):
@@ -36,14 +37,14 @@ class SceneInfo(TypedDict, total=False):
     factor: int  # downsampling that the scene was built for
     images: str  # folder of that factor
     license: str
-    dataset: str  # as result tables call it
-    evaluation: dict[str, Any]  # how the dataset's papers measure: protocol, effects
+    dataset: str  # name of the data set in result tables
+    evaluation: Facts  # how the dataset's papers measure: protocol, effects
     build_key: str
-    inputs: dict[str, Any]  # what it was built from
-    files: dict[str, FileEntry]  # by path relative to the scene
-    loaded_factor: int  # added: of the pictures that were opened
-    missing: dict[str, list[str]]  # added: per side the listed names that the model lacks
-    warnings: list[str]  # the build's; after `load_scene` what it found
+    inputs: Facts  # what it was built from
+    files: dict[str, FileEntry]  # path relative to the scene -> its entry
+    loaded_factor: int  # added by `load_scene`: downsampling of the pictures that it opened
+    missing: dict[str, list[str]]  # added by `load_scene`: listed photos without a pose, by side of the split
+    warnings: list[str]  # warnings of the build; `load_scene` replaces them
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,9 @@ class View:
     Keep maps follow one convention everywhere: 1 = static (kept), 0 = transient.
     """
 
-    name: str  # path relative to the image folder, as COLMAP and the split lists write it
+    name: str  # path relative to the image folder, as in COLMAP's model and the split lists
     image_path: Path  # the file that is trained on or measured against, already downsampled
-    camera: Camera  # of that file: intrinsics match its size
+    camera: Camera  # its intrinsics match the size of that file
     split: Split
     keep_path: Path | None = None  # PNG, white = keep; the user's or the capture's own mask
     image_id: int = -1  # COLMAP's id, -1 where there is none
@@ -81,14 +82,14 @@ class Points:
 
     @property
     def sure_xyz(self) -> np.ndarray:
-        """[K, 3] points that three photos or more show, for surfaces; all, where these are few."""
+        """Points [K, 3] seen by at least three photos, for surfaces; all points if these are too few."""
         sure = np.diff(self.track_offsets) >= 3
         return self.xyz[sure] if sure.sum() >= _FEW_POINTS else self.xyz
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a scene lies in its files' coordinates: inside, a position x is ``R (x - centre) * scale``."""
+    """The change of coordinates from a scene's files to training: ``x -> R (x - centre) * scale``."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0  # a power of two, so that positions lose no bit
@@ -102,7 +103,7 @@ class Place:
         return np.eye(3) + 2.0 * (w * cross + cross @ cross)
 
     def inside(self, camera: Camera) -> Camera:
-        """A camera of the files' coordinates, moved along."""
+        """Return a camera of the files' coordinates in those of training."""
         if self == UNMOVED:
             return camera
         pose = camera.cam_from_world.copy()
@@ -123,7 +124,7 @@ class Scene:
     views: tuple[View, ...]
     points: Points
     info: SceneInfo = field(default_factory=SceneInfo, repr=False)
-    place: Place = UNMOVED  # of the coordinates of views and points in those of the files
+    place: Place = UNMOVED  # how views and points were moved from the coordinates of the files
 
     @cached_property
     def train(self) -> tuple[View, ...]:
@@ -150,9 +151,9 @@ class Scene:
 
 
 def centred(scene: Scene) -> Scene:
-    """The scene near the origin and of ordinary size, with its place; as it is where it lies so already.
+    """Return the scene moved to the origin and scaled to an ordinary size, where it is not so already.
 
-    What trains and draws counts in float32, from a nearest depth of 0.01 on.
+    Training and rendering use float32 and draw nothing nearer than 0.01.
     """
     centers = np.array([v.camera.center for v in together(scene.train or scene.views)])
     xyz, middle = scene.points.xyz, np.median(centers, axis=0)
@@ -173,13 +174,13 @@ def centred(scene: Scene) -> Scene:
 
 
 def together(views: tuple[View, ...]) -> tuple[View, ...]:
-    """The views without the few, if any, whose cameras lie far from the rest: their poses are wrong."""
+    """Return the views without the few whose cameras lie far from the rest: their poses are wrong."""
     near = near_others(np.array([v.camera.center for v in views]))
     return views if near.all() else tuple(v for v, inside in zip(views, near) if inside)
 
 
 def near_others(centers: np.ndarray) -> np.ndarray:
-    """[N] bool, positions [N, 3] of cameras that do not lie far from all others; all, unless few lie so."""
+    """Whether each camera centre [N, 3] lies near the others, [N] bool; all True if many lie far away."""
     away, usual = _away(centers)
     near = away <= _FAR_CAMERA * usual
     few = usual > 0.0 and (~near).sum() <= max(1, _FEW_CAMERAS * len(centers))
@@ -187,14 +188,15 @@ def near_others(centers: np.ndarray) -> np.ndarray:
 
 
 def far_cameras(scene: Scene) -> list[str]:
-    """A warning that names the training photos that `together` leaves out."""
+    """Return a warning that names the training photos that `together` leaves out, or nothing."""
     far = {view.name for view in scene.train} - {view.name for view in together(scene.train)}
-    told = f"the cameras of {shortlist(sorted(far))} lie far from all others, so their poses are probably "
-    told += "wrong; the scene's size is measured without them: check them, or take them out of train_list.txt"
-    return [told] if far else []
+    message = f"the cameras of {shortlist(sorted(far))} lie far from all others, so their poses are probably "
+    message += "wrong; the scene's size is measured without them: check them, or take them out of "
+    message += "train_list.txt"
+    return [message] if far else []
 
 
 def _away(centers: np.ndarray) -> tuple[np.ndarray, float]:
-    """Distances [N] of positions [N, 3] from their median, and the median of these."""
+    """Return the distances [N] of positions [N, 3] from their median, and the median distance."""
     away = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     return away, float(np.median(away))

@@ -1,6 +1,6 @@
-"""Files of weights: where they are searched; tensors, read without running what a file names.
+"""Files of network weights: where they are searched, and how tensors are read without running code.
 
-torch is imported when one is read.
+torch is imported only when a file is read.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ DEFAULT_FOLDER = "~/.cache/ambiguous_wild/weights"
 
 
 def weights_folder() -> Path:
-    """The folder AW_WEIGHTS; `DEFAULT_FOLDER` if the variable is not set."""
+    """Return the folder that AW_WEIGHTS names; `DEFAULT_FOLDER` if the variable is not set."""
     return expanded(os.environ.get("AW_WEIGHTS", "").strip() or DEFAULT_FOLDER, "AW_WEIGHTS")
 
 
 def expanded(path: str | Path, name: str) -> Path:
-    """The path with its ~ replaced; `name` is the variable or option that holds it.
+    """Replace the ~ of a path; `name` is the variable or option that holds it.
 
     Raises:
-        AwError: it begins with the name of a user who has no home folder.
+        AwError: the home folder of its user is not known.
     """
     try:
         return Path(path).expanduser()
@@ -40,17 +40,17 @@ def expanded(path: str | Path, name: str) -> Path:
 
 
 def folder_fault() -> str:
-    """Why `weights_folder` cannot hold weights, and what to do: a file is in its place; "" if none is."""
+    """Return why `weights_folder` cannot hold weights, and what to do; "" if it can."""
     folder = weights_folder()
-    there = next((place for place in (folder, *folder.parents) if place.exists()), None)
-    if there is None or there.is_dir():
+    existing = next((place for place in (folder, *folder.parents) if place.exists()), None)
+    if existing is None or existing.is_dir():
         return ""
-    what = "the folder of weights" if there == folder else f"which the folder of weights {folder} is in"
-    return f"{there}, {what}, is a file; set AW_WEIGHTS to a folder"
+    role = "the folder of weights" if existing == folder else f"which the folder of weights {folder} is in"
+    return f"{existing}, {role}, is a file; set AW_WEIGHTS to a folder"
 
 
 def torch_hub_folder() -> Path:
-    """Folder of checkpoints that torch downloads: TORCH_HOME/hub/checkpoints or its default."""
+    """Return the folder of checkpoints that torch downloads: TORCH_HOME/hub/checkpoints or its default."""
     cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     home = os.environ.get("TORCH_HOME")
     folder = expanded(home, "TORCH_HOME") if home else expanded(cache, "XDG_CACHE_HOME") / "torch"
@@ -58,19 +58,19 @@ def torch_hub_folder() -> Path:
 
 
 def file_places(name: str) -> list[Path]:
-    """Folders in which single files of the weights of this name are searched, in order."""
+    """Return the folders in which files of the weights of this name are searched, in order."""
     own = weights_folder()
     return [own / name, own, torch_hub_folder()]
 
 
 def find_file(name: str, files: tuple[str, ...]) -> Path | None:
-    """The first of the files, which stand for each other, that exists in `file_places`."""
+    """Return the first of these equivalent files that exists in `file_places`."""
     paths = (folder / file for folder in file_places(name) for file in files)
     return next((path for path in paths if path.is_file()), None)
 
 
 def _fits(path: Path) -> bool:
-    """Whether memory holds a file twice: if it does, one that asked for too much is damaged."""
+    """Whether the file fits into memory twice: if so, a file that asked for too much is damaged."""
     try:
         bytearray(2 * path.stat().st_size)
     except MemoryError:
@@ -79,14 +79,14 @@ def _fits(path: Path) -> bool:
 
 
 def read_tensors(path: Path, advice: str = "download it again") -> dict[str, Tensor]:
-    """The tensors of a .safetensors file, or of a file of torch, read with ``weights_only``.
+    """Read the tensors of a .safetensors file, or of a file of torch with ``weights_only``.
 
     Args:
-        path: of the file.
+        path: file to read.
         advice: what to do about a file that cannot be used; ends the error.
 
     Raises:
-        AwError: damaged, a file that holds anything but a dict of tensors, or values that are not finite.
+        AwError: the file is damaged, holds anything but a dict of tensors, or a value is not finite.
     """
     import torch
 
@@ -97,7 +97,7 @@ def read_tensors(path: Path, advice: str = "download it again") -> dict[str, Ten
             data = load_file(path)
         else:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # about odd pickles: the error below says it in one line
+                warnings.simplefilter("ignore")  # warnings about odd pickles: the error below is enough
                 data = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(data, dict) or not all(isinstance(v, torch.Tensor) for v in data.values()):
             raise AwError(f"{path} holds no dictionary of tensors; {advice}")
@@ -116,7 +116,7 @@ def read_tensors(path: Path, advice: str = "download it again") -> dict[str, Ten
 
 
 def not_finite(tensors: Mapping[str, Tensor]) -> str | None:
-    """Name of the first tensor with a NaN or an infinite value."""
+    """Return the name of the first tensor with a NaN or an infinite value, if any."""
     import torch
 
     floats = ((key, value) for key, value in tensors.items() if value.is_floating_point())

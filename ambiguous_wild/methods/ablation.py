@@ -1,8 +1,7 @@
 """Ablations as data: a method lists the settings to vary, `aw ablate` trains and tabulates them.
 
-Imports nothing heavy: `aw ablate --list` shows them without torch.
-
-The paper's plug-in table: RefineSplat's masks, by three thresholds, in methods with appearance.
+This module imports nothing heavy, so that `aw ablate --list` works without torch. At its end is the paper's
+plug-in table: RefineSplat's masks, with three thresholds, in methods with appearance.
 """
 
 from __future__ import annotations
@@ -21,16 +20,15 @@ DEFAULT = "default"
 
 @dataclass(frozen=True)
 class Variant:
-    """A name and the settings it puts on top of the defaults."""
+    """One row of an ablation: a name, and the settings that differ from the defaults."""
 
     name: str
     settings: tuple[str, ...] = ()  # "key=value", as `--set METHOD.KEY=VALUE` takes them
     text: str = ""  # one line of explanation, if the name needs one
-    features: str = (
-        ""  # a features back end it needs, see vision/backends.py; without its weights the row is missing
-    )
-    # another method, if the paper compares with one; `settings` are then of the study's method as its donor,
-    # or of the graft where the study's method is its host
+    # a back end of features that it needs, see vision/backends.py; without its weights the row is missing
+    features: str = ""
+    # another method, if the paper compares with one; `settings` are then options of the study's method as the
+    # donor of that graft, or of the graft if the study's method is its host
     method: str = ""
 
 
@@ -41,11 +39,11 @@ class Group:
     name: str
     title: str
     variants: tuple[Variant, ...]
-    source: str = ""  # the paper's table
+    source: str = ""  # table of the paper
 
 
 def folder_name(method: str, group: Group, variant: Variant) -> str:
-    """The name of a variant's runs, in place of the method's: refinesplat@masks-local."""
+    """Return the name of a variant's runs, such as refinesplat@masks-local."""
     return f"{method}@{group.name}-{variant.name}"
 
 
@@ -55,14 +53,14 @@ def check_groups(method: str, groups: Sequence[Group]) -> None:
         (f"variants of {g.name}", [v.name for v in g.variants]) for g in groups
     ]:
         wrong = [n for n in names if not _NAME.fullmatch(n) or n == DEFAULT]
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if wrong or twice:
-            what = f"cannot be called {wrong[0]!r}" if wrong else f"are called {twice[0]!r} twice"
-            raise AwError(f"ablations of {method}: {kind} {what}; use small letters, digits, '.', '_', '-'")
+        repeated = sorted({n for n in names if names.count(n) > 1})
+        if wrong or repeated:
+            fault = f"cannot be called {wrong[0]!r}" if wrong else f"are called {repeated[0]!r} twice"
+            raise AwError(f"ablations of {method}: {kind} {fault}; use small letters, digits, '.', '_', '-'")
 
 
 def sweep_groups(options: Any, sweeps: Sequence[str]) -> tuple[Group, ...]:
-    """A group for each "KEY=V1,V2,...", a variant for each value; AwError for what the options refuse."""
+    """Return a group for each "KEY=V1,V2,..." with a variant for each value; AwError for a wrong value."""
     groups = []
     for key, values in ((k, v.split(",")) for k, _, v in (text.partition("=") for text in sweeps)):
         for value in values:
@@ -76,10 +74,10 @@ def sweep_groups(options: Any, sweeps: Sequence[str]) -> tuple[Group, ...]:
 
 
 def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) -> tuple[Group, ...]:
-    """The groups of these names in their own order; all if none is named.
+    """Return the groups of these names, in the order of the study; all if none is named.
 
     Raises:
-        AwError: the method has no ablations, or none of that name.
+        AwError: the method has no ablations, or no group of a name.
     """
     if not groups:
         raise AwError(f"{method} declares no ablations: --sweep KEY=V1,V2 varies an option of any method")
@@ -92,7 +90,7 @@ def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) ->
 
 
 def plug_in(host: str) -> tuple[Group, ...]:
-    """The host's group; its default row has the masks that it comes with, or none."""
+    """Return the plug-in group of a host; its default row has the host's own masks, if any."""
     grafted = f"{host}@mask=refinesplat"
     return (
         Group(

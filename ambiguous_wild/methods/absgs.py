@@ -1,20 +1,20 @@
-"""AbsGS: large Gaussians are split by the absolute screen gradient, where the signed one cancels out.
+"""AbsGS: large Gaussians are split by the absolute screen gradient, where signed gradients cancel out.
 
-Source: the defaults of the released code, TY424/AbsGS; what its paper's tables used is unverified. The
-clamp of opacity ends with growth (ours). Pruning by screen size and by blending weight (off there) are
-left out.
+Source: the defaults of the released code, TY424/AbsGS; the settings of the tables in its paper are
+unverified. Ours: the clamp of opacity ends with growth. Left out: pruning by screen size and by blending
+weight, which are off in the released code.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
@@ -25,10 +25,10 @@ from ambiguous_wild.splat.step import Step
 
 @dataclass(frozen=True)
 class AbsGsConfig(DensityConfig):
-    """Plain density control with a threshold of its own for splits; times in nominal iterations."""
+    """Density control with a separate threshold for splits; times in nominal iterations."""
 
     grow_scale: float = 0.001  # of the scene extent: clone below, split above; 3DGS has 0.01
-    split_grad: float = 4e-4  # mean norm of the absolute gradient; `grow_grad` is that of clones
+    split_grad: float = 4e-4  # mean absolute gradient above which Gaussians split; `grow_grad` is for clones
     clamp_every: float = 500.0
     min_clamp_every: int = 500  # real iterations
     clamp_opacity: float = 0.8  # 1 = never
@@ -42,7 +42,7 @@ class AbsGsConfig(DensityConfig):
 
 
 def build(options: AbsGsConfig) -> Parts:
-    """Growth by two gradients; the rest of the loop is 3DGS."""
+    """Return 3DGS with growth by two gradients."""
     return Parts(density=AbsDensity, density_config=options)
 
 
@@ -66,7 +66,7 @@ class AbsDensity(DensityControl):
         self.abs_sum += torch.where(step.rendered.visible, norms, torch.zeros_like(norms))
 
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
-        """Both kinds share the room: those furthest above their own threshold go first."""
+        """Choose clones and splits together: rows farthest above their threshold come first."""
         seen, small = self.seen.clamp(min=1), self.small(gaussians)
         signed = self.grad_sum / seen / max(self.config.grow_grad, 1e-12)
         score = torch.where(small, signed, self.abs_sum / seen / self.config.split_grad)
@@ -91,9 +91,9 @@ class AbsDensity(DensityControl):
         due = since >= config.min_clamp_every and since * step.nominal / step.iteration >= config.clamp_every
         return due and step.nominal <= config.stop and config.clamp_opacity < 1
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return super().state_dict() | {"last_clamp": self.last_clamp}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         super().load_state_dict(state)
         self.last_clamp = int(state["last_clamp"])

@@ -1,30 +1,30 @@
-"""AsymGS in its EMA-GS form: the model agrees with a slow average of itself, under two masks in turn.
+"""AsymGS in its EMA-GS form: the model must agree with a slow average of itself, under two masks in turn.
 
-Its form with two models is `asymgs_twin.py`.
-Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding)
-and instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map,
-not its gradient; the base is 3DGS without Mip-Splatting's filters and growth.
+The average is stored with every Gaussian, so that density control changes both alike. The form with two
+models is `asymgs_twin.py`.
 
-A slow average of the model, carried with every Gaussian: a teacher that density control keeps in step.
+Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding) and
+instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map, not its
+gradient; the base is 3DGS without Mip-Splatting's filters and growth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.dronesplat import nearest, unit_range
 from ambiguous_wild.methods.masking_common import residual, resized
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect, RowAdam
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
@@ -33,7 +33,7 @@ from ambiguous_wild.vision.precompute import instance_labels, photo_features
 
 
 class SlowAverage(Effect):
-    """p_slow = keep p_slow + (1 - keep) p of the raw parameters, after every step."""
+    """Updates p_slow = keep p_slow + (1 - keep) p of the raw parameters after every step."""
 
     name = "slow-average"
 
@@ -47,31 +47,30 @@ class SlowAverage(Effect):
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
         gaussians.settle()
         for name, tensor in gaussians.items():
-            gaussians.extra[slow(name)].lerp_(tensor, self.share)
+            gaussians.attributes[slow(name)].lerp_(tensor, self.share)
 
 
 class SlowDensity(DensityControl):
-    """The average of a split's child lies where the child lies and is as large; the rest is the parent's."""
+    """Gives the average of a split's child the child's position and size, and else the parent's values."""
 
     def _split_half(self, parents: Gaussians) -> Gaussians:
         child = super()._split_half(parents)
         for name in ("means", "log_scales"):
-            if slow(name) in child.extra:
-                child.extra[slow(name)].copy_(getattr(child, name))
+            if slow(name) in child.attributes:
+                child.attributes[slow(name)].copy_(getattr(child, name))
         return child
 
 
 def slow(name: str) -> str:
-    """Under which name a parameter's average is carried."""
+    """Return the name of the attribute that holds a parameter's average."""
     return f"slow_{name}"
 
 
 def slow_gaussians(gaussians: Gaussians) -> Gaussians | None:
-    """The average as a model of its own; None where it is not carried. Its tensors are those of `extra`."""
-    if slow("means") not in gaussians.extra:
+    """Return the average as Gaussians, which share its tensors; None if there is no average."""
+    if slow("means") not in gaussians.attributes:
         return None
-    found: dict[str, Any] = {name: gaussians.extra[slow(name)] for name in PARAMETERS}
-    return Gaussians(**found)
+    return Gaussians(*(gaussians.attributes[slow(name)] for name in PARAMETERS))
 
 
 @dataclass(frozen=True)
@@ -81,21 +80,21 @@ class AsymGsConfig:
     features: str = "labhog"  # see vision/backends.py
     instances: str = "graph"
     density: DensityConfig = field(default_factory=lambda: DensityConfig(every=1000.0, resets=()))
-    warm_up: float = 1000.0  # before it soft masks do not learn and nothing is compared with the average
-    consistency: float = 0.1  # of mean |picture - slow picture| in the loss
+    warm_up: float = 1000.0  # before it soft masks do not learn, and no loss compares with the average
+    consistency: float = 0.1  # weight of mean |picture - slow picture| in the loss
     colour: float = 0.95  # quantile of the residual above which a pixel is suspect
     feature: float = 0.9  # quantile of the features' distance
     support: float = 0.1  # instances with this share of the photo's density of points are static
 
 
 def build(options: AsymGsConfig) -> Parts:
-    """Masks, the average as an effect, and growth that carries it."""
+    """Return 3DGS with masks, the average as an effect, and growth that updates it."""
     average, rates = SlowAverage(0.8), Schedule(lr_opacity=0.1)
     return Parts(AsymMask(options, average), SlowDensity, options.density, rates, effects=(average,))
 
 
 class AsymMask(MaskPolicy):
-    """Even iterations: instances that residual and features suspect. Odd ones: a map learnt for the photo."""
+    """Masks suspicious instances in even iterations, and by a map learnt for the photo in odd ones."""
 
     def __init__(self, config: AsymGsConfig, average: SlowAverage | None = None) -> None:
         self.average = average
@@ -106,9 +105,9 @@ class AsymMask(MaskPolicy):
         self.features.fit(data.photos)
         self.phi = photo_features(self.features, data.photos, data.cache_dir)
         names, least = [view.name for view in data.scene.train], self.config.support
-        found = zip(instance_labels(self.instances, data.photos, names, data.cache_dir).labels, names)
-        left = (unsupported(labels, data.scene, name, least) for labels, name in found)
-        self.labels = [torch.from_numpy(labels).to(data.device) for labels in left]
+        labelled = zip(instance_labels(self.instances, data.photos, names, data.cache_dir).labels, names)
+        suspects = (unsupported(labels, data.scene, name, least) for labels, name in labelled)
+        self.labels = [torch.from_numpy(labels).to(data.device) for labels in suspects]
         self.soft = [RowAdam(torch.ones(1, *x.shape, device=data.device)) for x in self.labels]
 
     def loss_effect(self) -> SlowAverage | None:
@@ -126,17 +125,17 @@ class AsymMask(MaskPolicy):
         return self.hard_keep(step)
 
     def learn_soft(self, view: int, image: Tensor) -> None:
-        """One step of Adam on |M - (1 - distance)| of a photo's learnt map."""
+        """Take one step of Adam on |M - (1 - distance)| of a photo's learnt map."""
         soft = self.soft[view]
-        share, wanted = torch.sigmoid(8 * soft.values[0]), 1.0 - unit_range(self._distance(view, image))
-        soft.step(0, (share - wanted).sign() * 8 * share * (1 - share) / share.numel(), 0.1)
+        share, target = torch.sigmoid(8 * soft.values[0]), 1.0 - unit_range(self._distance(view, image))
+        soft.step(0, (share - target).sign() * 8 * share * (1 - share) / share.numel(), 0.1)
 
     def soft_keep(self, view: int, size: Sequence[int]) -> Tensor:
-        """The learnt map, [H, W]."""
+        """Return the learnt map, [H, W]."""
         return resized(torch.sigmoid(8 * self.soft[view].values[0]), *size)
 
     def hard_keep(self, step: Step) -> Tensor:
-        """Without the instances that residual and features suspect, [H, W]."""
+        """Return a map [H, W] that masks instances whose residual and features are suspicious."""
         size = step.photo.shape[:2]
         distance = resized(self._distance(step.view, step.rendered.image), *size)
         error = residual(step.photo, step.rendered.image)
@@ -152,7 +151,7 @@ class AsymMask(MaskPolicy):
 
     @torch.no_grad()
     def _distance(self, view: int, image: Tensor) -> Tensor:
-        """1 - cosine of the features of render and photo, [H, W] of the photo."""
+        """Return 1 - cosine of the features of render and photo, [H, W] of the photo."""
         size, chw = self.labels[view].shape, image.permute(2, 0, 1)
         seen = self.features(F.interpolate(chw[None], size=size, mode="bilinear")[0].permute(1, 2, 0))
         return resized(1.0 - F.cosine_similarity(self.phi[view], seen, dim=2), *size)

@@ -1,9 +1,10 @@
-"""AsymGS in its GS-GS form: two models under different masks are to agree; the first is the result.
+"""AsymGS in its GS-GS form: two models under different masks must agree; the first is the result.
 
 Source: arXiv 2506.03538 and its released code. The first model sees a photo under the hard mask, the second
-another photo under the learnt one; in both views their pictures are to agree. Ours: what `asymgs.py` says,
-and the second photo's camera stays as COLMAP gave it where an effect moves cameras.
-Cost: four pictures with gradients a step, and two models.
+another photo under the learnt one; in both views their pictures must agree. Ours: what `asymgs.py` lists, and
+the camera of the second photo stays as COLMAP gave it even if an effect moves cameras.
+
+Cost: four pictures with gradients in each step, and two models.
 """
 
 from __future__ import annotations
@@ -32,39 +33,39 @@ TWIN = "twin"
 
 @dataclass(frozen=True)
 class TwinConfig(AsymGsConfig):
-    """As `AsymGsConfig`, with what the release sets for two models."""
+    """`AsymGsConfig` with the released settings for two models."""
 
-    consistency: float = 1.0  # of mean |picture - the other model's picture|, in either view
+    consistency: float = 1.0  # weight of mean |picture - the other model's picture| in each view
     colour: float = 0.9
 
 
 def build(options: TwinConfig) -> Parts:
-    """The hard mask for the first model, and the second model as a field that no picture shows."""
+    """Return 3DGS with the hard mask, and the second model as a field that no picture shows."""
     masks, rates = HardMask(options), Schedule(lr_opacity=0.1)
     return Parts(masks, DensityControl, options.density, rates, fields=Twin(options, masks))
 
 
 class HardMask(AsymMask):
-    """The first model's mask; the learnt maps are the second model's."""
+    """The mask of the first model; the second model uses the learnt maps."""
 
     def keep(self, step: Step) -> Tensor:
         return self.hard_keep(step)
 
     predict = keep
 
-    cotangent = MaskPolicy.cotangent  # type: ignore[assignment]  # none: `Twin` compares the models
+    cotangent = MaskPolicy.cotangent  # type: ignore[assignment]  # no loss here: `Twin` compares the models
 
 
 class Twin(Fields):
-    """The second model. Drawn beside the first, it is in no picture; what both draw is to agree."""
+    """The second model. It is drawn beside the first and is part of no picture; both must agree."""
 
     def __init__(self, config: TwinConfig, masks: AsymMask) -> None:
         self.config, self.masks = config, masks
-        self._second: tuple[int, Camera] | None = None  # photo of the second model in this step
+        self._second: tuple[int, Camera] | None = None  # photo and camera of the second model in this step
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
         self.data = data
-        start = replace(static, extra={}).clone()
+        start = replace(static, attributes={}).clone()
         density = DensityControl(self.config.density, data.scene.extent, data.seed + 1)
         return {TWIN: FieldStart(start, rates, density, most=None)}
 
@@ -72,7 +73,7 @@ class Twin(Fields):
         return (TWIN,)
 
     def regularise(self, frames: Mapping[str, Frame], shot: Shot) -> Mapping[str, Cotangents]:
-        """The models' difference, and the second one's photometric loss in its own view."""
+        """Return gradients of the models' difference and of the second one's loss in its own view."""
         apart = frames[STATIC].image - frames[TWIN].image
         weight = self.config.consistency if shot.nominal > self.config.warm_up else 0.0
         pull = apart.sign() * (weight / apart.numel())
@@ -82,17 +83,17 @@ class Twin(Fields):
         return {STATIC: Cotangents(image=pull), TWIN: Cotangents(image=second)}
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
-        """Of both models in the second view, drawn with replacement."""
+        """Return gradients of both models in the second view, which is drawn with replacement."""
         view = int(np.random.default_rng((self.data.seed, step.iteration)).integers(len(self.data.cameras)))
         camera = shrink_camera(self.data.cameras[view], step.divisor)
         self._second = view, camera
-        both = step.draw(camera=camera)
-        found = both.backward(Cotangents(image=torch.zeros_like(both.image)))
+        rendered = step.draw(camera=camera)
+        gradients = rendered.backward(Cotangents(image=torch.zeros_like(rendered.image)))
         self._second = None
-        return {STATIC: found}  # with the second model's in its `fields`
+        return {STATIC: gradients}  # those of the second model are in `fields`
 
     def _photometric(self, view: int, image: Tensor, divisor: int) -> Tensor:
-        """dL/dimage of the second model under the learnt mask of its photo, which learns too."""
+        """Return dL/dimage of the second model under the learnt mask of its photo; the mask learns too."""
         keep, user = self.masks.soft_keep(view, image.shape[:2]), self.data.user_keep[view]
         if user is not None:
             keep = keep * shrink_keep(user, divisor)

@@ -1,4 +1,4 @@
-"""The methods that come with the package, as names of recipes: listing them imports none of their code."""
+"""The methods of the package, with recipes as names: listing them imports none of their code."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""A method in words: what its recipe says of itself, its options with their comments, its parts.
+"""Descriptions of methods for `aw methods NAME` and `aw methods --table`. Imports no torch.
 
-What each built-in method consists of, for `aw methods NAME` and `aw methods --table`. Imports no torch.
+They come from the recipe's docstring, its options with their comments, and a table of the parts of each
+built-in method.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.config import Facts, to_plain
 from ambiguous_wild.methods.entry import MethodEntry
 
 Source = Literal["", "code", "code, in part", "summaries"]
@@ -24,15 +25,16 @@ Source = Literal["", "code", "code, in part", "summaries"]
 
 @dataclass(frozen=True)
 class Traits:
-    """A few words on every part; "" = as in 3DGS, or none."""
+    """A few words about every part of a method; "" = as in 3DGS, or none."""
 
     masks: str = ""
     appearance: str = ""  # what changes colours by photo; fitted to test photos, or read from them
     density: str = ""
-    state: str = ""  # learnt or carried beside the Gaussians of 3DGS
-    cpu_only: bool = False  # gsplat does not sum what it needs
-    source: Source = ""  # of the facts: the authors' code, only a part of it, or summaries of the paper
-    published: str = ""  # features or instances of the release
+    state: str = ""  # what is learnt or stored beside the Gaussians of 3DGS
+    cpu_only: bool = False  # True: it needs a statistic that gsplat does not offer
+    # the facts come from the authors' code, a part of it, or summaries of the paper; "" = not stated
+    source: Source = ""
+    published: str = ""  # features or instances that the release uses
 
 
 BUILTIN_TRAITS = {
@@ -112,12 +114,12 @@ BUILTIN_TRAITS = {
 
 
 def traits_of(name: str) -> Traits | None:
-    """Of a built-in method; None for others."""
+    """Return the traits of a built-in method; None for others."""
     return BUILTIN_TRAITS.get(name)
 
 
 COLUMNS = ("method", "masks", "appearance", "density", "extra state", "back ends", "facts from")
-BACK_ENDS = "features", "instances"  # options that name one, see vision/backends.py
+BACK_ENDS = "features", "instances"  # options that name a back end of vision/backends.py
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ class Option:
 
 
 def recipe_text(entry: MethodEntry) -> str:
-    """The docstring of the module that the recipe is in; nothing is imported but its packages."""
+    """Return the docstring of the recipe's module, which is not imported."""
     if not isinstance(entry.recipe, str):
         return inspect.getdoc(inspect.getmodule(entry.recipe)) or ""
     spec = importlib.util.find_spec(entry.recipe.partition(":")[0])
@@ -140,46 +142,46 @@ def recipe_text(entry: MethodEntry) -> str:
 
 
 def options_of(entry: MethodEntry) -> list[Option]:
-    """Every option with its default; those of parts, such as density control, by dotted keys."""
+    """Return every option with its default; options of parts, such as density control, have dotted keys."""
     return _options(entry.options(), "")
 
 
 def _options(config: Any, prefix: str) -> list[Option]:
-    found, said = [], _comments(type(config))
+    options, comments = [], _comments(type(config))
     for f in dataclasses.fields(config):
         value = getattr(config, f.name)
         if dataclasses.is_dataclass(value):
-            found += _options(value, f"{prefix}{f.name}.")
+            options += _options(value, f"{prefix}{f.name}.")
         else:
-            found.append(Option(prefix + f.name, _short(to_plain(value)), said.get(f.name, "")))
-    return found
+            options.append(Option(prefix + f.name, _short(to_plain(value)), comments.get(f.name, "")))
+    return options
 
 
 def _comments(cls: type) -> dict[str, str]:
-    found: dict[str, str] = {}
+    by_field: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if not dataclasses.is_dataclass(base):
             continue
         try:
             source = textwrap.dedent(inspect.getsource(base))
-        except (OSError, TypeError):  # made at run time, as a graft's
+        except (OSError, TypeError):  # a class that was made at run time has no source, e.g. that of a graft
             continue
-        at = {
+        comment_at = {
             token.start[0]: token.string.lstrip("#").strip()
             for token in tokenize.generate_tokens(io.StringIO(source).readline)
             if token.type == tokenize.COMMENT
         }
-        alone = {k for k, line in enumerate(source.splitlines(), 1) if line.lstrip().startswith("#")}
+        own_line = {k for k, line in enumerate(source.splitlines(), 1) if line.lstrip().startswith("#")}
         for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
             if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
                 first = node.lineno
-                while first - 1 in alone:
+                while first - 1 in own_line:
                     first -= 1
                 last = node.end_lineno or node.lineno
-                said = [at[k] for k in range(first, last + 1) if k in at]
-                if said:
-                    found[node.target.id] = " ".join(said)
-    return found
+                words = [comment_at[k] for k in range(first, last + 1) if k in comment_at]
+                if words:
+                    by_field[node.target.id] = " ".join(words)
+    return by_field
 
 
 def _short(value: Any) -> str:
@@ -189,7 +191,7 @@ def _short(value: Any) -> str:
 
 
 def table_row(entry: MethodEntry) -> tuple[str, ...]:
-    """`COLUMNS` of a method."""
+    """Return the cells of a method, in the columns of `COLUMNS`."""
     traits = traits_of(entry.name)
     if entry.program is not None:
         return (entry.name, "", "", "", "", "its own program", "")
@@ -200,8 +202,8 @@ def table_row(entry: MethodEntry) -> tuple[str, ...]:
     return (entry.name, *(part or "-" for part in parts), places, traits.source or "-")
 
 
-def details(entry: MethodEntry) -> dict[str, Any]:
-    """All that is known of a method, ready for JSON."""
+def details(entry: MethodEntry) -> Facts:
+    """Return everything that is known about a method, ready for JSON."""
     options = [] if entry.program is not None else options_of(entry)
     traits = traits_of(entry.base or entry.name) or Traits()
     once = dataclasses.replace(entry, name=entry.base or entry.name)

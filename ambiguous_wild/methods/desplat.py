@@ -2,8 +2,8 @@
 
 Source: DeSplat (CVPR 2025, arXiv 2411.19756) and its released code. Ours: the layer covers the photo's
 frame (the released box spans 53 degrees), lies at 0.02 of the scene's extent, is drawn from iteration
-`min_start` on, and keeps its number of Gaussians. Growth of the layers, the background model and the
-embeddings are left out; static rules are those of 3DGS.
+`min_start` on, and keeps its number of Gaussians. Left out: growth of the layers, the background model and
+the embeddings. The static Gaussians follow 3DGS.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.rendered import Cotangents, Frame
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
-_NEAREST = 0.02  # the renderer cuts at 0.01
+_NEAREST = 0.02  # least distance of a layer; the renderer draws nothing nearer than 0.01
 
 
 @dataclass(frozen=True)
 class DeSplatConfig:
-    """Of the layer in front of each camera."""
+    """Options of the layer in front of each camera."""
 
-    density: DensityConfig = field(default_factory=DensityConfig)  # of the static Gaussians
-    points: int = 1000  # Gaussians a photo
-    distance: float = 0.02  # of the scene's extent, from the camera
+    density: DensityConfig = field(default_factory=DensityConfig)  # for the static Gaussians
+    points: int = 1000  # Gaussians of each photo
+    distance: float = 0.02  # from the camera, as a share of the scene's extent
     start_opacity: float = 0.1
     # iterations of the run before the layers are drawn: in a short run they take the brightness of all photos
     # before the static Gaussians have learnt it
@@ -42,8 +42,8 @@ class DeSplatConfig:
     # times the released rates of the layers (1): short runs visit a photo rarely. Simulated courtyard, 30
     # photos, 1500 iterations: 25.8 dB at 4, 24.9 at 2 with alpha_own 0.1 (3dgs 23.1)
     speed: float = 4.0
-    alpha_static: float = 0.01  # on mean(1 - A) of the static picture
-    alpha_own: float = 0.01  # on mean(A) of the layer
+    alpha_static: float = 0.01  # weight of mean(1 - A) of the static picture
+    alpha_own: float = 0.01  # weight of mean(A) of the layer
 
     def __post_init__(self) -> None:
         check_limits(
@@ -57,12 +57,12 @@ class DeSplatConfig:
 
 
 def build(options: DeSplatConfig) -> Parts:
-    """3DGS beside one field a photo; the mask is what the layer leaves uncovered, and weighs nothing."""
+    """Return 3DGS with one field for each photo; its mask is what the layer leaves uncovered."""
     return Parts(fields=Layers(options), mask=Uncovered(), density_config=options.density)
 
 
 class Uncovered(MaskPolicy):
-    """1 - A of the photo's layer, for pictures and measures: the composite has weighed the loss already."""
+    """1 - A of the photo's layer, for pictures and metrics: the loss uses the composite instead."""
 
     def composed_keep(self, step: Step) -> Tensor | None:
         return self.predict(step)
@@ -73,17 +73,17 @@ class Uncovered(MaskPolicy):
 
 
 class Layers(Fields):
-    """A field a train photo."""
+    """One field for each train photo."""
 
     def __init__(self, config: DeSplatConfig) -> None:
         self.config = config
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
         def own(progress: float) -> dict[str, float]:
-            found = {"quats": 0.01, "log_scales": 0.05, "opacity_logits": 0.05, "sh_rest": 0.0}
-            # 0.025 is a colour's, which is SH_C0 times the coefficient
-            found |= {"means": rates(progress)["means"], "sh0": 0.025 / SH_C0}
-            return {name: self.config.speed * rate for name, rate in found.items()}
+            rates_of_layer = {"quats": 0.01, "log_scales": 0.05, "opacity_logits": 0.05, "sh_rest": 0.0}
+            # 0.025 is the rate of a colour, which is SH_C0 times its coefficient
+            rates_of_layer |= {"means": rates(progress)["means"], "sh0": 0.025 / SH_C0}
+            return {name: self.config.speed * rate for name, rate in rates_of_layer.items()}
 
         rng = np.random.default_rng([data.seed, 0xDE])
         depth = max(self.config.distance * data.scene.extent, _NEAREST)
@@ -96,8 +96,8 @@ class Layers(Fields):
         rays = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(n)])
         world = (rays * depth - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
         colours = rng.integers(0, 256, (n, 3)).astype(np.uint8)
-        made = Gaussians.from_points(world, colours, sh_degree=0, opacity=self.config.start_opacity)
-        return replace(made, quats=torch.from_numpy(rng.standard_normal((n, 4)).astype(np.float32)))
+        gaussians = Gaussians.from_points(world, colours, sh_degree=0, opacity=self.config.start_opacity)
+        return replace(gaussians, quats=torch.from_numpy(rng.standard_normal((n, 4)).astype(np.float32)))
 
     def drawn(self, shot: Shot) -> Sequence[str]:
         return () if shot.view is None or shot.iteration < self.config.min_start else (str(shot.view),)

@@ -10,19 +10,19 @@ initialisation and the voxel-guided optimisation. The released code takes instan
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
-from ambiguous_wild.splat.parts import Parts, State
+from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
 from ambiguous_wild.vision.precompute import instance_labels
@@ -37,8 +37,8 @@ class DroneSplatConfig:
     lambda_dssim: float = 0.2
     mask_start: float = 500.0
     min_mask_start: int = 300  # earlier renders show too little
-    t_local: float = 0.4  # standard deviations added to the threshold at the start, none at the end
-    weight_l1: float = 4.0  # in the residual, beside 1 for 1 - SSIM
+    t_local: float = 0.4  # standard deviations added to the threshold at the start; it falls to 0 at the end
+    weight_l1: float = 4.0  # weight of L1 in the residual, where 1 - SSIM has weight 1
 
     def __post_init__(self) -> None:
         check_instances(self.instances)
@@ -47,7 +47,7 @@ class DroneSplatConfig:
 
 
 def build(options: DroneSplatConfig) -> Parts:
-    """Local masks; the rest of the loop is 3DGS."""
+    """Return 3DGS with local masks."""
     return Parts(
         mask=DroneSplatMask(options), density_config=options.density, lambda_dssim=options.lambda_dssim
     )
@@ -58,14 +58,14 @@ def combined_residual(
     photo: Tensor,  # [H, W, 3] in [0, 1]
     weight_l1: float = 4.0,
 ) -> Tensor:
-    """E = (4 a^ + s^) / 5 [H, W]: mean |render - photo| and 1 - SSIM, each over its range."""
+    """Return E = (4 a + s) / 5 [H, W] of mean |render - photo| and 1 - SSIM, each scaled to [0, 1]."""
     a = (render - photo).abs().mean(dim=2)
     s = (1.0 - ssim_map(render, photo)).mean(dim=2)
     return (weight_l1 * unit_range(a) + unit_range(s)) / (weight_l1 + 1.0)
 
 
 def unit_range(values: Tensor) -> Tensor:
-    """Values by their own minimum and maximum in [0, 1]; zeros if all are equal."""
+    """Scale values to [0, 1] by their minimum and maximum; zeros if all are equal."""
     low, high = values.min(), values.max()
     # 0 / 1 if all are equal: a test on the host would make it wait for the accelerator
     return (values - low) / (high - low).masked_fill(high <= low, 1.0)
@@ -74,9 +74,9 @@ def unit_range(values: Tensor) -> Tensor:
 def heat_map(
     residual: Tensor,  # [H, W]
     labels: Tensor,  # [H, W] int64, 0 = unlabelled
-    count: int | None = None,  # above every label; None: looked up, for which the host waits
+    count: int | None = None,  # above every label; None: read from the labels, so that the host waits
 ) -> Tensor:
-    """Each pixel its instance's mean residual, 0 where unlabelled, over its own range; float64 [H, W]."""
+    """Return the mean residual of each pixel's instance, scaled to [0, 1], 0 if unlabelled; [H, W]."""
     count = int(labels.max()) + 1 if count is None else count
     means = label_means(residual, labels, count)
     means[0] = 0.0
@@ -84,20 +84,20 @@ def heat_map(
 
 
 def label_means(values: Tensor, labels: Tensor, count: int) -> Tensor:
-    """[count] float64: mean of `values` [H, W] over the pixels of each label [H, W]; 0 where it has none."""
-    flat, given = labels.reshape(-1), values.reshape(-1).double()
+    """Return the mean of `values` [H, W] over the pixels of each label, [count] float64; 0 for no pixels."""
+    flat, weights = labels.reshape(-1), values.reshape(-1).double()
     backend = backend_of(flat.device)
-    return backend.label_sums(flat, count, given) / backend.label_sums(flat, count).clamp(min=1)
+    return backend.label_sums(flat, count, weights) / backend.label_sums(flat, count).clamp(min=1)
 
 
 def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> Tensor:
-    """T(it) = mu + sd + t_local sd (N - it) / N over all pixels of the photo, a 0-d tensor."""
+    """Return T(it) = mu + sd + t_local sd (N - it) / N over the photo's pixels, a 0-d tensor."""
     left = max(NOMINAL_ITERATIONS - nominal, 0.0) / NOMINAL_ITERATIONS
     return heat.mean() + heat.std(correction=0) * (1.0 + t_local * left)
 
 
 class DroneSplatMask(WarmUpMask):
-    """From statistics of the current render, instance by instance; nothing is learnt."""
+    """Masks instances by statistics of the current render; nothing is learnt."""
 
     config: DroneSplatConfig
 
@@ -108,8 +108,8 @@ class DroneSplatMask(WarmUpMask):
 
     def setup(self, data: TrainData) -> None:
         names = [view.name for view in data.scene.train]
-        found = instance_labels(self.instances, data.photos, names, data.cache_dir).labels
-        labels = [np.maximum(label, 0).astype(np.int64) for label in found]
+        by_photo = instance_labels(self.instances, data.photos, names, data.cache_dir).labels
+        labels = [np.maximum(label, 0).astype(np.int64) for label in by_photo]
         self.counts = [int(label.max()) + 1 for label in labels]  # labels 0..K
         self.labels = [torch.from_numpy(label).to(data.device) for label in labels]
 
@@ -124,7 +124,7 @@ class DroneSplatMask(WarmUpMask):
         return (~self._stands_out(step)[1]).float() if self.begun(step) else None
 
     def _stands_out(self, step: Step) -> tuple[Tensor, Tensor]:
-        """Heat map, and which pixels are above its threshold."""
+        """Return the heat map, and which pixels are above its threshold."""
         labels = nearest(self.labels[step.view], *step.photo.shape[:2])
         residual = combined_residual(step.rendered.image, step.photo, self.config.weight_l1)
         heat = heat_map(residual, labels, self.counts[step.view])
@@ -142,7 +142,7 @@ class DroneSplatMask(WarmUpMask):
             f"masked {100 * float(out.float().mean()):.0f} %{used}": tint(photo, out.cpu().numpy(), MASKED),
         }
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {
             "masked_share": self.shares.mean(),
             "instances": self.instances.name,
@@ -157,7 +157,7 @@ class DroneSplatMask(WarmUpMask):
 
 
 def nearest(labels: Tensor, height: int, width: int) -> Tensor:
-    """Labels [H, W] at the centres of the pixels of a smaller picture."""
+    """Return the labels [H, W] at the centres of the pixels of a smaller picture."""
     if labels.shape == (height, width):
         return labels
     device = labels.device

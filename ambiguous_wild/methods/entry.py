@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """One line of `aw methods` and the way to the recipe.
+    """A method: its line in `aw methods`, and where its recipe and options are.
 
     `recipe` is "module:function" or a function; it takes the options and returns `Parts`. `config` is
     "module:Class" or a frozen dataclass: the options of the method, all with defaults.
@@ -30,26 +30,25 @@ class MethodEntry:
     recipe: str | Callable[[Any], Parts]
     config: str | type | None = None
     paper: str = ""
-    needs: str = ""  # extras, weights or hardware; empty = nothing beyond the core
+    needs: str = ""  # required extras, weights or hardware; empty = none
     ablations: str | tuple[Group, ...] = ()  # "module:ABLATIONS" or the groups, see methods/ablation.py
-    source_hash: str = ""  # of a plugin's file: a changed plugin is another configuration
-    places: tuple[
-        tuple[str, str], ...
-    ] = ()  # of a graft: the method behind each field of its options, see graft.py
-    # an external program, run instead of parts on our trainer, see methods/external/
+    source_hash: str = ""  # hash of a plugin's file: a changed plugin is another configuration
+    # for a graft the method behind each field of its options, see graft.py
+    places: tuple[tuple[str, str], ...] = ()
+    # an external program, which runs instead of parts on our trainer, see external.py
     program: Program | None = None
-    base: str = ""  # of a method that trains twice: its name without that, which options are given by
-    passes: int = 1  # trainings, of which the second has the final masks of the first, see second_pass.py
-    # of a method named by its file: what --method was given, with the absolute path, see references.py
+    base: str = ""  # for a method that trains twice its name without "+2passes", by which options are set
+    passes: int = 1  # number of trainings; the second uses the final masks of the first, see second_pass.py
+    # for a method named by its file the value of --method, with the absolute path, see references.py
     given_as: str = ""
-    # what every table of its runs says below; {features} stands for the option of that name
+    # a line below every table of its runs; {features} stands for the option of that name
     note: str = ""
 
     def options(self) -> Any:
-        """The method's options at their defaults (a frozen dataclass instance).
+        """Return the method's options with their defaults (a frozen dataclass instance).
 
         Raises:
-            AwError: an option without a default.
+            AwError: an option has no default.
         """
         cls = resolve(self.config) if self.config else NoOptions
         missing = [
@@ -65,57 +64,57 @@ class MethodEntry:
         return cls()
 
     def by_machine(self) -> frozenset[str]:
-        """Options whose defaults depend on the weights on the machine, see vision/backends.py."""
+        """Return the options whose defaults depend on the machine's weights, see vision/backends.py."""
         options = self.options()
         fields = dataclasses.fields(options) if dataclasses.is_dataclass(options) else ()
         return frozenset(f.name for f in fields if f.metadata.get("by_machine"))
 
-    def about(self, options: Iterable[Mapping[str, Any]]) -> str:
-        """`note` with the values of the options that it names in braces.
+    def about(self, options: Iterable[Mapping[str, object]]) -> str:
+        """Return `note` with the values of the options that it names in braces.
 
         Args:
-            options: flat, of each run that the note is about.
+            options: flat options of each run that the note is about.
         """
-        every = list(options)
+        runs = list(options)
         keys = [key for _, key, _, _ in Formatter().parse(self.note) if key]
         values = {
-            key: "/".join(dict.fromkeys(str(o[key]) for o in every if key in o)) or "not recorded"
+            key: "/".join(dict.fromkeys(str(o[key]) for o in runs if key in o)) or "not recorded"
             for key in keys
         }
         return self.note.format_map(values)
 
     def option_keys(self, method: str, key: str) -> list[str]:
-        """The keys of this method's options that a setting METHOD.KEY sets; may be none."""
+        """Return the keys of this method's options that a setting METHOD.KEY sets; may be empty."""
         if method in (self.name, self.base):
             return [key]
         return [f"{place}.{key}" for place, name in self.places if name == method]
 
     def ablation_groups(self) -> tuple[Group, ...]:
-        """The ablations that the method declares; may be empty."""
+        """Return the ablations that the method declares; may be empty."""
         return tuple(resolve(self.ablations))
 
     def build(self, options: Any) -> Parts:
-        """The parts that fill the training loop.
+        """Call the recipe; returns the parts that fill the training loop.
 
         Raises:
             AwError: the recipe returned something else.
         """
         from ambiguous_wild.splat.parts import Parts
 
-        made = resolve(self.recipe)(options)
-        if not isinstance(made, Parts):
-            what = "None" if made is None else type(made).__name__
+        parts = resolve(self.recipe)(options)
+        if not isinstance(parts, Parts):
+            what = "None" if parts is None else type(parts).__name__
             raise AwError(f"{self.name} returned {what}, it must return Parts (see docs/extend.md)")
-        return made
+        return parts
 
 
 @dataclass(frozen=True)
 class NoOptions:
-    """A method without options of its own."""
+    """The options of a method that has none."""
 
 
 def resolve(target: Any) -> Any:
-    """The object that "module:attribute" names; anything else is returned unchanged."""
+    """Return the object that "module:attribute" names, or any other object unchanged."""
     if not isinstance(target, str):
         return target
     module, _, attribute = target.partition(":")

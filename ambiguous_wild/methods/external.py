@@ -1,8 +1,7 @@
 """`external:my.yaml`: a program with commands to train and render, described in a YAML or TOML file.
 
-The plain adapter: a train command, a render command, and the paths of the pictures.
-
-Placeholders in commands and paths: ``{scene}``, ``{index:05d}``; names only, no expressions.
+The file holds a train command, a render command and the paths of the pictures. Commands and paths may contain
+placeholders such as ``{scene}`` and ``{index:05d}``: names only, no expressions.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from ambiguous_wild.core import AwError, View
-from ambiguous_wild.core.config import config_hash, from_plain, to_plain
+from ambiguous_wild.core.config import Facts, config_hash, from_plain, to_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io import plain_yaml
@@ -45,10 +44,10 @@ _FORMATTER = string.Formatter()
 
 
 def placeholders(template: str, where: str) -> set[str]:
-    """Names in braces.
+    """Return the names in braces.
 
     Raises:
-        AwError: a brace without its partner, or more than a name in braces.
+        AwError: a brace has no partner, or braces hold more than a name.
     """
     try:
         parts = list(_FORMATTER.parse(template))
@@ -62,10 +61,10 @@ def placeholders(template: str, where: str) -> set[str]:
 
 
 def check(template: str, known: Iterable[str], where: str) -> set[str]:
-    """The placeholders of a template.
+    """Return the placeholders of a template.
 
     Raises:
-        AwError: one is not known; names the nearest.
+        AwError: a placeholder is unknown; the message suggests the nearest.
     """
     names, choices = placeholders(template, where), set(known)
     for name in sorted(names - choices):
@@ -73,28 +72,26 @@ def check(template: str, known: Iterable[str], where: str) -> set[str]:
     return names
 
 
-def fill(template: str, values: Mapping[str, Any]) -> str:
-    """The template with values in place; a value stays within the one argument it stands in."""
+def fill(template: str, values: Mapping[str, object]) -> str:
+    """Fill in a template; a value stays within the argument that holds its placeholder."""
     try:
         return _FORMATTER.vformat(template, (), values)
     except (ValueError, TypeError, KeyError) as error:
         raise AwError(f"{template!r} cannot be filled in: {error}") from None
 
 
-def fill_pattern(template: str, values: Mapping[str, Any]) -> str:
-    """The same for a glob pattern: wildcards of the template work, those in values are plain text."""
+def fill_pattern(template: str, values: Mapping[str, object]) -> str:
+    """Fill in a glob pattern: wildcards of the template work, those in values are plain text."""
     escaped = {k: glob.escape(v) if isinstance(v, str) else v for k, v in values.items()}
     return fill(template, escaped)
 
 
-BEGUN = (
-    "begun.json"  # in the program's folder: the command that was started, to know whether it may be resumed
-)
+BEGUN = "begun.json"  # in the program's folder: the command that was started, which `resume` must match
 
 
 @dataclass(frozen=True)
 class CommandProgram:
-    """See `Description` for the fields; commands are split and paths resolved."""
+    """A described program. Fields are those of `Description`, with commands split and paths resolved."""
 
     name: str
     train: tuple[str, ...]
@@ -108,18 +105,18 @@ class CommandProgram:
     environment: tuple[tuple[str, str], ...]
     scene_files: tuple[tuple[str, str], ...]
     timeout_s: float | None
-    photos: Photos = "all"  # what the program sees, see staging.py
-    drawn_by_us: bool = False  # it leaves splats, which our renderer draws
+    photos: Photos = "all"  # photos that the program gets, see `external_process.stage`
+    drawn_by_us: bool = False  # it writes splats, which our renderer draws
 
     def missing(self, options: Any) -> str:
-        """The first word of a command, or of the prefix, that is no program here; empty if all are."""
+        """Return the first program of the commands that this machine lacks; empty if it has all."""
         values = dataclasses.asdict(options)
         commands = [self.prefix] if self.prefix else [self.train, self.render, self.resume]
         words = [command[0] for command in commands if command]
         path = dict(self.environment).get("PATH")
         for word in dict.fromkeys(words):
             if placeholders(f"{word}{path or ''}", self.name) - values.keys():
-                continue  # known when it runs
+                continue  # its value is known only in a run
             program = fill(word, values)
             where = self.cwd / program if os.path.dirname(program) else program
             if shutil.which(where, path=path and fill(path, values)) is None:
@@ -127,7 +124,7 @@ class CommandProgram:
         return ""
 
     def run(self, task: Task) -> Produced:
-        """Train unless that is done, render unless that is done, collect.
+        """Train and render, unless already done, and collect the output.
 
         Raises:
             AwError: a command fails or writes no complete output.
@@ -141,13 +138,13 @@ class CommandProgram:
             values = self._values(task, staged)
             state = task.work / DONE
             done: dict[str, float] = _read(state)
-            output = Path(values["output"])
+            output = self._output(task)
             if "train_s" not in done:
-                again = self._goes_on(task, output)
-                if not again:
+                resuming = self._may_resume(task, output)
+                if not resuming:
                     shutil.rmtree(output, ignore_errors=True)
                 output.mkdir(parents=True, exist_ok=True)
-                command = self.resume if again else self.train
+                command = self.resume if resuming else self.train
                 write_json(task.work / BEGUN, list(self.train))
                 done["train_s"] = self._command("train", command, values, task)
                 write_json(state, done)
@@ -158,8 +155,12 @@ class CommandProgram:
         finally:
             shutil.rmtree(staged, ignore_errors=True)
 
-    def _goes_on(self, task: Task, output: Path) -> bool:
-        """Whether there is output of the same command that `resume` may continue."""
+    @staticmethod
+    def _output(task: Task) -> Path:
+        return (task.work / "output").absolute()
+
+    def _may_resume(self, task: Task, output: Path) -> bool:
+        """Whether there is output of the same train command, which `resume` can continue."""
         try:
             begun = json.loads((task.work / BEGUN).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
@@ -178,13 +179,13 @@ class CommandProgram:
         texts = (*self.train, *self.render, *(value for _, value in self.environment))
         return set().union(*(placeholders(text, self.name) for text in texts))
 
-    def _values(self, task: Task, staged: Path) -> dict[str, Any]:
+    def _values(self, task: Task, staged: Path) -> dict[str, object]:
         factor = int(task.scene.info.get("loaded_factor") or 1)
         return dataclasses.asdict(task.options) | {
             "scene": str(staged.absolute()),
             "source": str(task.scene.root.resolve()),
             "images": "images" if factor == 1 or self.photos != "all" else f"images_{factor}",
-            "output": str((task.work / "output").absolute()),
+            "output": str(self._output(task)),
             "seed": task.seed,
             "iterations": task.iterations,
             "budget_s": task.budget_s,
@@ -192,7 +193,7 @@ class CommandProgram:
             "device": task.device,
         }
 
-    def _command(self, step: str, command: Sequence[str], values: dict[str, Any], task: Task) -> float:
+    def _command(self, step: str, command: Sequence[str], values: dict[str, object], task: Task) -> float:
         return run_logged(
             f"{step} of {self.name}",
             [*self.prefix, *(fill(argument, values) for argument in command)],
@@ -202,11 +203,11 @@ class CommandProgram:
             timeout_s=self.timeout_s,
         )
 
-    def _collect(self, task: Task, values: dict[str, Any], done: dict[str, float]) -> Produced:
+    def _collect(self, task: Task, values: dict[str, object], done: dict[str, float]) -> Produced:
         tests, trains = task.scene.test, task.scene.train
         drawn = [] if self.drawn_by_us else list(enumerate(tests))
         renders = {view.name: self._find(self.renders, values, view, i) for i, view in drawn}
-        missing = [name for name, found in renders.items() if found is None]
+        missing = [name for name, path in renders.items() if path is None]
         if missing:
             raise AwError(
                 f"{self.name} left no render of {len(missing)} of {len(tests)} test photos "
@@ -231,28 +232,27 @@ class CommandProgram:
             facts=self._facts(),
         )
 
-    def _facts(self) -> dict[str, Any]:
-        """The program's revision, and the settings of the run that it was not given."""
-        revision = _revision(self.cwd)
-        deaf = sorted({"seed", "iterations"} - self._used())
-        return {"revision": revision, "not_told": deaf}
+    def _facts(self) -> Facts:
+        """Return the program's revision, and the settings of the run that its commands do not pass."""
+        not_passed = sorted({"seed", "iterations"} - self._used())
+        return {"revision": _revision(self.cwd), "not_told": not_passed}
 
-    def _pattern(self, template: str, values: dict[str, Any], view: View, index: int) -> str:
+    def _pattern(self, template: str, values: dict[str, object], view: View, index: int) -> str:
         stem = str(PurePosixPath(view.name).with_suffix(""))
         pattern = fill_pattern(template, values | {"stem": stem, "name": view.name, "index": index})
         return str(self.cwd / pattern)  # an absolute pattern stays as it is
 
-    def _find(self, template: str, values: dict[str, Any], view: View, index: int) -> Path | None:
+    def _find(self, template: str, values: dict[str, object], view: View, index: int) -> Path | None:
         return self._one(self._pattern(template, values, view, index))
 
     def _one(self, pattern: str) -> Path | None:
-        found = sorted(glob.glob(str(self.cwd / pattern)))
-        if len(found) > 1:
+        paths = sorted(glob.glob(str(self.cwd / pattern)))
+        if len(paths) > 1:
             raise AwError(
-                f"{self.name}: {len(found)} files fit {pattern} ({shortlist(found, 2)}): one must; "
+                f"{self.name}: {len(paths)} files fit {pattern} ({shortlist(paths, 2)}): one must; "
                 "make the pattern narrower"
             )
-        return Path(found[0]) if found else None
+        return Path(paths[0]) if paths else None
 
 
 def _read(state: Path) -> dict[str, float]:
@@ -264,7 +264,7 @@ def _read(state: Path) -> dict[str, float]:
 
 
 def _revision(folder: Path) -> str | None:
-    """The commit of the program's repository; None if it is in none."""
+    """Return the commit of the program's repository; None if it is in none."""
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10
@@ -276,8 +276,8 @@ def _revision(folder: Path) -> str | None:
 
 RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", "factor", "device")
 VIEW = ("stem", "name", "index")
-_NO_MATTER = ("summary", "paper", "needs", "timeout_h")
-_LATER = {"photos": "all", "drawn_by": "program"}
+_WITHOUT_INFLUENCE = ("summary", "paper", "needs", "timeout_h")  # keys that do not change the result
+_ADDED = {"photos": "all", "drawn_by": "program"}  # keys of later versions, with their defaults
 LISTS = ("train_names", "test_names", "train_stems", "test_stems")
 
 
@@ -285,34 +285,34 @@ LISTS = ("train_names", "test_names", "train_stems", "test_stems")
 class Description:
     """The keys of the file. Commands are lists, or text split as a shell splits it; no shell runs them."""
 
-    name: str = ""  # how tables call it
+    name: str = ""  # name in tables
     summary: str = ""
     paper: str = ""
     needs: str = ""
     train: str | tuple[str, ...] = ()
-    render: str | tuple[str, ...] = ()  # left out if training renders
+    render: str | tuple[str, ...] = ()  # not needed if the train command renders
     resume: str | tuple[str, ...] = ()  # instead of train, if a stopped run left files in {output}
     renders: str = ""  # path of a test photo's render; may contain wildcards
     masks: str = ""  # path of a train photo's keep map, white = kept
     ply: str = ""  # splats, for counting and size
     cwd: str = ""  # relative to the file; empty = the file's folder
     prefix: str | tuple[str, ...] = ()  # before every command, e.g. conda run --no-capture-output -n theirs
-    environment: dict[str, Any] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)  # placeholders of your own; --set NAME.KEY=VALUE
-    scene_files: dict[str, Any] = field(default_factory=dict)  # text files that the program wants in {scene}
-    photos: Photos = "all"  # what {scene} holds, see staging.py: "all", "train" alone, or as "nerf-w"
+    environment: Facts = field(default_factory=dict)
+    options: Facts = field(default_factory=dict)  # placeholders of your own; --set NAME.KEY=VALUE
+    scene_files: Facts = field(default_factory=dict)  # text files that the program needs in {scene}
+    photos: Photos = "all"  # what {scene} holds: "all", "train" alone, or as "nerf-w"
     drawn_by: Literal["program", "us"] = "program"  # "us": our renderer draws the test views from `ply`
-    timeout_h: float = 0.0  # of each command; 0 = none
+    timeout_h: float = 0.0  # limit of each command; 0 = none
 
 
 PACKAGED = Path(__file__).parent / "descriptions"
 
 
 def packaged(name: str) -> Path:
-    """The file of a description that comes with the package: external:opensplat.
+    """Return the file of a description of the package, as for external:opensplat.
 
     Raises:
-        AwError: there is none of that name.
+        AwError: the package has no description of this name.
     """
     known = sorted(file.stem for file in PACKAGED.glob("*.yaml"))
     if name not in known:
@@ -321,7 +321,7 @@ def packaged(name: str) -> Path:
 
 
 def load_description(path: Path) -> MethodEntry:
-    """The method that a description makes.
+    """Read a description; returns its method.
 
     Raises:
         AwError: no such file, no YAML or TOML, an unknown key or placeholder, or a missing key.
@@ -365,21 +365,21 @@ def load_description(path: Path) -> MethodEntry:
 
 
 def _folder(text: str, path: Path) -> Path:
-    """`cwd`, in which $NAME is a variable of the environment."""
+    """Return the folder `cwd`, in which $NAME is a variable of the environment."""
     for name in re.findall(r"\$(\w+)", text):
         if not os.environ.get(name):
             raise AwError(f"{path.stem} needs {name}: export {name}=FOLDER, the folder of its repository")
     return (path.resolve().parent / Path(os.path.expandvars(text)).expanduser()).resolve()
 
 
-def _decisive(description: Description) -> dict[str, Any]:
-    """What decides the result. Later keys count where they differ from their default: runs from before them
-    keep their identity."""
-    plain = {k: v for k, v in to_plain(description).items() if k not in _NO_MATTER}
-    return {k: v for k, v in plain.items() if k not in _LATER or v != _LATER[k]}
+def _decisive(description: Description) -> Facts:
+    """Return the keys that decide the result, without `_ADDED` keys at their defaults: so runs of earlier
+    versions keep their identity."""
+    plain = {k: v for k, v in to_plain(description).items() if k not in _WITHOUT_INFLUENCE}
+    return {k: v for k, v in plain.items() if k not in _ADDED or v != _ADDED[k]}
 
 
-def _parse(path: Path, content: bytes) -> Mapping[str, Any]:
+def _parse(path: Path, content: bytes) -> Facts:
     try:
         text = content.decode()
         data = tomllib.loads(text) if path.suffix == ".toml" else plain_yaml.parse(text)
@@ -397,8 +397,8 @@ def _command(text: str | tuple[str, ...]) -> tuple[str, ...]:
         raise AwError(f"command {text!r}: {error}") from None
 
 
-def _options_class(options: Mapping[str, Any], path: Path) -> type:
-    """A frozen dataclass with the file's values as defaults: `--set` checks types by it."""
+def _options_class(options: Facts, path: Path) -> type:
+    """Make a frozen dataclass with the file's values as defaults, by which `--set` checks types."""
     if not options:
         return NoOptions
     for key, value in options.items():

@@ -1,11 +1,9 @@
-"""Runs one external command: without a shell, with a log and a time limit; ends all its processes.
+"""How the harness runs an external program: the scene that it gets, the interface, and its processes.
 
-The interface of an external method: the harness starts it and reads the pictures that it writes.
-
-The scene as an external program sees it: a folder of links, so that its writes do not change the scene.
-
-Programs of the 3DGS family write into the scene (``sparse/0/points3D.ply``) and want their split in files of
-their own. Photos are linked, folders are real; ``truth/`` is left out: no method may read it.
+A command runs without a shell, with a log and a time limit; at its end all of its processes are ended. The
+program gets a copy of the scene made of links, because programs of the 3DGS family write into the scene
+(``sparse/0/points3D.ply``) and need the split in files of their own. Photos are links, folders are real;
+``truth/`` is left out, as no method may read it.
 """
 
 from __future__ import annotations
@@ -26,6 +24,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NoReturn, Protocol
 
 from ambiguous_wild.core import UNMOVED, AwError, Scene, View
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.io.colmap_model import write_views
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.images import image_size
@@ -36,12 +35,12 @@ _LEFT_OUT = {"truth", "scene.json"}
 
 
 def stage(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photos = "all") -> Path:
-    """Make the folder anew.
+    """Make the copy of the scene that a program gets.
 
     Args:
         scene: the scene.
-        folder: of links, replaced if it exists.
-        files: text by path relative to the folder; replaces a link of the same name.
+        folder: the copy; it is replaced if it exists.
+        files: texts by path relative to the folder; they replace links of the same name.
         photos: "all" links the scene as it is; "train" its train photos alone, at the size at which the
             scene is loaded, as images/ with a binary model; "nerf-w" all photos at full size, as dense/ with
             a binary model and NeRF-W's table of the split, for programs that shrink them by {factor}.
@@ -105,10 +104,10 @@ def _stage_nerfw(scene: Scene, folder: Path) -> None:
 
 def _full_size(scene: Scene, name: str, factor: int) -> Path:
     stem = (scene.root / "images" / name).with_suffix("")
-    found = sorted(p for p in stem.parent.glob(f"{glob.escape(stem.name)}.*") if p.is_file())
-    if len(found) != 1:
+    paths = sorted(p for p in stem.parent.glob(f"{glob.escape(stem.name)}.*") if p.is_file())
+    if len(paths) != 1:
         raise AwError(f"{scene.root} has no images/{name} at full size, of which images_{factor} was made")
-    return found[0]
+    return paths[0]
 
 
 def _link_files(path: Path, target: Path) -> None:
@@ -121,15 +120,15 @@ def _link_files(path: Path, target: Path) -> None:
 
 
 def split_lists(scene: Scene) -> dict[str, str]:
-    """Names of the photos of each side, one a line: values for placeholders in `files`."""
+    """Return the names of the photos of each side, one a line: values for placeholders in `files`."""
     sides = {"train": scene.train, "test": scene.test}
     out = {f"{side}_names": "".join(f"{v.name}\n" for v in views) for side, views in sides.items()}
     stems = {side: [PurePosixPath(v.name).with_suffix("") for v in views] for side, views in sides.items()}
     return out | {f"{side}_stems": "".join(f"{s}\n" for s in names) for side, names in stems.items()}
 
 
-WORK, LOGS = "external", "logs"  # folders of a run: the program's output, and its logs
-DONE = "done.json"  # in WORK: the commands that ended, and the seconds they took
+WORK, LOGS = "external", "logs"  # folders of a run for the program's output and for its logs
+DONE = "done.json"  # in WORK: the finished commands, and their seconds
 
 
 @dataclass(frozen=True)
@@ -137,14 +136,14 @@ class Task:
     """One run of a program."""
 
     scene: Scene
-    options: Any  # the method's frozen dataclass
+    options: Any  # options of the method, a frozen dataclass
     seed: int
     iterations: int
     budget_s: float | None  # training time, if the run has one instead of a length
     device: str  # "cpu" or "cuda"
     folder: Path  # the run folder
-    work: Path  # folder for what the program writes; kept when a run is resumed
-    logs: Path  # folder of its logs
+    work: Path  # folder for the program's output; kept when a run is resumed
+    logs: Path  # folder for its logs
 
 
 @dataclass(frozen=True)
@@ -156,17 +155,17 @@ class Produced:
     ply: Path | None = None  # splats, as 3DGS writes them
     drawn_by_us: bool = False  # there are no renders: the harness draws the test views from `ply`
     cost: Mapping[str, float] = field(default_factory=dict)  # train_s, render_s and other known costs
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: Facts = field(default_factory=dict)
 
 
 class Program(Protocol):
-    """Trains, renders the test views, and returns the paths of its output."""
+    """An external program: it trains, renders the test views, and returns the paths of its output."""
 
     def missing(self, options: Any) -> str:
-        """The command that this machine lacks; empty if all are here.
+        """Return the command that this machine lacks; empty if it has all.
 
         Args:
-            options: the method's.
+            options: options of the method.
         """
         ...
 
@@ -174,18 +173,18 @@ class Program(Protocol):
         """Run, or resume a stopped run.
 
         Raises:
-            AwError: it fails, takes too long, or writes no complete output.
+            AwError: the program fails, takes too long, or writes no complete output.
         """
         ...
 
 
 def no_parts(options: Any) -> NoReturn:
-    """The recipe of an external method, which has no parts."""
+    """Raise AwError: the recipe of an external method, which has no parts."""
     raise AwError("an external method is a program of its own: it has no parts that fit into another method")
 
 
-GRACE_S = 10.0  # between SIGTERM and SIGKILL
-_RECORD = ".running.json"  # of a running command, beside its log
+GRACE_S = 10.0  # seconds between SIGTERM and SIGKILL
+_RECORD = ".running.json"  # record of a running command, beside its log
 _TAIL_BYTES, _TAIL_LINES = 8192, 4
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
@@ -199,21 +198,21 @@ def run_logged(
     environment: Mapping[str, str],
     timeout_s: float | None,
 ) -> float:
-    """Run a command to its end; its output goes to `log`, which is added to.
+    """Run a command to its end; its output is appended to `log`.
 
     Args:
-        what: for errors, e.g. ``"train of gsplat-mcmc"``.
-        command: program and arguments, unchanged: no shell reads them.
-        log: of stdout and stderr.
-        cwd: where it runs.
-        environment: variables on top of ours.
-        timeout_s: it is ended after that; None = never.
+        what: name of the command for errors, e.g. ``"train of gsplat-mcmc"``.
+        command: program and arguments, which no shell reads.
+        log: file for stdout and stderr.
+        cwd: working folder.
+        environment: variables in addition to those of this process.
+        timeout_s: seconds after which it is ended; None = never.
 
     Returns:
         Wall seconds.
 
     Raises:
-        AwError: no such program, a non-zero exit code (with the last lines of the log), or too late.
+        AwError: no such program, a non-zero exit code (with the last lines of the log), or a timeout.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     record = log.with_suffix(_RECORD)
@@ -222,7 +221,7 @@ def run_logged(
         out.write(f"$ {shlex.join(command)}\n".encode())
         out.flush()
         try:
-            # A session of its own, so that what the program starts ends with it.
+            # A new session, so that all processes of the program can be ended together.
             process = subprocess.Popen(
                 list(command), cwd=cwd, env={**os.environ, **environment}, stdin=subprocess.DEVNULL,
                 stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
@@ -247,7 +246,7 @@ def run_logged(
 
 
 def _tail(log: Path) -> str:
-    """ "last lines of LOG: ...": one line, without the escapes of a terminal."""
+    """Return "last lines of LOG: ..." as one line, without the escapes of a terminal."""
     with open(log, "rb") as f:
         f.seek(max(0, log.stat().st_size - _TAIL_BYTES))
         text = f.read().decode(errors="replace")
@@ -279,21 +278,21 @@ def _alive(group: int) -> bool:
         os.killpg(group, 0)
     except (ProcessLookupError, PermissionError):
         return False
-    # A leader that has ended but was not waited for (a zombie) does not count.
+    # A leader that has ended, but was not waited for (a zombie), is not alive.
     stat = _stat(group)
     return stat is None or stat[0] != "Z"
 
 
 def end_left_over(logs: Path) -> None:
-    """End processes that a killed run left behind for these logs: two would overwrite each other's files."""
+    """End processes that a killed run left behind: they would write to the same files as a new run."""
     for record in sorted(logs.glob(f"*{_RECORD}")):
         _end_recorded(record)
 
 
 def _end_recorded(record: Path) -> None:
     try:
-        left = json.loads(record.read_text(encoding="utf-8"))
-        group, host, start = int(left["group"]), left["host"], left["start"]
+        entry = json.loads(record.read_text(encoding="utf-8"))
+        group, host, start = int(entry["group"]), entry["host"], entry["start"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return
     # Process ids are reused: the start time tells whether it is still the same process.
@@ -303,13 +302,13 @@ def _end_recorded(record: Path) -> None:
 
 
 def _start(pid: int) -> str | None:
-    """Start time of the process in the kernel's units; None if unknown."""
+    """Return the start time of the process in the kernel's units; None if unknown."""
     stat = _stat(pid)
     return None if stat is None else stat[19]
 
 
 def _stat(pid: int) -> list[str] | None:
-    """Fields of /proc/PID/stat from the state on; None without such a process or system."""
+    """Return the fields of /proc/PID/stat from the state on; None without such a process or system."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

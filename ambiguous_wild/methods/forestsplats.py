@@ -1,14 +1,13 @@
-"""ForestSplats: one small transient field for all photos, bent for each by a net; a net on the photo masks.
+"""ForestSplats: one small transient field for all photos, deformed for each by a net; another net masks.
 
-Source: arXiv 2503.06179 and kalelpark/ForestSplats, which says that parts are missing; the paper's own
-losses are unverified. Read as the card does: superpixels of channels-last photos and masks that stay
-fractions. Ours: the mask net (plain and dilated convolutions in CGNet's place) and superpixels see the
-photo at `side` px; a narrower bending net; its heads start near zero; no sky points, no Mip filter. Its
+Source: arXiv 2503.06179 and kalelpark/ForestSplats, which says that parts are missing; the losses of the
+paper are unverified. Two readings of the code: superpixels are of channels-last photos, and masks stay
+fractions. Ours: the mask net (plain and dilated convolutions instead of CGNet) and the superpixels get the
+photo at `side` px; a narrower deforming net, whose heads start near zero; no sky points, no Mip filter. Its
 growth (UAD) has no effect in the released code: `--density uad` gives this toolkit's reading of it.
-Appearance is WildGaussians', of static Gaussians alone.
-Cost: a second picture, the bending net, and two evaluations of D-SSIM for the mask.
+Appearance is that of WildGaussians, for static Gaussians alone.
 
-ForestSplats' options and nets: one bends the transient field for a photo, one masks the photo.
+Cost: a second picture, the deforming net, and two evaluations of D-SSIM for the mask.
 """
 
 from __future__ import annotations
@@ -48,13 +47,13 @@ class ForestSplatsConfig:
 
     density: DensityConfig = field(default_factory=DensityConfig)
     points: int = 5000  # transient Gaussians; their number stays
-    width: int = 64  # of the bending net; published 256
+    width: int = 64  # units of the deforming net's hidden layers; published 256
     side: int = 160  # px, the longer side of the photo that the mask net sees
     segments: int = 30  # superpixels
     filled: float = 0.2  # superpixels with this mean mask are masked as a whole
-    area: float = 0.05  # times mean M^2 at the start
-    area_final: float = 0.006
-    static: float = 0.2  # times the loss of the static picture where it is not masked
+    area: float = 0.05  # weight of mean M^2 at the start
+    area_final: float = 0.006  # and at the end
+    static: float = 0.2  # weight of the loss of the static picture where it is not masked
     appearance: bool = False  # published: on for photo collections
     lr_mask: float = 1e-3
     lr_bend: float = 8e-4
@@ -65,7 +64,7 @@ class ForestSplatsConfig:
 
 
 class Nets(Learnt):
-    """Holds what is learnt beside Gaussians: the bending net and the mask net. Acts on no picture itself."""
+    """Holds the deforming net and the mask net. As an effect it changes no picture itself."""
 
     name = "forestsplats"
 
@@ -93,18 +92,18 @@ class Nets(Learnt):
 
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
         position, w, rate = 4 * (1 + 2 * OCTAVES), self.config.width, self.config.lr_bend
-        found: dict[str, Leaf] = {}
+        leaves: dict[str, Leaf] = {}
         for i in range(LAYERS):
             inputs = position if i == 0 else w + position if i == SKIP + 1 else w
-            found |= mlp_leaves(f"bend{i}", (inputs, w), rng, rate)
+            leaves |= mlp_leaves(f"bend{i}", (inputs, w), rng, rate)
         for key, leaf in mlp_leaves("moved", (w, 10), rng, rate).items():
-            found[key] = replace(leaf, values=0.01 * leaf.values)
+            leaves[key] = replace(leaf, values=0.01 * leaf.values)
         for name, channels in (("stem", (3, 32, 32, 32)), ("near", (32, 64, 128)), ("far", (32, 64, 128))):
-            found |= conv_leaves(name, channels, rng, self.config.lr_mask)
-        return found | conv_leaves("last", (128, 1), rng, self.config.lr_mask, side=1)
+            leaves |= conv_leaves(name, channels, rng, self.config.lr_mask)
+        return leaves | conv_leaves("last", (128, 1), rng, self.config.lr_mask, side=1)
 
     def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
-        """The transient Gaussians as this photo's."""
+        """Deform the transient Gaussians for this photo."""
         assert shot.view is not None
         time = torch.full_like(gaussians.means[:, :1], shot.view / max(self.photos - 1, 1))
         code = frequencies(torch.cat([self.unit(gaussians.means.detach()), time], dim=1), OCTAVES)
@@ -120,7 +119,7 @@ class Nets(Learnt):
         }
 
     def masked(self, photo: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
-        """M [H, W] in (0, 1), 1 = transient."""
+        """Return M [H, W] in (0, 1), 1 = transient."""
 
         def conv(x: Tensor, name: str, i: int, stride: int = 1, dilation: int = 1) -> Tensor:
             weight, bias = leaf[f"{name}_weight{i}"], leaf[f"{name}_bias{i}"]
@@ -136,13 +135,13 @@ class Nets(Learnt):
         return resized(small, *photo.shape[:2])
 
     def filled(self, mask: Tensor, view: int) -> Tensor:
-        """M_f [H, W]: in superpixels whose mean reaches `filled` their largest value, elsewhere M."""
+        """Return M_f [H, W]: the largest value in superpixels whose mean reaches `filled`, elsewhere M."""
         segments = F.interpolate(self.segments[view][None, None].float(), size=mask.shape)[0, 0].long()
         return fill(mask, segments, 2 * self.config.segments, self.config.filled)
 
 
 def fill(mask: Tensor, segments: Tensor, count: int, share: float) -> Tensor:
-    """The mask [H, W], and the maximum in segments [H, W] whose mean is `share` or more."""
+    """Replace the mask [H, W] by its maximum in segments [H, W] whose mean is `share` or more."""
     flat = segments.reshape(-1)
     most = torch.zeros(count, device=mask.device).scatter_reduce(0, flat, mask.reshape(-1), "amax")
     whole = label_means(mask, segments, count) >= share
@@ -153,7 +152,7 @@ TRANSIENT = "transient"
 
 
 def build(options: ForestSplatsConfig) -> Parts:
-    """A static and a transient field, mixed by the mask."""
+    """Return a static and a transient field, mixed by the mask."""
     nets = Nets(options)
     effects: tuple[Effect, ...] = (nets,)
     if options.appearance:
@@ -162,7 +161,7 @@ def build(options: ForestSplatsConfig) -> Parts:
 
 
 class Forest(Fields):
-    """C = M_f R_t + (1 - M_f) R_s."""
+    """Composes C = M_f R_t + (1 - M_f) R_s of the transient and the static render."""
 
     def __init__(self, nets: Nets) -> None:
         self.nets, self.config = nets, nets.config
@@ -174,7 +173,7 @@ class Forest(Fields):
         self.nets.require_setup()
         rng, count = np.random.default_rng([data.seed, 0xF0]), min(self.config.points, len(static))
         rows = torch.from_numpy(np.sort(rng.choice(len(static), count, replace=False))).to(static.device)
-        return {TRANSIENT: FieldStart(replace(static.select(rows), extra={}), rates)}
+        return {TRANSIENT: FieldStart(replace(static.select(rows), attributes={}), rates)}
 
     def drawn(self, shot: Shot) -> Sequence[str]:
         return () if shot.view is None else (TRANSIENT,)
@@ -184,7 +183,7 @@ class Forest(Fields):
 
     @torch.no_grad()
     def mask(self, shot: Shot) -> Tensor:
-        """M_f of a train photo."""
+        """Return M_f of a train photo."""
         assert shot.photo is not None and shot.view is not None
         return self.nets.filled(self.nets.masked(shot.photo, self.nets._leaf(shot)), shot.view)
 
@@ -205,7 +204,7 @@ class Forest(Fields):
             return {
                 name: Cotangents(
                     of(name, c.image), of(name, c.extra), of(name, c.alpha),
-                    c.depth if name == STATIC else None, c.own if name == STATIC else {},
+                    c.depth if name == STATIC else None, own=c.own if name == STATIC else {},
                 )
                 for name in share
             }  # fmt: skip
@@ -224,15 +223,15 @@ class Forest(Fields):
         d_mask = 2.0 * area / m.numel() * m + apart.abs().mean(dim=2) / m.numel()
         d_mask = d_mask - config.static * d_keep(static, photo, 1.0 - m)
         with torch.enable_grad():
-            found = torch.autograd.grad(mask, list(leaf.values()), d_mask, allow_unused=True)
-        own = {nets.name: {name: d for name, d in zip(leaf, found) if d is not None}}
+            d_leaves = torch.autograd.grad(mask, list(leaf.values()), d_mask, allow_unused=True)
+        own = {nets.name: {name: d for name, d in zip(leaf, d_leaves) if d is not None}}
         d_static = config.static * photometric(static, photo, 1.0 - m, weighting="images").d_image
         d_transient = m[..., None] * apart.sign() / apart.numel()
         return {STATIC: Cotangents(image=d_static, own=own), TRANSIENT: Cotangents(image=d_transient)}
 
 
 class Mixed(MaskPolicy):
-    """1 - M_f, for pictures and measures: the mixture has weighed the loss already."""
+    """1 - M_f, for pictures and metrics: the loss uses the mixture instead."""
 
     def __init__(self, nets: Nets) -> None:
         self.forest = Forest(nets)

@@ -1,21 +1,18 @@
-"""A mask policy made of two: one gives the keep maps, the other adds its loss on the render.
-
-Masks that were made before training, by a first pass.
-"""
+"""Mask policies of other sources: fixed masks of a first pass, or masks and losses of two methods."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.parts import MaskPolicy, State
+from ambiguous_wild.splat.parts import MaskPolicy
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 
@@ -26,7 +23,7 @@ class FixedMasks(MaskPolicy):
     def __init__(self, keeps: Sequence[Tensor]) -> None:
         """
         Args:
-            keeps: of the train views, [H, W] in [0, 1] at the photos' size, 1 = static.
+            keeps: keep maps of the train views, [H, W] in [0, 1] at the photos' size, 1 = static.
         """
         self.keeps = list(keeps)
 
@@ -36,7 +33,7 @@ class FixedMasks(MaskPolicy):
     def keep(self, step: Step) -> Tensor:
         return shrink_keep(self.keeps[step.view], step.divisor)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         shares = [1.0 - float(keep.mean()) for keep in self.keeps]
         return {"masked_share": sum(shares) / max(len(shares), 1)}
 
@@ -82,7 +79,7 @@ class GraftedPolicy(MaskPolicy):
         if self.regulariser is not None:
             self.regulariser.on_opacity_reset(step)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return self.mask.facts()
 
     def panels(self, step: Step) -> dict[str, np.ndarray]:

@@ -1,15 +1,15 @@
 """Plug and play: masking, density control, regulariser and effects of one method in another.
 
 `3dgs@mask=refinesplat` is 3DGS with RefineSplat's masks, `refinesplat@mask=truth` RefineSplat with exact
-ones. What a place takes:
+ones. The places, and what a donor fills them with:
 
 mask         the keep map (`MaskPolicy.keep`, `predict`), and what it learns
 density      the density control and its config
 regulariser  the donor policy's loss on the render (`MaskPolicy.cotangent`), under the host's keep map
 effects      the donor's own effects (`Parts.effects`) instead of the host's
 
-Everything else - schedule, how the keep map enters SSIM, which photos - stays the host's. What cannot work
-is refused, see graft_checks.py. Imports no torch: names are checked before anything heavy is loaded.
+Everything else stays the host's: schedule, how the keep map enters SSIM, which photos. Grafts that cannot
+work are refused, see graft_checks.py. Imports no torch: names are checked before anything heavy is loaded.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.parts import Parts
 
 PLACES = ("mask", "density", "regulariser", "effects")
-ALIASES = {"none": "3dgs", "motion": "3dgs+motion", "truth": "3dgs+truth"}  # of donors
+ALIASES = {"none": "3dgs", "motion": "3dgs+motion", "truth": "3dgs+truth"}  # short names of donors
 
 
 def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
-    """`3dgs@mask=refinesplat,density=refinesplat`; the host's own name if no place is filled.
+    """Return a name such as `3dgs@mask=refinesplat,density=refinesplat`; the host's if no place is filled.
 
-    Donors replace those that the host's name already has.
+    Donors replace those in the host's name.
     """
     base, rest = split_graft(host)
     filled = dict(_pairs(host)) if rest else {}
@@ -46,10 +46,10 @@ def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
 
 
 def split_graft(name: str) -> tuple[str, str]:
-    """(host, the text after its @); a host may be a reference, whose path may contain an @ too.
+    """Split a name into the host and the text after its @; the path of a reference may contain an @ too.
 
     Raises:
-        AwError: nothing after the @, or two of them.
+        AwError: nothing follows the @, or there are two.
     """
     if is_reference(name) or "@" not in name:
         return name, ""
@@ -61,16 +61,16 @@ def split_graft(name: str) -> tuple[str, str]:
 
 
 def refuse_parts_of_program(name: str) -> None:
-    """Raise AwError for `external:opensplat@density=uad`: a program of its own takes no parts."""
+    """Raise AwError for a name such as `external:opensplat@density=uad`: a program takes no parts."""
     host, _, rest = name.rpartition("@")
     if not is_program(host) or not all(place in PLACES for place, _ in _written(rest)):
         return
     path = reference_file(name)
     if path is None or not path.exists():
-        raise _takes_none(host, rest)
+        raise _program_takes_no_parts(host, rest)
 
 
-def _takes_none(host: str, rest: str) -> AwError:
+def _program_takes_no_parts(host: str, rest: str) -> AwError:
     return AwError(
         f"{host} is trained by another program, which takes no parts of other methods: leave {rest} out"
     )
@@ -89,27 +89,27 @@ def knows_truth(name: str) -> bool:
 
 
 def members(name: str) -> list[str]:
-    """The host and the donors in a method's name; of an ablation's variant, its method."""
+    """Return the host and the donors in a method's name; for a variant of an ablation its method."""
     host, _, rest = name.rpartition("@") if "@" in name else (name, "", "")
     return list(dict.fromkeys([host, *(ALIASES.get(donor, donor) for _, donor in _written(rest) if donor)]))
 
 
 def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) -> MethodEntry:
-    """The method that `graft_name` names.
+    """Return the method that a graft's name stands for.
 
     Args:
-        name: of the graft, as it was typed.
+        name: name of the graft, as it was typed.
         host: the method before its @.
-        methods: those that may be donors, by name.
+        methods: possible donors by name.
 
     Raises:
-        AwError: unknown place or donor, or a place filled twice.
+        AwError: a place or donor is unknown, or a place is filled twice.
     """
     if host.passes > 1:
         raise AwError(f"{name}: the end of the name says that it trains twice: {host.base}@...+2passes")
     pairs = _pairs(name)
     if host.program is not None:
-        raise _takes_none(host.name, split_graft(name)[1])
+        raise _program_takes_no_parts(host.name, split_graft(name)[1])
     donors = {place: _donor(place, donor, methods) for place, donor in pairs}
     entries = {"host": host} | donors
     fields = [
@@ -143,15 +143,15 @@ class Graft:
 
 
 def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
-    """The host's parts with the donors' in their places.
+    """Return the host's parts with those of the donors in their places.
 
     A method that fills two places with the same options is built once, so its frozen inputs are prepared
     once, and a method grafted onto itself is unchanged.
 
     Args:
-        name: of the graft, for warnings.
+        name: name of the graft, for warnings.
         entries: "host", and the donor of every place that is filled.
-        options: of each of them, by place.
+        options: their options, by place.
     """
     from ambiguous_wild.methods.graft_checks import check_members
 
@@ -159,31 +159,35 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
     check_members(host_member, donors)
     host = host_member.parts
     mask, regulariser = (donors.get(place, host_member).parts.mask for place in ("mask", "regulariser"))
-    changed: dict[str, Any] = {"mask": compose(mask, regulariser)}
+    host = dataclasses.replace(host, mask=compose(mask, regulariser))
     if "density" in donors:
         density = donors["density"].parts
-        changed |= {"density": density.density, "density_config": density.density_config}
-        # MCMC's fixed number starts from Gaussians of its own
-        changed |= {"start_opacity": density.start_opacity, "start_scale": density.start_scale}
-        if density.start is not None:
-            changed["start"] = density.start
+        host = dataclasses.replace(
+            host,
+            density=density.density,
+            density_config=density.density_config,
+            # MCMC's fixed number of Gaussians needs its own start
+            start_opacity=density.start_opacity,
+            start_scale=density.start_scale,
+            start=host.start if density.start is None else density.start,
+        )
     if "effects" not in donors:
-        return dataclasses.replace(host, **changed)
+        return host
     effects = donors["effects"].parts.effects
     for effect in effects:
         host = host.suited_to(effect)
-    return dataclasses.replace(host, **changed, effects=effects)
+    return dataclasses.replace(host, effects=effects)
 
 
 def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tuple[Member, dict[str, Member]]:
-    """The host, and the donors by place, each built once for the same options."""
+    """Build the host and the donors by place; a method with equal options is built once."""
     from ambiguous_wild.methods.graft_checks import Member
 
     typed, members = dict(_pairs(name)), {}
-    built: list[tuple[str, Any, Parts]] = []
+    built: list[tuple[str, Any, Parts]] = []  # method, options, parts
     for place, entry in entries.items():
         own = getattr(options, place)
-        parts = next((parts for known, of, parts in built if known == entry.name and of == own), None)
+        parts = next((parts for method, set_, parts in built if method == entry.name and set_ == own), None)
         if parts is None:
             parts = entry.build(own)
             built.append((entry.name, own, parts))
@@ -192,22 +196,22 @@ def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tup
 
 
 def compose(mask: Any, regulariser: Any) -> Any:
-    """One policy of two: keep maps of `mask`, cotangents of `regulariser`."""
+    """Join two policies to one: keep maps of `mask`, losses of `regulariser`."""
     from ambiguous_wild.methods.given_masks import GraftedPolicy
 
     if regulariser is mask:
         return mask
-    # the loss of the mask's donor was not asked for
+    # a donor of masks does not add its own loss
     return GraftedPolicy(mask, regulariser if regulariser.regularises() else None)
 
 
 def check_graft(method: MethodEntry, options: Any) -> list[str]:
-    """Warnings of a graft: losses that are switched off, and effects that it leaves out.
+    """Return warnings about a graft: losses that are switched off, and effects that it leaves out.
 
-    Other methods have none, nor has a graft whose recipes cannot be built: building tells why.
+    There are none for other methods, or if a recipe fails: building it will tell why.
 
     Raises:
-        AwError: it could not train, or would change nothing.
+        AwError: the graft cannot train, or would change nothing.
     """
     from ambiguous_wild.methods.graft_checks import NOTHING, check_members, left_out
 
@@ -219,20 +223,20 @@ def check_graft(method: MethodEntry, options: Any) -> list[str]:
     except Exception:
         return []
     check_members(host, donors)
-    found, losses = left_out(host, donors), donors.get("regulariser")
+    warnings, losses = left_out(host, donors), donors.get("regulariser")
     if losses is not None and losses.name not in NOTHING and not losses.parts.mask.regularises():
-        found.append(
+        warnings.append(
             f"{losses.name} adds no loss on the render with these options; "
             f"switch it on with --set {losses.name}.KEY=VALUE, or leave the regulariser out"
         )
-    return found
+    return warnings
 
 
 def _pairs(name: str) -> list[tuple[str, str]]:
-    """(place, donor) of every place that the name of a graft fills.
+    """Return (place, donor) for every place that the name of a graft fills.
 
     Raises:
-        AwError: an unknown place, no donor, or a place filled twice.
+        AwError: a place is unknown, has no donor, or is filled twice.
     """
     host, rest = split_graft(name)
     pairs = _written(rest) if rest else []
@@ -247,7 +251,7 @@ def _pairs(name: str) -> list[tuple[str, str]]:
 
 
 def _written(rest: str) -> list[tuple[str, str]]:
-    """(place, donor) of `mask=refinesplat,density=truth`, unchecked; an empty donor if there is no `=`."""
+    """Split `mask=refinesplat,density=truth` into (place, donor); the donor is empty without a `=`."""
     parts = [text.partition("=") for text in rest.split(",")]
     return [(place.strip(), donor.strip()) for place, _, donor in parts]
 

@@ -1,4 +1,4 @@
-"""Grafts that could not train or would change nothing, refused before training; what a graft leaves out."""
+"""Checks of grafts before training: grafts that cannot train or change nothing; effects that are left out."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 
 NOTHING = ("none", "3dgs")  # donors that leave a place empty
-# where an effect changes a picture, or the Gaussians that it shows
-_SEEN = ("first_points", "camera", "model", "shade", "image", "pose", "after_step")
+# hooks by which an effect changes a picture, or the Gaussians in it
+_VISIBLE = ("first_points", "camera", "model", "shade", "image", "pose", "after_step")
 
 
 @dataclass(frozen=True)
 class Member:
     """The host or a donor of a graft."""
 
-    name: str  # as the name of the graft gives it
+    name: str  # as in the name of the graft
     parts: Parts
 
 
@@ -26,8 +26,8 @@ def check_members(host: Member, donors: Mapping[str, Member]) -> None:
     """Refuse a graft that could not train, or a donor that has nothing for its place.
 
     Args:
-        host: that is trained.
-        donors: by place.
+        host: the method that is trained.
+        donors: donors by place.
 
     Raises:
         AwError: a donor's masks come from its own fields, it has no loss on the render, or its effects change
@@ -39,35 +39,35 @@ def check_members(host: Member, donors: Mapping[str, Member]) -> None:
         _check_regulariser(donors["regulariser"])
     if "effects" in donors:
         _check_effects(host, donors)
-    _check_what_is_read(host, donors)
+    _check_required_effects(host, donors)
 
 
 def left_out(host: Member, donors: Mapping[str, Member]) -> list[str]:
-    """Warnings of effects that a donor of masks or losses brings, and the graft has not."""
+    """Return warnings about effects of donors of masks or losses that the graft lacks."""
     if "effects" in donors:
         return []
-    own, found = {name_of(effect) for effect in host.parts.effects}, {}
+    own, warnings = {name_of(effect) for effect in host.parts.effects}, {}
     for place in ("mask", "regulariser"):
         donor = donors.get(place)
         if donor is None or (place == "regulariser" and not donor.parts.mask.regularises()):
             continue
         names = [name for name in map(name_of, donor.parts.effects) if name not in own]
         if names:
-            found[donor.name] = (
+            warnings[donor.name] = (
                 f"leaves out {donor.name}'s effects ({', '.join(names)}): add effects={donor.name} to the "
                 f"name to take them, or effects={host.name if own else 'none'} to leave them out without "
                 "this warning"
             )
-    return list(found.values())
+    return list(warnings.values())
 
 
 def has_masks(parts: Parts) -> bool:
-    """Whether the method's masks can be taken by another."""
+    """Whether another method can take this method's masks."""
     return type(parts.mask).keep is not MaskPolicy.keep
 
 
 def masks_of_fields(parts: Parts) -> bool:
-    """Whether the method's masks only show what its own fields have learnt: they weigh no loss."""
+    """Whether the method's masks only show what its own fields have learnt, and weight no loss."""
     shown = type(parts.mask).predict is not MaskPolicy.predict
     return parts.fields is not None and shown and not has_masks(parts)
 
@@ -99,14 +99,14 @@ def _check_effects(host: Member, donors: Mapping[str, Member]) -> None:
     effects, mask = donor.parts.effects, donors.get("mask", host).parts.mask
     if not effects or donor.parts is host.parts:
         return
-    if not any(effect is mask.required_effect() or any(map(effect.acts, _SEEN)) for effect in effects):
+    if not any(effect is mask.required_effect() or any(map(effect.acts, _VISIBLE)) for effect in effects):
         raise AwError(
             f"effects={donor.name} would change no picture: the effects of {donor.name} serve its own "
             f"fields, which a graft does not take; use {donor.name} as the host, or write effects=none"
         )
 
 
-def _check_what_is_read(host: Member, donors: Mapping[str, Member]) -> None:
+def _check_required_effects(host: Member, donors: Mapping[str, Member]) -> None:
     taken = donors.get("effects", host).parts.effects
 
     def lacks(effect: Effect | None) -> bool:
@@ -117,7 +117,7 @@ def _check_what_is_read(host: Member, donors: Mapping[str, Member]) -> None:
             f"the fields of {host.name} need its effects, which effects={donors['effects'].name} replaces: "
             f"leave effects={donors['effects'].name} out"
         )
-    unfit = {}  # method whose masks or losses need effects that are not there, by place
+    unfit = {}  # place -> method whose masks or losses need effects that the graft lacks
     masking, losing = donors.get("mask", host), donors.get("regulariser", host)
     if lacks(masking.parts.mask.required_effect()):
         unfit["mask"] = masking
@@ -126,15 +126,16 @@ def _check_what_is_read(host: Member, donors: Mapping[str, Member]) -> None:
     for place, owner in unfit.items():
         what = "masks" if place == "mask" else "losses"
         if owner is host:
-            raise AwError(_of_host(what, host, donors["effects"], [p for p, m in unfit.items() if m is host]))
+            places = [p for p, member in unfit.items() if member is host]
+            raise AwError(_host_lacks_effects(what, host, donors["effects"], places))
         how = f"add effects={owner.name} to the name"
         if "effects" in donors:
             how = f"write effects={owner.name} instead of effects={donors['effects'].name}"
         raise AwError(f"the {what} of {owner.name} need its effects: {how}")
 
 
-def _of_host(what: str, host: Member, effects: Member, places: list[str]) -> str:
-    """How to go on where the host's own masks or losses need the effects that a donor's replace."""
+def _host_lacks_effects(what: str, host: Member, effects: Member, places: list[str]) -> str:
+    """Return the message for a host whose masks or losses need the effects that a donor replaces."""
     empty = ",".join(f"{place}=none" for place in places)
     ways = [empty]
     if places[0] == "mask" and has_masks(effects.parts):

@@ -1,16 +1,16 @@
-"""GS-W (Gaussian in the Wild): colours by a net from what a Gaussian is and what it samples in its photo.
+"""GS-W (Gaussian in the Wild): a net colours each Gaussian from its features and samples of maps of the
+photo.
 
-Source: EastbeanZhang/Gaussian-Wild. Ours: a small U-Net without ImageNet's weights, on the photo at
-`side` px (published: ResNet-18 at full size); no LPIPS term (it needs VGG's weights); 0.5 is added to
-colours, for the renderer clamps at 0; positions in units of the scene, without a gradient of the net (the
-release's is unverified); boxes start at the photo's size (published: 512 px); the net's output is added to
-the colour in the first three intrinsic features (`residual`: 24.3 for 22.9 dB after 700 iterations of a
-time-of-day, for the net need not learn every colour). A test photo shows the net its left half only (the
-release: all of it); a camera without a photo gets the mean of the train photos' maps. Gaussians outside of
-what may be read get the mean of what they sample at their pixels in the train photos whose pictures they lie
-in (at most 64 photos), as in training: zeros instead cost 3.8 dB on a courtyard.
+Source: EastbeanZhang/Gaussian-Wild. Ours: a small U-Net without ImageNet's weights makes the maps, from the
+photo at `side` px (published: ResNet-18 at full size); no LPIPS term (it needs VGG's weights); 0.5 is added
+to colours, because the renderer clamps at 0; positions are in units of the scene, without a gradient of the
+net (that of the release is unverified); boxes start at the photo's size (published: 512 px); the net's output
+is added to the colour in the first three intrinsic features (`residual`: 24.3 instead of 22.9 dB after 700
+iterations of a time-of-day, because the net need not learn every colour).
 
-GS-W's U-Net, small and without pretrained weights: maps of a photo, and which of its pixels are static.
+Of a test photo the net gets only the left half (released: all of it); a camera without a photo gets the mean
+of the train photos' maps. Gaussians outside of the part that may be read get the mean of their samples in at
+most 64 train photos that show them, as in training: zeros instead cost 3.8 dB on a courtyard.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import d_keep, hashed_uniform
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
@@ -39,16 +39,16 @@ from ambiguous_wild.splat.effects.placing import (
 )
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
-CHANNELS, FREE = 16, 2  # of a map; maps sampled at learnt places
+CHANNELS, FREE = 16, 2  # channels of a map; number of maps that are sampled at learnt places
 DYNAMIC = (FREE + 1) * CHANNELS
 
 
 def unet_leaves(width: int, rng: np.random.Generator, rate: float) -> dict[str, Leaf]:
-    """Encoder of three levels, decoder of two, and the mask's head on the last level of the encoder."""
+    """Return an encoder of three levels, a decoder of two, and the head for masks on the encoder."""
     w = width
     widths = {
         "down": (3, w, 2 * w, 4 * w),
@@ -60,17 +60,17 @@ def unet_leaves(width: int, rng: np.random.Generator, rate: float) -> dict[str, 
 
 
 def coded(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> list[Tensor]:
-    """The photo at `side` and the three levels of the encoder, [1, C, h, w] each."""
+    """Return the photo at `side` and the three levels of the encoder, [1, C, h, w] each."""
     share = min(side / max(photo.shape[:2]), 1.0)
     size = [max(8 * round(side * share / 8), 8) for side in photo.shape[:2]]
-    found = [F.interpolate(photo.permute(2, 0, 1)[None], size=size, mode="area") - 0.5]
+    levels = [F.interpolate(photo.permute(2, 0, 1)[None], size=size, mode="area") - 0.5]
     for i in range(3):
-        found.append(_normal(_conv(found[-1], leaf, "down", i, stride=2)))
-    return found
+        levels.append(_normal(_conv(levels[-1], leaf, "down", i, stride=2)))
+    return levels
 
 
 def maps_of(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
-    """[3, 16, h, w]: two that are sampled at learnt places, one at the Gaussian's pixel."""
+    """Return maps [3, 16, h, w]: two to sample at learnt places, one at the Gaussian's pixel."""
     _, fine, middle, coarse = coded(photo, leaf, side)
     x = torch.cat([F.interpolate(coarse, size=middle.shape[2:]), middle], dim=1)
     x = _normal(_conv(x, leaf, "up"))
@@ -79,7 +79,7 @@ def maps_of(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
 
 
 def visibility(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
-    """M [H, W] in (0, 1), 1 = static, from the encoder's last level."""
+    """Return M [H, W] in (0, 1), 1 = static, from the encoder's last level."""
     x = F.interpolate(_normal(_conv(coded(photo, leaf, side)[3], leaf, "mask")), scale_factor=2.0)
     x = torch.sigmoid(_conv(x, leaf, "mask", 1))
     return F.interpolate(x, size=photo.shape[:2])[0, 0]
@@ -94,14 +94,14 @@ def _normal(x: Tensor) -> Tensor:
 
 
 def sample(maps: Tensor, at: Tensor) -> Tensor:
-    """[M, C] of a map [C, h, w] at (x, y) [M, 2] in [-1, 1]^2, bilinear, the border's value outside."""
-    found = F.grid_sample(maps[None], at[None, None], padding_mode="border", align_corners=False)
-    return found[0, :, 0].T
+    """Sample a map [C, h, w] at (x, y) [M, 2] in [-1, 1]^2, bilinear, with border values outside, [M, C]."""
+    samples = F.grid_sample(maps[None], at[None, None], padding_mode="border", align_corners=False)
+    return samples[0, :, 0].T
 
 
-INTRINSIC, OCTAVES = 48, 10  # features a Gaussian has; of the code of positions
+INTRINSIC, OCTAVES = 48, 10  # intrinsic features of a Gaussian; octaves of the code of positions
 LENGTH = 70_000  # iterations of the release's commands
-MOST = 64  # train photos that stand for all where a camera has none
+MOST = 64  # number of train photos whose maps are averaged for a camera without a photo
 
 
 @dataclass(frozen=True)
@@ -111,22 +111,22 @@ class GswConfig:
     density: DensityConfig = field(default_factory=lambda: DensityConfig(grow_grad=4e-4))
     side: int = 128  # px, the longer side of the photo that the U-Net sees
     width: int = 16  # channels of its first level
-    lr_unet: float = 2e-3  # to a tenth of it
-    lr_colour: float = 5e-4  # for 70 000 iterations; more in shorter runs
-    lr_places: float = 1.0  # of free coordinates, and in px of boxes; to a hundredth of it
+    lr_unet: float = 2e-3  # decays to a tenth
+    lr_colour: float = 5e-4  # for 70 000 iterations; higher in shorter runs
+    lr_places: float = 1.0  # rate of free coordinates, and of boxes in px; decays to a hundredth
     residual: bool = True  # the net's output is added to the intrinsic colour; published: it is the colour
     lr_intrinsic: float = 2.5e-3  # as 3DGS's colours; published 1.25e-4, for 70 000 iterations
-    dropout: float = 0.1  # of what is sampled
+    dropout: float = 0.1  # share of samples
     mask_start: float = 2500.0
-    mask_prior: float = 0.15  # times mean (1 - M)^2
-    outside: float = 1e-3  # times the mean distance of coordinates from [-1, 1]
+    mask_prior: float = 0.15  # weight of mean (1 - M)^2
+    outside: float = 1e-3  # weight of the mean distance of coordinates from [-1, 1]
 
     def __post_init__(self) -> None:
         check_limits(self, "gs-w", side=(16, 4096), width=(1, 512), dropout=(0, 0.9))
 
 
 def build(options: GswConfig) -> Parts:
-    """Colours, masks of the same U-Net, and growth from a higher gradient."""
+    """Return 3DGS with such colours, masks of the same U-Net, and a higher threshold of growth."""
     effect = GswAppearance(options)
     return Parts(
         mask=Visibility(effect), density_config=options.density, weighting="images",
@@ -135,7 +135,7 @@ def build(options: GswConfig) -> Parts:
 
 
 class GswAppearance(Learnt):
-    """colour = net(position, intrinsic feature, samples of three maps, direction)."""
+    """Colours Gaussians by net(position, intrinsic feature, samples of three maps, direction)."""
 
     name, reads_photo = "gs-w", True
 
@@ -147,11 +147,11 @@ class GswAppearance(Learnt):
         self.unit = Unit(data.scene.points.xyz, data.device)
         self.cameras, count = data.cameras, len(data.photos)
         self.chosen = sorted({k * count // min(count, MOST) for k in range(min(count, MOST))})
-        self._known: tuple[float, list[Tensor]] | None = None  # maps of those photos, at a nominal iteration
+        self._cached: tuple[float, list[Tensor]] | None = None  # nominal iteration, and maps of those photos
         super().setup(data)
 
     def acts(self, hook: str) -> bool:
-        return hook != "fit" and super().acts(hook)  # a test photo is read, nothing is fitted to it
+        return hook != "fit" and super().acts(hook)  # a test photo is read; nothing is fitted to it
 
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
         lr, position = self.config.lr_colour, 3 * (1 + 2 * OCTAVES)
@@ -177,11 +177,15 @@ class GswAppearance(Learnt):
         }
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        photo, means, intrinsic = self._seen(shot), visible.means.detach(), visible.extra["gsw_intrinsic"]
+        photo, means, intrinsic = (
+            self._seen(shot),
+            visible.means.detach(),
+            visible.attributes["gsw_intrinsic"],
+        )
         maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
-        places, box = visible.extra["gsw_places"], visible.extra["gsw_box"]
+        places, box = visible.attributes["gsw_places"], visible.attributes["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
-        width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of what is read
+        width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of the picture read
         own, inside = at_pixels(maps[FREE], means, shot.camera, width, box)
         if shot.fitting or photo is None:
             usual = self._usual(shot, leaf, means, box)
@@ -203,31 +207,31 @@ class GswAppearance(Learnt):
         return with_penalty(colours, self.config.outside * beyond)
 
     def _seen(self, shot: Shot) -> Tensor | None:
-        """What the U-Net sees: the photo, and of a test photo the left half."""
+        """Return the input of the U-Net: the photo, or the left half of a test photo."""
         if shot.photo is None or shot.neutral:
             return None
         return shot.photo[:, : shot.photo.shape[1] // 2] if shot.fitting else shot.photo
 
     @torch.no_grad()
     def _maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> list[Tensor]:
-        """Maps of train photos, at most `MOST` of them, evenly chosen; made once an iteration."""
-        if self._known is None or self._known[0] != shot.nominal:
-            self._known = (
+        """Return maps of at most `MOST` train photos, evenly chosen; computed once an iteration."""
+        if self._cached is None or self._cached[0] != shot.nominal:
+            self._cached = (
                 shot.nominal,
                 [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen],
             )
-        return self._known[1]
+        return self._cached[1]
 
     @torch.no_grad()
     def _mean_maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> Tensor:
-        """Their mean, at the first one's size."""
+        """Return the mean of `_maps`, at the size of the first."""
         maps = self._maps(shot, leaf)
         size = maps[0].shape[2:]
         return torch.stack([F.interpolate(m, size=size, mode="bilinear") for m in maps]).mean(dim=0)
 
     @torch.no_grad()
     def _usual(self, shot: Shot, leaf: Mapping[str, Tensor], means: Tensor, box: Tensor) -> Tensor:
-        """[M, 16] that Gaussians sample at their pixels, in the mean of the train photos that show them."""
+        """Return the mean sample of each Gaussian in the train photos that show it, [M, 16]."""
         total, count = means.new_zeros(len(means), CHANNELS), means.new_zeros(len(means), 1)
         for k, maps in zip(self.chosen, self._maps(shot, leaf)):
             own, inside = at_pixels(maps[FREE], means, self.cameras[k], self.cameras[k].width, box)
@@ -235,29 +239,29 @@ class GswAppearance(Learnt):
         return total / count.clamp(min=1.0)
 
     def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
-        self._known = None
+        self._cached = None
         super().step(own, shot, called_off)
 
     def load_state_dict(self, state: State) -> None:
-        self._known = None
+        self._cached = None
         super().load_state_dict(state)
 
     def learnable(self, shot: Shot) -> dict[str, Tensor]:
-        """Copies of all leaves, for a graph of one's own."""
+        """Return copies of all leaves that can be differentiated."""
         return {name: value.requires_grad_() for name, value in self._leaf(shot).items()}
 
 
 def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tensor) -> tuple[Tensor, Tensor]:
-    """What Gaussians sample of a map [16, h, w] at their pixels in a camera.
+    """Sample a map [16, h, w] at the pixels of Gaussians in a camera.
 
     Args:
-        maps: of the photo that the camera took, or of its left part.
-        means: [M, 3] world.
-        width: px, of what the maps are of.
-        box: [M, 2] part of width and height that a Gaussian takes for the whole.
+        maps: map of the camera's photo, or of its left part.
+        means: [M, 3] in the world.
+        width: width in px of the part of the photo that the map covers.
+        box: [M, 2] share of width and height that counts as the whole for a Gaussian.
 
     Returns:
-        [M, 16] samples, and [M] bool where the pixel is inside.
+        Samples [M, 16], and whether the pixel is inside, [M] bool.
     """
     pixels, z = projected(means, camera)
     at = torch.stack([pixels[:, 0] / width, pixels[:, 1] / camera.height], dim=1) / box
@@ -266,7 +270,7 @@ def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tens
 
 
 class Visibility(MaskPolicy):
-    """M learns from the residual that it leaves in the loss, against the prior that nothing is masked."""
+    """Masks by M, which learns from the weighted residual and the prior that nothing is masked."""
 
     learns_by_gradients = True
 
@@ -292,13 +296,13 @@ class Visibility(MaskPolicy):
         with torch.enable_grad():
             leaf = self.effect.learnable(step)
             mask = visibility(step.photo, leaf, self.config.side)
-            found = torch.autograd.grad(
+            d_leaves = torch.autograd.grad(
                 mask, list(leaf.values()), self.d_mask(step, mask.detach()), allow_unused=True
             )
-        own = {name: d for name, d in zip(leaf, found) if d is not None}
+        own = {name: d for name, d in zip(leaf, d_leaves) if d is not None}
         return Cotangents(own={self.effect.name: own})
 
     def d_mask(self, step: Step, mask: Tensor) -> Tensor:
-        """dL/dM [H, W] of 0.8 |M R - M I| + 0.2 D-SSIM(M R, M I) + prior mean (1 - M)^2."""
+        """Return dL/dM [H, W] of 0.8 |M R - M I| + 0.2 D-SSIM(M R, M I) + prior mean (1 - M)^2."""
         through = d_keep(step.rendered.image.detach(), step.photo, mask)
         return through - 2.0 * self.config.mask_prior / mask.numel() * (1.0 - mask)

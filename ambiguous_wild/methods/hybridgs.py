@@ -1,35 +1,35 @@
 """HybridGS: every photo has 2D Gaussians on its plane for what only it shows; 3D Gaussians are the rest.
 
-Source: arXiv 2412.03844, its project page and the released code for inference. UNVERIFIED, hence ours:
-every loss weight, rate and length of a stage, and how the stages share the loss: while both learn apart,
-the 3D Gaussians see the photo where the 2D ones leave it uncovered, and the 2D ones see what the 3D ones
-leave over. Ours too: fewer 2D Gaussians (released 10 000), as large as their number asks for and cut at
-`reach`; a penalty on what they cover. The page's supervision by other views is left out: nothing is known
-of it.
-Cost: the 2D Gaussians' windows, `points` times (2 reach)^2 cells, forwards and back.
+Source: arXiv 2412.03844, its project page and the released code for inference. UNVERIFIED, hence ours: every
+loss weight, rate and length of a stage, and how the stages share the loss: while both kinds learn separately,
+the 3D Gaussians learn where the 2D ones leave the photo uncovered, and the 2D ones learn what the 3D ones
+leave over. Also ours: fewer 2D Gaussians (released 10 000), larger to match their number and cut off at
+`reach`; a penalty on the area that they cover. Left out: the page's supervision by other views, of which
+nothing is known.
+
+Cost: the 2D Gaussians' windows, `points` times (2 reach)^2 cells, forward and backward.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.masking_common import MaskedShares
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
-COVERED = 1.0 / 4.33  # size of a cell in distances between Gaussians: released, 1 px with 10 000 a photo
-FAINT = 2.0 * float(np.log(255.0))  # squared distance in deviations from which a kernel is below 1/255
+COVERED = 1.0 / 4.33  # size of a cell in distances between Gaussians, as released: 1 px with 10 000 a photo
+FAINT = 2.0 * float(np.log(255.0))  # squared distance, in deviations, beyond which a kernel is below 1/255
 
 
 @dataclass(frozen=True)
@@ -39,23 +39,23 @@ class HybridGsConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     points: int = 1000  # 2D Gaussians a photo
     reach: int = 5  # cells; no 2D Gaussian is drawn farther from its centre
-    apart: float = 5000.0  # both kinds learn apart from here on
-    joint: float = 15_000.0  # and together from here on
-    lr: float = 0.05  # of 2D Gaussians
-    area: float = 0.05  # times the mean of what they cover
+    apart: float = 5000.0  # from here on both kinds learn separately
+    joint: float = 15_000.0  # and from here on together
+    lr: float = 0.05  # learning rate of 2D Gaussians
+    area: float = 0.05  # weight of the mean area that they cover
 
     def __post_init__(self) -> None:
         check_limits(self, "hybridgs", points=(1, 1e6), reach=(1, 64), joint=(self.apart, 1e9), lr=(0, 10))
 
 
 def build(options: HybridGsConfig) -> Parts:
-    """A layer of the photo's own over the picture; the rest of the loop is 3DGS."""
+    """Return 3DGS with a layer of each photo over its picture."""
     plane = Plane(options)
     return Parts(mask=Uncovered(plane), density_config=options.density, effects=(plane,))
 
 
 class Plane(Learnt):
-    """From `joint` on the picture is clip(T + (1 - M) S), with T and M sums of the photo's 2D Gaussians."""
+    """Draws clip(T + (1 - M) S) from `joint` on, with T and M sums of the photo's 2D Gaussians."""
 
     name = "hybridgs"
 
@@ -74,9 +74,9 @@ class Plane(Learnt):
         return {"planar": Leaf(torch.from_numpy(start), self.config.lr, per_photo=True)}
 
     def layer(self, planar: Tensor, shot: Shot) -> tuple[Tensor, Tensor]:
-        """T [H, W, 3] and M [H, W] of the photo."""
-        found = planar_sums(planar, shot.camera.height, shot.camera.width, self.config.reach).clamp(0.0, 1.0)
-        return found[..., :3], found[..., 3]
+        """Return T [H, W, 3] and M [H, W] of the photo."""
+        sums = planar_sums(planar, shot.camera.height, shot.camera.width, self.config.reach).clamp(0.0, 1.0)
+        return sums[..., :3], sums[..., 3]
 
     def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         if shot.view is None or shot.other_gaussians or shot.nominal < self.config.joint:
@@ -85,12 +85,12 @@ class Plane(Learnt):
 
 
 def composed(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
-    """clip(T + (1 - M) S, 0, 1)."""
+    """Return clip(T + (1 - M) S, 0, 1)."""
     return (front + (1.0 - mask)[..., None] * back.clamp(0.0, 1.0)).clamp(0.0, 1.0)
 
 
 class Uncovered(MaskPolicy):
-    """1 - M weighs the loss while both kinds learn apart; afterwards the picture has it in it."""
+    """1 - M, which weights the loss while both kinds learn separately; afterwards the picture contains M."""
 
     learns_by_gradients = True
 
@@ -129,17 +129,17 @@ class Uncovered(MaskPolicy):
                 picture = composed(front, mask, step.rendered.image.detach())
                 outputs.append(picture)
                 pulls.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
-            (found,) = torch.autograd.grad(outputs, planar, pulls)
-        return Cotangents(own={self.plane.name: {"planar": found}})
+            (d_planar,) = torch.autograd.grad(outputs, planar, pulls)
+        return Cotangents(own={self.plane.name: {"planar": d_planar}})
 
     @staticmethod
     def _user(keep: Tensor | None, mask: Tensor) -> Tensor | None:
-        """The capture's own mask alone: pixels that are left out although the layer does not cover them."""
+        """Return the capture's own mask alone: it masks pixels that the layer does not cover."""
         if keep is None:
             return None
         return ((keep > 0) | (mask.detach() >= 1.0)).float()
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"masked_share": self.shares.mean()}
 
     def state_dict(self) -> State:
@@ -150,12 +150,12 @@ class Uncovered(MaskPolicy):
 
 
 def planar_sums(planar: Tensor, height: int, width: int, reach: int) -> Tensor:
-    """[H, W, 4]: sum over 2D Gaussians of o (c, 1) g, without order and without a background.
+    """Sum o (c, 1) g over 2D Gaussians, without order or background, [H, W, 4].
 
     Args:
         planar: [n, 9]: p with tanh(p) the centre in [-1, 1]^2, colour, (l1, l2, l3) with the lower factor
             [[l1 + 0.5, 0], [l2, l3 + 0.5]] of the covariance in cells, and the logit of the weight.
-        height, width: of the picture, px.
+        height, width: size of the picture, px.
         reach: cells; a kernel is 0 farther from its centre along an axis.
     """
     cell = (height * width / len(planar)) ** 0.5 * COVERED  # px
@@ -182,5 +182,5 @@ def planar_sums(planar: Tensor, height: int, width: int, reach: int) -> Tensor:
 
 
 def _apart_from_zero(x: Tensor) -> Tensor:
-    """x, at least 0.1 from zero on its own side: a factor of the covariance may cross it."""
+    """Move x away from zero to at least 0.1 on its side: a factor of the covariance may cross zero."""
     return torch.where(x >= 0, x.clamp(min=0.1), x.clamp(max=-0.1))

@@ -1,19 +1,19 @@
-"""The per-pixel net: Linear - ReLU - Linear - sigmoid on frozen features of the photo."""
+"""A per-pixel net on frozen features of the photo: Linear - ReLU - Linear - sigmoid."""
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.splat.backend import backend_of
 
 
 class MaskNet(nn.Module):
-    """Features [h, w, C] to a static map [H, W]; the features' mean and std are part of it."""
+    """Maps features [h, w, C] to a static map [H, W]; standardises them first."""
 
     mean: Tensor
     std: Tensor
@@ -21,9 +21,9 @@ class MaskNet(nn.Module):
     def __init__(self, mean: Tensor, std: Tensor, hidden: int, seed: int) -> None:
         """
         Args:
-            mean, std: [C], subtracted and divided by; zeros and ones change nothing.
-            hidden: width.
-            seed: of the weights, drawn as `nn.Linear` draws them.
+            mean, std: [C], which standardise features; zeros and ones change nothing.
+            hidden: width of the hidden layer.
+            seed: seed of the weights, which are initialised as by `nn.Linear`.
         """
         super().__init__()
         self.register_buffer("mean", mean.clone())
@@ -38,10 +38,10 @@ class MaskNet(nn.Module):
                     values.copy_((2.0 * torch.rand(values.shape, generator=generator) - 1.0) * limit)
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
-        """The map [height, width].
+        """Return the map [height, width].
 
-        The first layer runs on the grid and its output is enlarged: bilinear weights sum to one, so that is
-        what enlarging all C channels first gives, at hidden / C of the work.
+        The first layer runs on the grid, and its output is enlarged. As bilinear weights sum to one, this
+        equals enlarging all C channels first, at hidden / C of the work.
         """
         z = self.first((features - self.mean) / self.std)
         if z.shape[:2] != (height, width):
@@ -50,7 +50,7 @@ class MaskNet(nn.Module):
 
 
 def enlarged(z: Tensor, height: int, width: int) -> Tensor:
-    """[h, w, C] to [height, width, C], bilinear with pixel centres kept in place (not align_corners).
+    """Enlarge [h, w, C] to [height, width, C], bilinear, with pixel centres in place (not align_corners).
 
     Two products with small matrices: with many channels on the CPU a third of the cost of `F.interpolate`
     and its backward pass, equal up to rounding.
@@ -62,8 +62,8 @@ def enlarged(z: Tensor, height: int, width: int) -> Tensor:
 
 
 @cache
-def _weights(size: int, to: int, dtype: torch.dtype, place: torch.device) -> Tensor:
-    """[to, size]: weight of each value in each enlarged one; rows sum to one. Copied to the device once."""
+def _weights(size: int, to: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the weight of each value in each enlarged one, [to, size]; rows sum to one. Copied once."""
     at = ((torch.arange(to, dtype=torch.float64) + 0.5) * (size / to) - 0.5).clamp(min=0.0)
     low = at.floor().long().clamp(max=size - 1)
     high = (low + 1).clamp(max=size - 1)
@@ -71,23 +71,23 @@ def _weights(size: int, to: int, dtype: torch.dtype, place: torch.device) -> Ten
     weights = torch.zeros(to, size, dtype=torch.float64)
     weights[number, low] += 1.0 - share
     weights[number, high] += share
-    return weights.float().to(place, dtype)
+    return weights.float().to(device, dtype)
 
 
-def adam_of(net: nn.Module, lr: float, place: torch.device) -> torch.optim.Adam:
-    """Adam on the net's parameters, see `Backend.adam`."""
-    return backend_of(place).adam(net.parameters(), lr)
+def adam_of(net: nn.Module, lr: float, device: torch.device) -> torch.optim.Adam:
+    """Return Adam for the net's parameters, see `Backend.adam`."""
+    return backend_of(device).adam(net.parameters(), lr)
 
 
-def adam_state(optimiser: torch.optim.Adam) -> list[dict[str, Any]]:
-    """Moments and counts of every parameter, in the optimiser's order; empty before its first step."""
+def adam_state(optimiser: torch.optim.Adam) -> list[State]:
+    """Return moments and step count of every parameter, in order; empty before the first step."""
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     return [dict(optimiser.state[p]) for p in parameters if p in optimiser.state]
 
 
-def load_adam_state(optimiser: torch.optim.Adam, rows: list[dict[str, Any]]) -> None:
+def load_adam_state(optimiser: torch.optim.Adam, rows: list[State]) -> None:
     """Restore what `adam_state` returned."""
-    optimiser.state.clear()  # what was saved before the first step is empty
+    optimiser.state.clear()  # a state saved before the first step is empty
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     fused = bool(optimiser.defaults["fused"])
     for parameter, row in zip(parameters, rows):

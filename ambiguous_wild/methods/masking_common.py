@@ -1,8 +1,6 @@
-"""What the mask policies of several methods share: warm-up, pause after an opacity reset, masked shares.
+"""What the mask policies of several methods share: targets and bounds, warm-up, pauses, masked shares.
 
-The targets and the loss of RobustSplat's mask net: cosine target, residual bounds. Pure functions.
-
-Maps are [H, W] float32, 1 = static.
+Targets and loss of RobustSplat's mask net are pure functions. Maps are [H, W] float32, 1 = static.
 """
 
 from __future__ import annotations
@@ -21,62 +19,62 @@ from ambiguous_wild.splat.step import Step
 
 
 def cosine_target(cosine: Tensor) -> Tensor:
-    """T_cos = 1 - clip(1 - (c - 0.5) / 0.5, 0, 1): 1 where photo and render agree, 0 from 0.5 down."""
+    """Return T_cos = 1 - clip(1 - (c - 0.5) / 0.5, 0, 1): 1 where photo and render agree, 0 below 0.5."""
     return 1.0 - (1.0 - (cosine - 0.5) / 0.5).clamp(0.0, 1.0)
 
 
 def calibrated(cosine: Tensor, unit: float, normal: float) -> Tensor:
-    """The cosine stretched to its whole range: 0 at a distance of `normal` units, -1 from twice that.
+    """Stretch a cosine to its whole range: 0 at a distance of `normal` units, -1 from twice that on.
 
     Cosines of hand-made features stay above 0.99, where the published target is 1 everywhere. The unit is
-    the cosine distance that blur and noise alone make (`Features.unit`).
+    the cosine distance that blur and noise alone cause (`Features.unit`).
     """
     return 1.0 - ((1.0 - cosine) / (unit * normal)).clamp(0.0, 2.0)
 
 
 def relative_target(distance: Tensor, usual: float | Tensor, reach: float) -> Tensor:
-    """1 up to the `usual` distance of features, 0 from `reach` times that on, linear between.
+    """Return 1 up to the `usual` distance of features, 0 from `reach` times that on, linear between.
 
-    What a render that is still blurred lacks everywhere is usual; what it lacks here alone is not.
+    A blurred render has a usual distance everywhere; only a larger one shows a distractor.
     """
     usual = max(usual, 1e-6) if isinstance(usual, float) else usual.clamp(min=1e-6)
     return 1.0 - ((distance / usual - 1.0) / (reach - 1.0)).clamp(0.0, 1.0)
 
 
 def residual(photo: Tensor, render: Tensor) -> Tensor:
-    """Mean over channels of |photo - render|, [H, W], of pictures [H, W, 3]; at most 1."""
+    """Return the mean over channels of |photo - render|, [H, W], of pictures [H, W, 3]; at most 1."""
     return (photo - render).abs().mean(dim=2).clamp(max=1.0)
 
 
 def update_histogram(histogram: Tensor, values: Tensor, decay: float) -> Tensor:
-    """h <- decay h + hist(values); `histogram` [bins] float64 over [0, 1], values in [0, 1]."""
+    """Return decay h + hist(values), for `histogram` [bins] float64 over [0, 1] and values in [0, 1]."""
     bins = len(histogram)
     index = (values.reshape(-1).double() * bins).long().clamp(0, bins - 1)
     return decay * histogram + backend_of(histogram.device).label_sums(index, bins)
 
 
 def percentile(histogram: Tensor, share: float) -> float | Tensor:
-    """The smallest bin edge with at least `share` of all counts below it; 1 for an empty histogram.
+    """Return the smallest bin edge with at least `share` of all counts below it; 1 for an empty histogram.
 
-    As `Backend.number`: a 0-d tensor on a GPU, so that the host does not wait for it.
+    On a GPU it is a 0-d tensor, as of `Backend.number`, so that the host does not wait.
     """
     total = histogram.sum()
     # a little below the target for rounding, so that 0.6 of 10 equal counts is six of them
     reached = torch.cumsum(histogram, 0) >= share * total * (1.0 - 1e-12)
-    first = reached.int().argmax()  # of equal values the first
+    first = reached.int().argmax()  # the first of equal values
     edge = ((first + 1).to(histogram) / len(histogram)).masked_fill(total <= 0, 1.0)
     return backend_of(histogram.device).number(edge)
 
 
 def bound(e: Tensor, threshold: float | Tensor) -> Tensor:
-    """1 where e < threshold for the pixel or for over half of its 3x3 neighbourhood; outside counts as 0."""
+    """Return 1 where e < threshold for the pixel or for over half of its 3x3 window; outside counts as 0."""
     inlier = (e < threshold).float()
     near = F.avg_pool2d(inlier[None, None], 3, stride=1, padding=1)[0, 0]
     return ((inlier > 0) | (near > 0.5)).float()
 
 
 def resized(grid: Tensor, height: int, width: int) -> Tensor:
-    """A map [h, w] at [height, width], bilinear."""
+    """Resize a map [h, w] to [height, width], bilinear."""
     if grid.shape == (height, width):
         return grid
     return F.interpolate(grid[None, None], size=(height, width), mode="bilinear", align_corners=False)[0, 0]
@@ -94,7 +92,7 @@ def mask_loss(
     lambda_pull: float = 2.0,
     beta: float = 2000.0,
 ) -> Tensor:
-    """0.5 mean|M - T_cos| + 0.5 mean(relu(M - u) + relu(l - M)) + 2 exp(-it / beta) mean(1 - M).
+    """Return 0.5 mean|M - T_cos| + 0.5 mean(relu(M - u) + relu(l - M)) + 2 exp(-it / beta) mean(1 - M).
 
     The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights, hence constant and left out.
     """
@@ -106,7 +104,7 @@ def mask_loss(
 
 
 def keep_of(mask: Tensor, threshold: float, erosion: int) -> Tensor:
-    """[M > threshold], the static region eroded by a min-pool of side `erosion`."""
+    """Return [M > threshold] with the static region eroded by a min-pool of side `erosion`."""
     kept = (mask > threshold).float()
     return -F.max_pool2d(-kept[None, None], erosion, stride=1, padding=erosion // 2)[0, 0]
 
@@ -120,7 +118,7 @@ class WarmUp(Protocol):
     @property
     def mask_start(self) -> float: ...  # nominal iterations
     @property
-    def min_mask_start(self) -> int: ...  # iterations of the run: an earlier render shows too little
+    def min_mask_start(self) -> int: ...  # iterations of the run; earlier renders show too little
 
 
 class Pause(WarmUp, Protocol):
@@ -138,12 +136,12 @@ class WarmUpMask(MaskPolicy):
     config: WarmUp
 
     def begun(self, step: Step) -> bool:
-        """Whether masks are in force at this step."""
+        """Whether masks are used at this step."""
         return step.nominal >= self.config.mask_start and step.iteration >= self.config.min_mask_start
 
 
 class PausingMask(WarmUpMask):
-    """A mask policy that also rests after every opacity reset: renders are too dark to be judged by."""
+    """A mask policy that also pauses after every opacity reset, when renders are too dark."""
 
     config: Pause
     last_reset = 0  # iteration, 0 = never
@@ -159,19 +157,19 @@ class PausingMask(WarmUpMask):
         return step.iteration - self.last_reset < pause
 
     def pause_iterations(self, step: Step) -> float:
-        """`reset_pause` in iterations of the run."""
+        """Return `reset_pause` in iterations of the run."""
         return self.config.reset_pause / (step.nominal / step.iteration)
 
 
 class MaskedShares(dict[int, float | Tensor]):
-    """View: the share of its pixels that was masked when it was last seen."""
+    """The share of each view's pixels that was masked when it was last seen."""
 
     def take(self, view: int, keep: Tensor) -> None:
-        """Note the share of a keep map [H, W]; on an accelerator it is read later."""
+        """Store the masked share of a keep map [H, W]; on an accelerator it is read later."""
         self[view] = backend_of(keep.device).number(1.0 - keep.mean())
 
     def mean(self) -> float:
-        """Over the views seen so far, 0 before the first."""
+        """Return the mean over the views seen so far; 0 before the first."""
         shares = [float(self[view]) for view in sorted(self)]
         return sum(shares) / len(shares) if shares else 0.0
 
@@ -180,12 +178,12 @@ class MaskedShares(dict[int, float | Tensor]):
 
     @classmethod
     def from_state(cls, state: dict[str, float]) -> MaskedShares:
-        """What `state_dict` returned."""
+        """Restore what `state_dict` returned."""
         return cls({int(view): float(share) for view, share in state.items()})
 
 
 def d_keep(render: Tensor, photo: Tensor, keep: Tensor) -> Tensor:
-    """dL/dkeep [H, W] of 0.8 |k R - k I| + 0.2 D-SSIM(k R, k I), for nets that learn what they mask by it.
+    """Return dL/dkeep [H, W] of 0.8 |k R - k I| + 0.2 D-SSIM(k R, k I), for nets that learn masks by it.
 
     Both pictures depend on k; the loss is symmetric in them, so each call gives the share of one of them.
     """
@@ -195,20 +193,20 @@ def d_keep(render: Tensor, photo: Tensor, keep: Tensor) -> Tensor:
 
 
 def upsampled(image: Tensor, height: int, width: int) -> Tensor:
-    """A render [h, w, 3] at [height, width, 3], bilinear; the render itself where it has that size."""
+    """Resize a render [h, w, 3] to [height, width, 3], bilinear; returns it unchanged if it has that size."""
     if image.shape[:2] == (height, width):
         return image
     chw = image.permute(2, 0, 1)[None]
     return F.interpolate(chw, size=(height, width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 
 
-def hashed_uniform(count: int, key: tuple[int, ...], place: torch.device) -> Tensor:
-    """[count] float32 in (0, 1), a function of the numbers in `key` alone: the same on every device.
+def hashed_uniform(count: int, key: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return [count] float32 in (0, 1) that depend on `key` alone: the same on every device.
 
     A generator would have a state to save, and its numbers would come from the host. Mixing: the finaliser
     of MurmurHash3 (public domain), once for each number of the key.
     """
-    x = torch.arange(count, device=place, dtype=torch.int64)
+    x = torch.arange(count, device=device, dtype=torch.int64)
     for number in key:
         x = (x + (number % _WORD) * 0x9E3779B1 % _WORD) % _WORD
         x = ((x ^ (x >> 16)) * 0x85EBCA6B) & (_WORD - 1)
@@ -218,19 +216,19 @@ def hashed_uniform(count: int, key: tuple[int, ...], place: torch.device) -> Ten
 
 
 def sampled(keep: Tensor, probability: float, key: tuple[int, ...]) -> Tensor:
-    """Bernoulli draw [H, W] with probability p + (1 - p) keep: 1 for certain where keep is 1.
+    """Draw [H, W] of 0 and 1 with probability p + (1 - p) keep: always 1 where keep is 1.
 
     Args:
         keep: [H, W] in [0, 1].
-        probability: with which a masked pixel is kept nevertheless.
-        key: seed and iteration, for instance.
+        probability: probability that a masked pixel is kept nevertheless.
+        key: numbers that decide the draw, e.g. seed and iteration.
     """
     chance = probability + (1.0 - probability) * keep
     return (hashed_uniform(keep.numel(), key, keep.device).reshape(keep.shape) < chance).float()
 
 
 def annealed(step: Step, rate: float) -> float:
-    """exp(-rate floor((1 + s) / 1.5)), with s in iterations of the run or nominal ones, whichever are fewer.
+    """Return exp(-rate floor((1 + s) / 1.5)), with s the smaller of real and nominal iterations.
 
     Source: SpotLessSplats and T-3DGS. A short run's renders are no better for its nominal count.
     """

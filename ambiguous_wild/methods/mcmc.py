@@ -29,14 +29,14 @@ class McmcConfig(DensityConfig):
 
     stop: float = 25_000.0
     min_every: int = 20
-    prune_opacity: float = 0.0  # nobody is removed
+    prune_opacity: float = 0.0  # no Gaussian is removed
     resets: tuple[float, ...] = ()
-    dead_opacity: float = 0.005  # up to here a Gaussian is moved
+    dead_opacity: float = 0.005  # Gaussians up to this opacity are moved
     noise: float = 5e5  # times the learning rate of means
-    lambda_opacity: float = 0.01  # of the mean opacity in the loss
-    lambda_scale: float = 0.01  # of the mean scale in the loss
-    # copies start at a draw of their source times this. Released: 0; they then separate over thousands of
-    # iterations only (700 iterations of a courtyard: 28.4 dB, with 1 29.4; 3000: 32.4, with 1 33.2)
+    lambda_opacity: float = 0.01  # weight of the mean opacity in the loss
+    lambda_scale: float = 0.01  # weight of the mean scale in the loss
+    # copies are offset by a draw from their source times this. Released: 0; they then separate only over
+    # thousands of iterations (700 iterations of a courtyard: 28.4 dB, with 1 29.4; 3000: 32.4, with 1 33.2)
     apart: float = 1.0
     start_opacity: float = 0.5
     start_scale: float = 1.0  # times that of 3DGS; released: 0.1 (1500 iterations: 28.5 dB for 30.1)
@@ -53,7 +53,7 @@ class McmcConfig(DensityConfig):
 
 
 def build(options: McmcConfig) -> Parts:
-    """A start and a density control of its own; the rest of the loop is 3DGS."""
+    """Return 3DGS with another start and another density control."""
     return Parts(
         density=McmcDensity, density_config=options,
         start_opacity=options.start_opacity, start_scale=options.start_scale,
@@ -61,7 +61,7 @@ def build(options: McmcConfig) -> Parts:
 
 
 def divided(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity o' [n] and factor of the scale o / D [n] with which m `copies` [n] look like one Gaussian."""
+    """Return opacity [n] and scale factor [n] with which m `copies` [n] look like one Gaussian."""
     # o' = 1 - (1 - o)^(1/m), D = sum_i sum_k C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1), summed over i first
     o, m, k = opacity.double(), copies.clamp(max=51), np.arange(1, 52)
     each = 1.0 - (1.0 - o) ** (1.0 / m)
@@ -71,7 +71,7 @@ def divided(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class McmcDensity(DensityControl):
-    """Moves dead Gaussians, grows by a share each round, and shakes the faint ones in every step."""
+    """Moves dead Gaussians, grows by a share each round, and adds noise to faint ones in every step."""
 
     config: McmcConfig
 
@@ -97,33 +97,33 @@ class McmcDensity(DensityControl):
         return True  # noise in every step
 
     def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
-        free = self.mutable_rows(
+        mutable = self.mutable_rows(
             torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians
         )
-        if not bool(free.any()):
+        if not bool(mutable.any()):
             return gaussians
-        dead = (torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity) & free
-        if 0 < (count := int(dead.sum())) < int(free.sum()):
-            sources = self._draw(gaussians, optimiser, ~dead & free, count)
+        dead = (torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity) & mutable
+        if 0 < (count := int(dead.sum())) < int(mutable.sum()):
+            sources = self._draw(gaussians, optimiser, ~dead & mutable, count)
             for _, tensor in gaussians.rows():
                 tensor[dead] = tensor[sources]
             gaussians.means[dead] += self._offsets(gaussians.select(sources))
         most = min(len(gaussians) // 20, self.room(step, gaussians))
-        new = gaussians.select(self._draw(gaussians, optimiser, free, most))
+        new = gaussians.select(self._draw(gaussians, optimiser, mutable, most))
         new.means += self._offsets(new)
         optimiser.append(len(new))
         self.log.grew(len(new), 0, new.means)
         return gaussians.cat(new)
 
     def _offsets(self, g: Gaussians) -> Tensor:
-        """[N, 3] by which copies lie beside their sources: a draw of their Gaussians, times `apart`."""
+        """Draw the offsets of copies from their sources, [N, 3], scaled by `apart`."""
         if not self.config.apart:
             return torch.zeros_like(g.means)
         noise = torch.from_numpy(self.rng.standard_normal((len(g), 3), dtype=np.float32)).to(g.device)
         return self.config.apart * shaped(noise, g)
 
     def _draw(self, g: Gaussians, optimiser: SplatAdam, among: Tensor, count: int) -> Tensor:
-        """Rows [count] drawn by opacity; each is already one of the copies that it is about to have."""
+        """Draw rows [count] by opacity; their opacity and scale become those of the copies."""
         share = torch.where(among, torch.sigmoid(g.opacity_logits), 0.0).double().cpu().numpy()
         drawn = torch.from_numpy(self.rng.choice(len(share), count, p=share / share.sum())).to(g.device)
         rows, times = drawn.unique(return_counts=True)

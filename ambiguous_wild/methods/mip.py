@@ -3,7 +3,7 @@
 Source: Mip-Splatting (Yu et al., CVPR 2024) and its code, autonomousvision/mip-splatting, whose README
 calls the growth by absolute gradients a later addition: `growth=absolute`, while the default is that of
 the tables. Ours: the principal point need not be the centre; the 2D factor is that of gsplat's
-"antialiased" mode, without the floors of 1e-6. The paper's text was not read again.
+"antialiased" mode, without the floors of 1e-6.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class MipConfig:
     """Options."""
 
     kernel: float = 0.1  # px^2, variance of the 2D filter
-    growth: Literal["plain", "absolute"] = "plain"  # of the tables; of the current code
+    growth: Literal["plain", "absolute"] = "plain"  # plain: of the tables; absolute: of the current code
     density: DensityConfig = field(default_factory=DensityConfig)
 
     def __post_init__(self) -> None:
@@ -38,7 +38,7 @@ class MipConfig:
 
 
 def build(options: MipConfig) -> Parts:
-    """Both filters, and a reset of the filtered opacity."""
+    """Return 3DGS with both filters, and a reset of the filtered opacity."""
     density = MipDensity if options.growth == "plain" else AbsoluteMipDensity
     return Parts(
         density=density, density_config=options.density, antialias=True, blur=options.kernel,
@@ -47,13 +47,13 @@ def build(options: MipConfig) -> Parts:
 
 
 def opacity_factor(log_scales: Tensor, size: Tensor) -> Tensor:
-    """[N] by which the 3D filter of size f [N] dims a Gaussian: sqrt(prod s^2 / prod (s^2 + f^2))."""
+    """Return the factor [N] of opacities under a filter of size f [N]: sqrt(prod s^2 / prod (s^2 + f^2))."""
     variance = (2 * log_scales).exp()
     return (variance / (variance + size[:, None] ** 2)).prod(dim=1).sqrt()
 
 
 class MipDensity(DensityControl):
-    """3DGS's; a reset leaves the filtered opacity at its target."""
+    """Density control of 3DGS whose reset brings the filtered opacity to the target."""
 
     def setup(self, data: TrainData) -> None:
         self.cameras = data.cameras
@@ -65,11 +65,11 @@ class MipDensity(DensityControl):
 
 
 class AbsoluteMipDensity(MipDensity):
-    """Also grows as many by the absolute gradient as by the signed one, those where it is largest."""
+    """Density control that also grows by the absolute gradient, as many Gaussians as by the signed one."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": (), "abs_sum": ()}
-    abs_sum: Tensor  # [N] sum over views of |dL/du| + |dL/dv|, of pixels each, scaled to half the picture
+    abs_sum: Tensor  # [N] sum over views of |dL/du| + |dL/dv| of single pixels, times half the picture's size
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
@@ -83,14 +83,14 @@ class AbsoluteMipDensity(MipDensity):
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
         seen, small = self.seen.clamp(min=1), self.small(gaussians)
         signed, absolute = self.grad_sum / seen, self.abs_sum / seen
-        wanted = signed >= self.config.grow_grad
-        share = float(wanted.float().mean())
+        growing = signed >= self.config.grow_grad
+        share = float(growing.float().mean())
         limit = matched(absolute, share)
         score = torch.maximum(signed / max(self.config.grow_grad, 1e-12), absolute / max(limit, 1e-12))
-        chosen = largest(score, wanted | (absolute >= limit), self.room(step, gaussians))
+        chosen = largest(score, growing | (absolute >= limit), self.room(step, gaussians))
         return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
 
 
 def matched(absolute: Tensor, share: float) -> float:
-    """Threshold that this share of the values [N] reaches: their (1 - share) quantile."""
+    """Return the threshold that this share of the values [N] reaches: their (1 - share) quantile."""
     return float(np.quantile(absolute.cpu().numpy(), 1.0 - share))

@@ -1,7 +1,8 @@
-"""3DGS with masks of what moves by geometry alone, from the first step on (`--mask motion` elsewhere).
+"""3DGS with masks of what moves, from geometry alone and from the first step on (elsewhere `--mask motion`).
 
-No colour and no feature is compared: a pixel is masked if more photos say of the features around it, and in
-its segment, that they fit another rigid motion than the place's. Where none says anything, it is kept.
+No colour and no appearance is compared. A pixel is masked if more photos show that the features around it,
+and in its segment, follow another rigid motion than the scene than show the opposite. It is kept if no photo
+tells.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from ambiguous_wild.vision.sparse_surface import map_size
 class MotionConfig:
     """Options of `3dgs+motion`."""
 
-    threshold: float = MOVES  # of `moving_map`, above which a pixel is masked
+    threshold: float = MOVES  # value of `moving_map` above which a pixel is masked
     instances: str = "graph"  # back end of segments, see docs/foundation-models.md
 
     def __post_init__(self) -> None:
@@ -39,12 +40,12 @@ class MotionConfig:
 
 
 def build(options: MotionConfig) -> Parts:
-    """3DGS with these masks."""
+    """Return 3DGS with these masks."""
     return Parts(mask=MotionMask(options))
 
 
 class MotionMask(FixedMasks):
-    """The same masks in every step."""
+    """Masks what moves; the masks are the same in every step."""
 
     def __init__(self, config: MotionConfig) -> None:
         super().__init__([])
@@ -69,8 +70,8 @@ class MotionMask(FixedMasks):
             )
         config, self.keeps = self.config, []
         instances = make_instances(config.instances)
-        found = instance_labels(instances, data.photos, names, data.cache_dir)
-        for name, photo, labels, camera in zip(names, data.photos, found.labels, data.cameras, strict=True):
+        segments = instance_labels(instances, data.photos, names, data.cache_dir).labels
+        for name, photo, labels, camera in zip(names, data.photos, segments, data.cameras, strict=True):
             moves = np.zeros(labels.shape, bool)
             if name in points:
                 labels = moving_labels(instances, photo, labels, points[name], data.cache_dir)
@@ -83,6 +84,6 @@ class MotionMask(FixedMasks):
         assert step.view is not None
         photo = (self.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
         masked = self.keeps[step.view].cpu().numpy() < 0.5
-        found = {f"masked {100 * masked.mean():.0f} %": tint(faded(photo), masked, MASKED)}
+        pictures = {f"masked {100 * masked.mean():.0f} %": tint(faded(photo), masked, MASKED)}
         points = self.points.get(self.data.scene.train[step.view].name)
-        return found if points is None else {POINTS: draw_points(photo, points), **found}
+        return pictures if points is None else {POINTS: draw_points(photo, points), **pictures}

@@ -1,6 +1,6 @@
 """`nerfbaselines:METHOD`: a method of NerfBaselines, through its command line in its own environment.
 
-It needs numpy below 2, so it cannot share our environment. Its training runs without its own evaluation,
+NerfBaselines needs numpy below 2, so it cannot share our environment. It trains without its own evaluation,
 which would count as training time; its renders are read from the predictions archive and measured like all
 others. Source: nerfbaselines 1.2.12, `cli/_train.py`, `cli/_render.py`, `evaluation.py`.
 """
@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.archive import Limits, unpack
@@ -23,26 +24,26 @@ from ambiguous_wild.io.files import atomic_dir, write_json
 from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.external_process import DONE, Produced, Task, end_left_over, no_parts, run_logged
 
-PROGRAM = "AW_NERFBASELINES"  # environment variable: path of its command
+PROGRAM = "AW_NERFBASELINES"  # environment variable with the path of its command
 TESTED = "1.2.12"
-LIMITS = Limits(bytes=50_000_000_000)  # of an unpacked predictions archive
+LIMITS = Limits(bytes=50_000_000_000)  # size of an unpacked predictions archive
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of its command line; `--set nerfbaselines-METHOD.KEY=VALUE`."""
+    """Options for the command line of NerfBaselines; `--set nerfbaselines-METHOD.KEY=VALUE`."""
 
     backend: str = ""  # conda, docker, apptainer or python; empty = its own choice
     presets: tuple[str, ...] = ()  # names with commas; none = its own defaults
     overrides: tuple[str, ...] = ()  # KEY=VALUE,KEY=VALUE of the method
-    iterations_key: str = ""  # the method's key for its length: gets --iterations; empty = its own length
-    seed_key: str = ""  # the method's key for its seed; empty = it has none and is not told
+    iterations_key: str = ""  # the method's key for its length, set to --iterations; empty = its own length
+    seed_key: str = ""  # the method's key for its seed; empty = it gets no seed
     evaluate: bool = False  # run its own metrics too, which need torch in its environment
-    timeout_h: float = 0.0  # of each command; 0 = none
+    timeout_h: float = 0.0  # limit of each command; 0 = none
 
 
 def nerfbaselines_entry(method: str) -> MethodEntry:
-    """The entry of a method of NerfBaselines.
+    """Return the entry of a method of NerfBaselines.
 
     Raises:
         AwError: NerfBaselines is not installed (the message says how), or the name is not allowed.
@@ -61,16 +62,16 @@ def nerfbaselines_entry(method: str) -> MethodEntry:
 
 
 def find_program() -> str:
-    """The command `nerfbaselines`, by $AW_NERFBASELINES or on PATH.
+    """Return the path of `nerfbaselines`, from $AW_NERFBASELINES or PATH.
 
     Raises:
         AwError: it is not installed; the message gives the commands.
     """
-    wanted = os.environ.get(PROGRAM, "")
-    found = shutil.which(wanted or "nerfbaselines")
-    if found:
-        return str(Path(found).absolute())
-    where = f"${PROGRAM} is {wanted}, which is no program" if wanted else "NerfBaselines is not here"
+    configured = os.environ.get(PROGRAM, "")
+    path = shutil.which(configured or "nerfbaselines")
+    if path:
+        return str(Path(path).absolute())
+    where = f"${PROGRAM} is {configured}, which is no program" if configured else "NerfBaselines is not here"
     raise AwError(
         f"{where}; it needs an environment of its own (numpy < 2): python3 -m venv ~/nerfbaselines && "
         f"~/nerfbaselines/bin/pip install nerfbaselines=={TESTED} 'numpy<2' && "
@@ -86,7 +87,7 @@ class NerfBaselines:
     program: str
 
     def missing(self, options: Any) -> str:
-        """Its command, where it has gone since it was found."""
+        """Return the path of its command if that is missing now; empty if it is there."""
         return "" if shutil.which(self.program) else self.program
 
     def run(self, task: Task) -> Produced:
@@ -111,7 +112,7 @@ class NerfBaselines:
             steps.run("render", self._render_command(task, checkpoint, archive))
         reported = self._own_metrics(task, archive, steps)
         renders = read_predictions(archive, task.work / "predictions", task.scene)
-        info = _info(checkpoint)
+        info = _json(checkpoint / "nb-info.json")
         return Produced(
             renders=renders,
             cost=_cost(info, steps.seconds),
@@ -134,7 +135,7 @@ class NerfBaselines:
     def _check(self, task: Task) -> None:
         if task.budget_s is not None:
             raise AwError(f"{self.method} of NerfBaselines keeps no --budget: give --iterations instead")
-        loaded, wanted = _factor_it_loads(task.scene), int(task.scene.info.get("loaded_factor") or 1)
+        loaded, wanted = _loaded_factor(task.scene), int(task.scene.info.get("loaded_factor") or 1)
         if loaded != wanted:
             raise AwError(
                 f"NerfBaselines loads {task.scene.root} at factor {loaded} (its nb-info.json), not {wanted}: "
@@ -159,8 +160,8 @@ class NerfBaselines:
         command += ["--data", str(task.scene.root.resolve()), "--output", str(archive.absolute())]
         return [*command, *_backend(task.options)]
 
-    def _own_metrics(self, task: Task, archive: Path, steps: _Steps) -> dict[str, Any] | None:
-        """NerfBaselines' own metrics of the same renders; beside our numbers, never instead of them."""
+    def _own_metrics(self, task: Task, archive: Path, steps: _Steps) -> Facts | None:
+        """Return NerfBaselines' own metrics of the same renders, which are shown beside ours."""
         if not task.options.evaluate:
             return None
         path = task.work / "results.json"
@@ -173,13 +174,13 @@ class NerfBaselines:
 
 
 class _Steps:
-    """The commands of one run, and the seconds of those that are done."""
+    """Runs the commands of a run, and stores the seconds of those that are done."""
 
     def __init__(self, method: NerfBaselines, task: Task) -> None:
         self.method, self.task = method, task
         self.state = task.work / DONE
-        known = _json(self.state) if self.state.is_file() else {}
-        self.seconds = {key: float(value) for key, value in known.items() if isinstance(value, (int, float))}
+        stored = _json(self.state) if self.state.is_file() else {}
+        self.seconds = {key: float(value) for key, value in stored.items() if isinstance(value, (int, float))}
 
     def run(self, step: str, arguments: list[str]) -> None:
         self.seconds[f"{step}_s"] = run_logged(
@@ -212,10 +213,10 @@ def read_predictions(archive: Path, folder: Path, scene: Scene) -> dict[str, Pat
     return {name: by_stem[stem] for name, stem in stems.items()}
 
 
-def _factor_it_loads(scene: Scene) -> int:
+def _loaded_factor(scene: Scene) -> int:
     path = scene.root / "nb-info.json"
     if not path.is_file():
-        return 1  # its COLMAP loader takes images/
+        return 1  # NerfBaselines' COLMAP loader reads images/
     arguments = _json(path).get("loader_kwargs")
     folder = arguments.get("images_path", "images") if isinstance(arguments, dict) else "images"
     tail = str(folder).removeprefix("images").removeprefix("_")
@@ -223,32 +224,28 @@ def _factor_it_loads(scene: Scene) -> int:
 
 
 def _checkpoint(output: Path) -> Path | None:
-    """checkpoint-N of the last complete step: its nb-info.json is written last."""
-    found = [
+    """Return the last complete checkpoint-N; its nb-info.json is written last."""
+    complete = [
         (int(path.name.removeprefix("checkpoint-")), path)
         for path in output.glob("checkpoint-*")
         if path.name.removeprefix("checkpoint-").isdecimal() and (path / "nb-info.json").is_file()
     ]
-    return max(found)[1] if found else None
+    return max(complete)[1] if complete else None
 
 
-def _info(checkpoint: Path) -> dict[str, Any]:
-    return _json(checkpoint / "nb-info.json")
-
-
-def _cost(info: dict[str, Any], seconds: dict[str, float]) -> dict[str, float]:
-    """Training time as NerfBaselines counts it, and the wall time of its commands."""
+def _cost(info: Facts, seconds: dict[str, float]) -> dict[str, float]:
+    """Return the training time that NerfBaselines reports, and the wall time of its commands."""
     cost = {f"{step}_wall_s": seconds[f"{step}_s"] for step in ("train", "render") if f"{step}_s" in seconds}
     train_s = info.get("total_train_time", seconds.get("train_s"))
     used = info.get("resources_utilization")
     used = used if isinstance(used, dict) else {}
-    known = {
+    reported = {
         "train_s": train_s,
         "iterations": info.get("num_iterations"),
         "peak_rss_mb": used.get("memory"),
         "peak_gpu_mb": used.get("gpu_memory"),
     }
-    cost |= {key: value for key, value in known.items() if isinstance(value, (int, float))}
+    cost |= {key: value for key, value in reported.items() if isinstance(value, (int, float))}
     if cost.get("iterations") and "train_s" in cost:
         cost["ms_per_iteration"] = 1e3 * cost["train_s"] / cost["iterations"]
     return cost
@@ -258,7 +255,7 @@ def _backend(options: Any) -> list[str]:
     return ["--backend", options.backend] if options.backend else []
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _json(path: Path) -> Facts:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:

@@ -1,13 +1,15 @@
-"""NexusSplats on plain Gaussians: uncertainty is drawn like a colour, light is a code beside each Gaussian.
+"""NexusSplats on plain Gaussians: uncertainty is drawn like a colour, and each Gaussian has a code of its
+light.
 
 Source: arXiv 2411.14514 and juliantang324/NexusSplats; which of its settings the tables used is unverified.
-LEFT OUT: anchors, so each Gaussian has codes of its own and 3DGS's growth, without opacity resets. Ours too:
-features (Lab and HOG for DINOv2's, option `features`) with a distance in units of what blur alone makes;
+LEFT OUT: anchors, so each Gaussian has its own codes, and growth is 3DGS's without opacity resets. Ours:
+features (Lab and HOG for DINOv2's, option `features`) with a distance in units of what blur alone causes;
 toned colours are colour + 2 sigmoid(net) - 1; D-SSIM is of the toned picture; growth reads the photometric
 gradient alone; the uncertainty moves no Gaussians (option `through_geometry`) and is at least 0.1 (the
-release: weights are at most 3); nets are narrower, for they run on each Gaussian, not on each tenth; rates of
-nets and of codes of photos rise in runs below 30 000 iterations.
-Cost: a second picture a step and the features of the render.
+release: weights are at most 3); nets are narrower, because they run on each Gaussian, not on every tenth;
+rates of nets and of codes of photos are higher in runs below 30 000 iterations.
+
+Cost: a second picture in each step and the features of the render.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform
 from ambiguous_wild.methods.wildgaussians import FeatureDistance, fourier
 from ambiguous_wild.splat.backend import backend_of
@@ -30,15 +32,15 @@ from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_
 from ambiguous_wild.splat.effects.placing import directions, in_picture
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import Parts, State
+from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 from ambiguous_wild.vision.backends import check_features
 
-CODE, SHIFT = 32, 4.0  # of photos and of doubts; added to what is drawn, for the renderer clamps at 0
+CODE, SHIFT = 32, 4.0  # length of codes; offset of the drawn uncertainty, because the renderer clamps at 0
 LEAST = 0.1  # smallest sigma
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
-COLOURING = ("nexussplats", "exposure", "appearance")  # effects that an uncertainty does not go through
+COLOURING = ("nexussplats", "exposure", "appearance")  # effects that are not applied to the uncertainty
 
 
 @dataclass(frozen=True)
@@ -51,17 +53,18 @@ class NexusSplatsConfig:
     mask_start: float = 2000.0
     min_mask_start: int = 300  # iterations: earlier renders show too little
     boundary: bool = False  # photo collections: the lower middle of a picture is masked more easily
-    normal_units: float = 80.0  # of hand-made features: distance, in units of blur, that is 1
-    prior: float = 0.5  # times the mean ln sigma
-    volume: float = 0.01  # times the mean volume of a Gaussian
-    # whether the loss of the uncertainty also moves Gaussians, as published for anchors. Without anchors that
+    normal_units: float = 80.0  # hand-made features: the distance, in units of blur, that counts as 1
+    prior: float = 0.5  # weight of the mean ln sigma
+    volume: float = 0.01  # weight of the mean volume of a Gaussian
+    # whether the loss of the uncertainty also moves Gaussians, as published with anchors. Without anchors it
     # costs 4 dB on a courtyard (21.2 against 25.3)
     through_geometry: bool = False
     light_width: int = 64  # published 256, for ten Gaussians at once
     doubt_width: int = 64  # published 128, likewise
     dropout: float = 0.2
-    lr_code: float = 1e-3  # of photos and doubts; of photos and of nets more in runs below 30 000 iterations
-    lr_light: float = 5e-3  # of a Gaussian's light
+    # codes of photos and doubts; runs below 30 000 iterations have higher rates of photos and nets
+    lr_code: float = 1e-3
+    lr_light: float = 5e-3  # rate of a Gaussian's light
     lr_net: float = 5e-4
 
     def __post_init__(self) -> None:
@@ -73,14 +76,14 @@ class NexusSplatsConfig:
 
 
 def build(options: NexusSplatsConfig) -> Parts:
-    """Colours and uncertainty of codes; the rest of the loop is 3DGS without resets."""
+    """Return 3DGS without resets, with colours and uncertainty from codes."""
     codes = Codes(options)
     control = type("NexusDensity", (SmallVolumes,), {"weight": options.volume})
     return Parts(Doubt(codes), control, options.density, effects=(codes,))
 
 
 class Codes(Learnt):
-    """What photos and Gaussians carry, and both nets."""
+    """The codes of photos and Gaussians, and both nets."""
 
     name = "nexussplats"
 
@@ -120,7 +123,7 @@ class Codes(Learnt):
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         photo = leaf["light"].expand(len(visible.base), CODE)
         towards = directions(visible.means.detach(), shot.camera)
-        inputs = torch.cat([visible.base, visible.extra["nexus_light"], photo, towards], dim=1)
+        inputs = torch.cat([visible.base, visible.attributes["nexus_light"], photo, towards], dim=1)
         if shot.view is not None and self.config.dropout:
             kept = hashed_uniform(inputs.numel(), (self.seed, shot.iteration), inputs.device)
             kept = (kept >= self.config.dropout).reshape(inputs.shape) / (1.0 - self.config.dropout)
@@ -128,13 +131,13 @@ class Codes(Learnt):
         return visible.base + 2.0 * torch.sigmoid(mlp(inputs, leaf, "toned")) - 1.0
 
     def doubts(self, codes: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
-        """[M] raw uncertainty of Gaussians with these codes [M, 32] in the photo of the leaves."""
+        """Return the raw uncertainty [M] of Gaussians with these codes [M, 32] in the photo of the leaves."""
         photo = leaf["transient"].expand(len(codes), CODE)
         return mlp(torch.cat([codes, photo], dim=1), leaf, "doubt")[:, 0]
 
 
 class Doubt(WarmUpMask):
-    """Static where the drawn uncertainty leaves features of photo and render a weight above 1."""
+    """Keeps pixels where the drawn uncertainty gives a weight above 1."""
 
     config: NexusSplatsConfig
 
@@ -144,7 +147,7 @@ class Doubt(WarmUpMask):
         self.codes, self.config = codes, codes.config
         self.distance = FeatureDistance(self.config.features, self.config.normal_units)
         self.shares = MaskedShares()
-        self.pending: Gradients | None = None  # of the step under way
+        self.pending: Gradients | None = None  # gradients of the current step, until `gradients` returns them
 
     def required_effect(self) -> Codes:
         return self.codes
@@ -162,24 +165,24 @@ class Doubt(WarmUpMask):
         return keep
 
     def gradients(self, step: Step, keep: Tensor | None) -> Gradients | None:
-        found, self.pending = self.pending, None
-        return found
+        gradients, self.pending = self.pending, None
+        return gradients
 
     def predict(self, step: Step) -> Tensor | None:
         return kept(self._weight(step, learn=False)[0]) if self.begun(step) else None
 
     def _weight(self, step: Step, learn: bool) -> tuple[Tensor, Gradients | None]:
-        """w = 1 / (2 sigma^2) [H, W], sigma = softplus of what is drawn, and gradients of its loss."""
+        """Return w = 1 / (2 sigma^2) [H, W] of the drawn uncertainty, and gradients of its loss."""
         g, seen = step.gaussians, self._seen(step)
         with torch.set_grad_enabled(learn):
             leaf = {name: value.requires_grad_(learn) for name, value in self.codes._leaf(step).items()}
-            codes = g.extra["nexus_doubt"][seen].detach().requires_grad_(learn)
+            codes = g.attributes["nexus_doubt"][seen].detach().requires_grad_(learn)
             doubts = self.codes.doubts(codes, leaf)
         drawn = step.draw(gaussians=as_colour(g, seen, doubts.detach()), without=COLOURING)
         with torch.set_grad_enabled(learn):
             raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).detach().requires_grad_(learn)
-            # with a ceiling on w instead, the distance no longer pulls where w reached it, and sigma falls
-            # without end
+            # with an upper limit of w instead, the distance has no gradient where w reaches it, and sigma
+            # falls without end
             sigma = LEAST + F.softplus(raw)
             weight = 0.5 / sigma.square()
         judged = weight.detach()
@@ -194,25 +197,26 @@ class Doubt(WarmUpMask):
         back = drawn.backward(Cotangents(image=image, alpha=-SHIFT * d_raw))
         inputs = [codes, *leaf.values()]
         with torch.enable_grad():
-            found = torch.autograd.grad(doubts, inputs, back.sh0[seen, 0] / SH_C0, allow_unused=True)
-        d_codes = torch.zeros_like(g.extra["nexus_doubt"])
-        d_codes[seen] = found[0]
-        own = {name: d for name, d in zip(leaf, found[1:]) if d is not None}
+            d_inputs = torch.autograd.grad(doubts, inputs, back.sh0[seen, 0] / SH_C0, allow_unused=True)
+        d_codes = torch.zeros_like(g.attributes["nexus_doubt"])
+        d_codes[seen] = d_inputs[0]
+        own = {name: d for name, d in zip(leaf, d_inputs[1:]) if d is not None}
         if not self.config.through_geometry:
-            still: dict[str, Any] = {k: torch.zeros_like(getattr(back, k)) for k in GEOMETRY}
-            back = replace(back, **still)
+            zeros = [torch.zeros_like(getattr(back, name)) for name in GEOMETRY]
+            back = replace(back, means=zeros[0], quats=zeros[1], log_scales=zeros[2], opacity_logits=zeros[3])
         gradients = replace(
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
-            screen=torch.zeros_like(back.screen), extra={"nexus_doubt": d_codes}, own={self.codes.name: own},
+            screen=torch.zeros_like(back.screen), attributes={"nexus_doubt": d_codes},
+            own={self.codes.name: own},
         )  # fmt: skip
         return judged, gradients
 
     def _seen(self, step: Step) -> Any:
-        """Rows that may be in the picture, see `Backend.rows`."""
+        """Return the rows that may be in the picture, see `Backend.rows`."""
         g = step.gaussians
         return backend_of(g.device).rows(lambda: in_picture(g.means, step.camera, margin=0.5))
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"masked_share": self.shares.mean(), "features": self.distance.name}
 
     def state_dict(self) -> State:
@@ -223,27 +227,27 @@ class Doubt(WarmUpMask):
 
 
 def kept(weight: Tensor) -> Tensor:
-    """Where the weight is above 1; a photo without such a pixel is kept whole, or it would teach nothing."""
+    """Keep pixels with a weight above 1; a photo without such a pixel is kept whole, or nothing is learnt."""
     static = weight > 1.0
     return torch.where(static.any(), static, True).float()
 
 
 def as_colour(gaussians: Gaussians, rows: Any, values: Tensor) -> Gaussians:
-    """The Gaussians with value + `SHIFT` as the colour of `rows`, and none of their harmonics."""
+    """Return the Gaussians with value + `SHIFT` as the colour of `rows`, without harmonics."""
     colours = torch.full_like(gaussians.sh0, (SHIFT - 0.5) / SH_C0)
     colours[rows] += values[:, None] / SH_C0
-    return replace(gaussians, sh0=colours, sh_rest=gaussians.sh_rest[:, :0], extra={})
+    return replace(gaussians, sh0=colours, sh_rest=gaussians.sh_rest[:, :0], attributes={})
 
 
 def boundary(height: int, width: int, like: Tensor) -> Tensor:
-    """G [H, W] = exp(-((r - 0.5)^2 / (2 0.5^2) + c^2 / (2 0.8^2))) at rows and columns from -1 to 1."""
+    """Return G [H, W] = exp(-((r - 0.5)^2 / (2 0.5^2) + c^2 / (2 0.8^2))) at rows, columns in [-1, 1]."""
     r = torch.linspace(-1, 1, height, device=like.device)[:, None]
     c = torch.linspace(-1, 1, width, device=like.device)[None, :]
     return torch.exp(-((r - 0.5) ** 2 / 0.5 + c**2 / 1.28))
 
 
 class SmallVolumes(DensityControl):
-    """3DGS's, with a loss of `weight` times the mean volume: the product of the three scales."""
+    """Density control of 3DGS, with a loss of `weight` times the mean volume (product of the scales)."""
 
     weight = 0.0
 

@@ -1,21 +1,20 @@
-"""PUP 3D-GS: removes Gaussians that can move or change size without changing a picture, then refines.
-Source: PUP 3D-GS (CVPR 2025) and its code: the score is log det of the 6x6 Gauss-Newton block of mean and log
-scale over all train views. Ours: the block from random signs (Hutchinson; rank correlation not measured),
-growth ends after a third of the run, 80 % go in equal rounds (that code: 80 %, then 50 %), and rates do not
-fall by a further 5 % every 400 iterations of refining.
+"""PUP 3D-GS: removes Gaussians that can move or change size without changing a picture, then refines. Source:
+PUP 3D-GS (CVPR 2025) and its code: the score is log det of the 6x6 Gauss-Newton block of mean and log
+scale over all train views. Ours: the block is estimated from random signs (Hutchinson; rank correlation
+not measured), growth ends after a third of the run, 80 % are removed in equal rounds (released: 80 %, then
+50 %), and rates do not fall by a further 5 % every 400 iterations of refining.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -29,11 +28,11 @@ class PupConfig(DensityConfig):
     """3DGS's density control, and rounds of pruning; times in nominal iterations (of 30 000)."""
 
     stop: float = 10_000.0
-    prune_at: float = 10_000.0  # the first round
+    prune_at: float = 10_000.0  # time of the first round
     rounds: int = 4
-    between: float = 3000.0  # rounds
-    share: float = 0.8  # of the Gaussians that all rounds remove
-    signs: int = 8  # random sign pictures a view, at the photos' size over `divisor`
+    between: float = 3000.0  # time between rounds
+    share: float = 0.8  # share of the Gaussians that all rounds together remove
+    signs: int = 8  # pictures of random signs for each view, at 1/`divisor` of the photos' size
     divisor: int = 4
 
     def __post_init__(self) -> None:
@@ -49,25 +48,25 @@ class PupConfig(DensityConfig):
 
 
 def build(options: PupConfig) -> Parts:
-    """3DGS whose density control prunes after growth."""
+    """Return 3DGS whose density control prunes after growth."""
     return Parts(density=PupDensity, density_config=options)
 
 
 def log_det(blocks: Tensor) -> Tensor:
-    """[N] score of blocks [N, 6, 6] float64; 1e-12 on the diagonal keeps what no view sees finite."""
+    """Return the score [N] of blocks [N, 6, 6] float64; 1e-12 on the diagonal keeps unseen ones finite."""
     return torch.linalg.slogdet(blocks + 1e-12 * torch.eye(6).to(blocks))[1]
 
 
 def removed(score: Tensor, share: float) -> Tensor:
-    """[N] bool: all up to the score at index int(share (N - 1)), with ties, as in the released code."""
+    """Return rows up to the score at index int(share (N - 1)), with ties, as the released code, [N] bool."""
     return score <= score.sort().values[int(share * (len(score) - 1))]
 
 
 class PupDensity(DensityControl):
-    """Growth as in 3DGS; the sensitivity of all train views decides who is removed."""
+    """Grows as 3DGS; then the sensitivity of all train views decides which Gaussians are removed."""
 
     config: PupConfig
-    done = 0  # rounds
+    done = 0  # number of rounds that are done
 
     def setup(self, data: TrainData) -> None:
         self.cameras = [shrink_camera(camera, self.config.divisor) for camera in data.cameras]
@@ -82,9 +81,9 @@ class PupDensity(DensityControl):
         share = 1.0 - (1.0 - config.share) ** (1.0 / config.rounds)
         score = log_det(self.blocks(step, gaussians))
         drop = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
-        free = self.mutable_rows(~drop, gaussians)
-        if bool(free.any()):
-            drop[free] = removed(score[free], share)  # the share is of those that may be removed
+        mutable = self.mutable_rows(~drop, gaussians)
+        if bool(mutable.any()):
+            drop[mutable] = removed(score[mutable], share)  # a share of those that may be removed
         if self.leaves_only_protected(drop, gaussians):
             return gaussians, events
         optimiser.flush()
@@ -101,7 +100,7 @@ class PupDensity(DensityControl):
         return self.done < config.rounds and step.nominal >= config.prune_at + self.done * config.between
 
     def blocks(self, step: Step, gaussians: Gaussians) -> Tensor:
-        """[N, 6, 6] float64: sum over views of the mean g g^T, g = d(sum(signs picture))/d(mean, log s)."""
+        """Sum the mean g g^T over views, g = d(sum(signs picture))/d(mean, log s), [N, 6, 6] float64."""
         total = torch.zeros(len(gaussians), 6, 6, dtype=torch.float64, device=gaussians.device)
         for camera in self.cameras:
             rendered = step.draw(camera)
@@ -112,9 +111,9 @@ class PupDensity(DensityControl):
                 total += both[:, :, None] * both[:, None, :] / self.config.signs
         return total
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return super().state_dict() | {"pruning_rounds": self.done}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         super().load_state_dict(state)
         self.done = state["pruning_rounds"]

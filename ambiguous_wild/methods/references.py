@@ -1,10 +1,8 @@
 """Methods named by their location: a recipe in a file, a program's description, NerfBaselines.
 
-recipe.py:my_recipe     a function, or a MethodEntry, in a Python file
-external:my.yaml        a program with commands of its own, see external/description.py
-nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see external/nerfbaselines.py
-
-A Python file of the user's, loaded as a module: plugins and recipes in files.
+recipe.py:my_recipe     a function, or a MethodEntry, in a Python file, which is loaded as a module
+external:my.yaml        a program with commands of its own, see external.py
+nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see nerfbaselines.py
 """
 
 from __future__ import annotations
@@ -24,14 +22,14 @@ from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.methods.entry import MethodEntry
 
-_loaded: set[str] = set()  # paths as tracebacks have them
+_loaded: set[str] = set()  # paths of loaded files, as in tracebacks
 
 
 def import_file(path: Path) -> ModuleType:
-    """The module of a Python file, run anew.
+    """Run a Python file; returns its module.
 
     Raises:
-        AwError: no such file, no Python file, or it fails when it is loaded; names the line.
+        AwError: no such file, no Python file, or it fails when it is loaded; the message names the line.
     """
     if not path.is_file():
         raise AwError(f"no plugin file {path}: give the path of a .py file")
@@ -55,7 +53,7 @@ def import_file(path: Path) -> ModuleType:
 
 
 def place_of(error: BaseException) -> str:
-    """Such as " (my_method.py, line 7)": where the error last was in a loaded file; empty if in none."""
+    """Return the last place of an error in a loaded file, such as " (my_method.py, line 7)"; else ""."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _loaded]
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
@@ -65,7 +63,7 @@ _RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
 
 def is_reference(name: str) -> bool:
-    """Whether the name is such a reference."""
+    """Whether the name is a reference."""
     return is_program(name) or _RECIPE.fullmatch(name) is not None
 
 
@@ -75,7 +73,7 @@ def is_program(name: str) -> bool:
 
 
 def reference_file(name: str) -> Path | None:
-    """The file that a reference names; None if it names none."""
+    """Return the file that a reference names; None if it names no file."""
     if name.startswith(EXTERNAL):
         return Path(name.removeprefix(EXTERNAL))
     match = None if name.startswith(NERFBASELINES) else _RECIPE.fullmatch(name)
@@ -83,24 +81,24 @@ def reference_file(name: str) -> Path | None:
 
 
 def with_file(name: str, path: Path) -> str:
-    """The same reference with another path of the file."""
+    """Return the reference with another path of its file."""
     if name.startswith(EXTERNAL):
         return f"{EXTERNAL}{path}"
     return f"{path}:{name.rpartition(':')[2]}"
 
 
 def absolute(name: str) -> str:
-    """The same reference with an absolute path."""
+    """Return the reference with an absolute path."""
     path = reference_file(name)
     return name if path is None else with_file(name, path.resolve())
 
 
 def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
-    """The method behind a reference; `registry.load_reference` also registers it.
+    """Return the method of a reference; `registry.load_reference` also registers it.
 
     Args:
         name: the reference.
-        given_as: what was typed, if `name` refers to a copy of that file.
+        given_as: the reference that was typed, if `name` refers to a copy of that file.
 
     Raises:
         AwError: no such file, or no recipe in it.
@@ -119,30 +117,30 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
 
 
 def _recipe(name: str) -> MethodEntry:
-    """A MethodEntry of the file, or one made of a function that returns `Parts`."""
+    """Return a MethodEntry of the file, or make one of a function that returns `Parts`."""
     path_text, _, attribute = name.rpartition(":")
     path = Path(path_text)
     module = import_file(path)
-    found = getattr(module, attribute, None)
-    if found is None:
+    target = getattr(module, attribute, None)
+    if target is None:
         raise unknown(f"recipe in {path}", attribute, _recipes(module))
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    if isinstance(found, MethodEntry):
-        return dataclasses.replace(found, source_hash=digest)
-    if not inspect.isfunction(found):
+    if isinstance(target, MethodEntry):
+        return dataclasses.replace(target, source_hash=digest)
+    if not inspect.isfunction(target):
         raise AwError(
-            f"{name} is a {type(found).__name__}: it must be a function that returns Parts, or a MethodEntry"
+            f"{name} is a {type(target).__name__}: it must be a function that returns Parts, or a MethodEntry"
         )
-    config = _config_of(found, name)
-    recipe = found if config is not None else lambda options: found()
-    summary = (inspect.getdoc(found) or f"{attribute} of {path.name}").splitlines()[0]
+    config = _config_of(target, name)
+    recipe = target if config is not None else lambda options: target()
+    summary = (inspect.getdoc(target) or f"{attribute} of {path.name}").splitlines()[0]
     return MethodEntry(
         check_name("method name", attribute), summary, recipe, config=config, source_hash=digest
     )
 
 
 def without_recipe(path: Path) -> AwError:
-    """The error for a file without the name of a recipe; it gives the names."""
+    """Return the error for a file without the name of a recipe; its message lists the names."""
     if not path.is_file():
         return AwError(f"no file {path}: write FILE.py:RECIPE, or a name of 'aw methods'")
     names = _recipes(import_file(path))
@@ -154,7 +152,7 @@ def without_recipe(path: Path) -> AwError:
 
 
 def _recipes(module: ModuleType) -> list[str]:
-    """Names of the entries and of the functions that the file itself defines; some may be helpers."""
+    """Return the names of entries and functions that the file defines; some may be helpers."""
     own = {
         key: value
         for key, value in vars(module).items()
@@ -170,7 +168,7 @@ def _recipes(module: ModuleType) -> list[str]:
 
 
 def _config_of(recipe: typing.Callable[..., object], name: str) -> type | None:
-    """The frozen dataclass that the function takes; None if it takes nothing."""
+    """Return the frozen dataclass that the function takes; None if it takes nothing."""
     required = [p for p in inspect.signature(recipe).parameters.values() if p.default is p.empty]
     if not required:
         return None

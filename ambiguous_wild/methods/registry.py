@@ -1,6 +1,6 @@
 """Finds methods by name. Listing them imports neither torch nor any method's code.
 
-A method of one's own is found in four ways: `register(...)`, the entry-point group
+A user's method is found in four ways: `register(...)`, the entry-point group
 `ambiguous_wild.methods`, a file given as `--plugin my_method.py`, or a reference to a recipe in a file,
 `--method my_method.py:my_recipe` (see docs/extend.md).
 """
@@ -52,12 +52,13 @@ def all_methods() -> dict[str, MethodEntry]:
 
 
 def get_method(name: str) -> MethodEntry:
-    """The method of that name, in capitals or not; "host@mask=donor" is a graft, see graft.py, and
-    "recipe.py:my_recipe", "external:FILE" and "nerfbaselines:METHOD" are references, see references.py;
-    "NAME+2passes" trains twice, see second_pass.py.
+    """Return the method of this name, in any case of letters.
+
+    "host@mask=donor" is a graft, see graft.py. "recipe.py:my_recipe", "external:FILE" and
+    "nerfbaselines:METHOD" are references, see references.py. "NAME+2passes" trains twice, see second_pass.py.
 
     Raises:
-        AwError: there is none; names the nearest.
+        AwError: the name is unknown; the message suggests the nearest.
     """
     once = trained_once(name)
     if once != name:
@@ -83,18 +84,18 @@ def get_method(name: str) -> MethodEntry:
 
 
 def load_reference(name: str, *, given_as: str = "") -> MethodEntry:
-    """The method behind a reference; registered, so that its name alone finds it from now on.
+    """Return the method of a reference, and register it, so that its name alone finds it from now on.
 
     Args:
         name: the reference.
-        given_as: what was typed, if `name` refers to a copy of that file.
+        given_as: the reference that was typed, if `name` refers to a copy of that file.
 
     Raises:
         AwError: no such file, no recipe in it, or another method has its name.
     """
     entry = read_reference(name, given_as=given_as)
-    known = all_methods().get(entry.name)
-    if known is not None and known.source_hash != entry.source_hash and known.given_as != entry.given_as:
+    other = all_methods().get(entry.name)
+    if other is not None and other.source_hash != entry.source_hash and other.given_as != entry.given_as:
         raise AwError(f"{name} is called {entry.name!r}, and so is another method: give it another name")
     return register(entry)
 

@@ -1,23 +1,19 @@
-"""RobustSplat as a recipe of parts.
+"""RobustSplat: growth waits until masks are stable, and a net on frozen features makes the masks.
 
 Source: "RobustSplat: Decoupling Densification and Dynamics for Transient-Free 3DGS", ICCV 2025 (arXiv
-2506.02751) and its released code. Densification and opacity resets wait until the static scene and the
-masks are stable; a per-pixel net on frozen features learns from the agreement of photos with renders,
-first at a low scale.
+2506.02751) and its released code. Densification and opacity resets wait until the static scene and the masks
+are stable; a per-pixel net on frozen features learns from the agreement of photos and renders, first at a low
+scale.
 
 The published form is `features=dinov2-small-registers@504,normalise=raw`, the default where its weights are;
-else EfficientNet-Lite0, else hand-made features (Lab and HOG). Settings that change with that are "auto" in
-`config.py`.
-
-RobustSplat's mask policy: a net on frozen features, taught coarse to fine from agreement with renders.
-
-Every hyper-parameter of RobustSplat in one place; values without a comment are the authors'.
+else EfficientNet-Lite0, else hand-made features (Lab and HOG). Settings that depend on the features are
+"auto". Values without a comment are the authors'.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods import masking_common
 from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, load_adam_state
@@ -32,20 +29,20 @@ from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, ups
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
-from ambiguous_wild.splat.parts import Parts, Schedule, State
+from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import BY_MACHINE, DINO, check_features, first_here, make_features, parse
 from ambiguous_wild.vision.precompute import photo_features
 from ambiguous_wild.vision.protocols import Features, SceneFeatures
 
-_SIZES = dict.fromkeys((*DINO, "vgg16"), 252)  # px of a net's input without "@"; others take the photo's size
+_SIZES = dict.fromkeys((*DINO, "vgg16"), 252)  # px, input of nets without "@"; others take the photo's size
 PUBLISHED = "dinov2-small-registers@504,normalise=raw"
 
 
 def features() -> str:
-    """The published features where their weights are on this machine, else EfficientNet-Lite0, else `labhog`.
+    """Return the published features if their weights are here, else EfficientNet-Lite0, else `labhog`.
 
-    Of those that need no hub EfficientNet-Lite0 alone falls below 3DGS on no capture (docs/fidelity.md).
+    Of the others EfficientNet-Lite0 alone is below 3DGS on no capture (docs/fidelity.md).
     """
     return first_here(PUBLISHED, "efficientnet-lite0", "labhog")
 
@@ -60,26 +57,24 @@ def _delayed_growth() -> DensityConfig:
 class RobustSplatConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run.
 
-    "auto" and None are the published form with DINO's features, and with all others, whose cells see a small
-    part of the photo and whose cosines have other scales, what was tuned with `labhog` on
+    "auto" and None stand for the published values with DINO's features. Cells of other features see a small
+    part of the photo, and their cosines have other scales: for these the values were tuned with `labhog` on
     two simulated captures that are not reported (240x135, 2000 iterations, 10 900 Gaussians). Distractors in
     the background's colours: 26.3 dB and IoU 0.41 with features of the cell alone, 29.1 dB and 0.62 with
     wider context and a wider net, both at lr 0.003; twins of static things: 29.5 dB and 0.68 with the latter.
     """
 
     features: str = field(default_factory=features, metadata=BY_MACHINE)  # see vision/backends.py
-    coarse_features: str = ""  # of the coarse stage; "" = the same kind at 16/36 of the size, as published
-    coarse_share: float = 16 / 36  # of the side of the pictures that coarse features see
-    # what the cosine target is made of: the cosine; its distance in units of what blur makes; or in units of
-    # the distance that a share `lower` of all cells lately stayed below
+    coarse_features: str = ""  # for the coarse stage; "" = the same kind at 16/36 of the size, as published
+    coarse_share: float = 16 / 36  # side of the pictures for coarse features, as a share of the photo's
+    # source of the cosine target: the cosine; its distance in units of what blur alone causes; or in units of
+    # the distance that a share `lower` of all cells had lately
     cosine: Literal["auto", "calibrated", "plain", "relative"] = "auto"
-    reach: float = 3.0  # of those units, where the relative target is 0
-    normal_units: float = (
-        10.0  # of distance, where the calibrated cosine is 0; the target is 0 from half of it on
-    )
-    inputs: Literal["auto", "standardised", "raw"] = "auto"  # of the net
-    # cells over which local features are averaged and put beside the cell's own: a token of DINO sees the
-    # whole photo, a cell of labhog 20 px
+    reach: float = 3.0  # distance in those units at which the relative target is 0
+    normal_units: float = 10.0  # distance where the calibrated cosine is 0; from half of it the target is 0
+    inputs: Literal["auto", "standardised", "raw"] = "auto"  # inputs of the net
+    # sides in cells of boxes whose mean features the net also gets: a token of DINO sees the whole photo, a
+    # cell of labhog 20 px
     context: tuple[int, ...] | None = None  # None: 5,15 with local features; DINO never takes any
     hidden: int | None = None  # None: 16, published; 64 with local features
     lr: float | None = None  # None: 0.001, published; 0.003 with local features
@@ -89,19 +84,19 @@ class RobustSplatConfig:
     mask_start: float = 500.0
     min_mask_start: int = 300  # earlier renders show too little
     bootstrap: float = 20_000.0  # coarse supervision before, fine after
-    coarse_divisor: int = 4  # of the render's side for the coarse residual
-    coarse_render: Literal["render", "shrink"] = "render"  # a render of its own, or the full one shrunk
+    coarse_divisor: int = 4  # the coarse residual is at 1/4 of the render's side
+    coarse_render: Literal["render", "shrink"] = "render"  # draw a small render, or shrink the full one
     lower: float = 0.6  # share of residuals that are surely static
-    upper: float = 0.8  # share that may be static
-    decay: float = 0.95  # of the running histogram
+    upper: float = 0.8  # share of residuals that may be static
+    decay: float = 0.95  # decay of the running histogram in each step
     bins: int = 10_000
     beta: float = 2000.0  # decay of the pull towards "all static"
     lambda_pull: float = 2.0
     lambda_cosine: float = 0.5
     lambda_residual: float = 0.5
-    threshold: float = 0.25  # kept above
+    threshold: float = 0.25  # pixels above are kept
     erosion: int = 7  # px, side of the min-pool
-    reset_pause: float = 300.0  # the net does not learn for so long after an opacity reset
+    reset_pause: float = 300.0  # time after an opacity reset in which the net does not learn
     min_reset_pause: int = 200
 
     def __post_init__(self) -> None:
@@ -127,7 +122,7 @@ class RobustSplatConfig:
 
     @property
     def net_context(self) -> tuple[int, ...]:
-        """Sides in cells of the boxes whose means the net sees beside a cell's own features."""
+        """Sides in cells of the boxes whose mean features the net also gets."""
         if not self.local:
             return ()
         return (5, 15) if self.context is None else self.context
@@ -149,10 +144,10 @@ class RobustSplatConfig:
 
     @property
     def coarse_size(self) -> int | None:
-        """Longer side in px of the coarse net's input; None: the features follow the size of the picture."""
-        found = parse(self.features)
-        size = _SIZES.get(found.name, 0) if found.size is None else found.size
-        if found.size == 0 or not size:
+        """Longer side in px of the coarse net's input; None: it follows the size of the picture."""
+        spec = parse(self.features)
+        size = _SIZES.get(spec.name, 0) if spec.size is None else spec.size
+        if spec.size == 0 or not size:
             return None
         return round(size * self.coarse_share)
 
@@ -167,12 +162,12 @@ class RobustSplatMask(PausingMask):
         self.fine: Features = make_features(config.features)
         self.coarse: Features = make_features(config.coarse_features or coarse_spec(config))
         self.histogram = torch.zeros(config.bins, dtype=torch.float64)
-        # roots of feature distances, coarse and fine; where the cosine target is relative
+        # histograms of the roots of feature distances, coarse and fine, for a relative cosine target
         self.distances = [torch.zeros_like(self.histogram) for _ in range(2)]
         self.shares = MaskedShares()
-        self.loss_sum: float | Tensor = 0.0  # of the mask loss
+        self.loss_sum: float | Tensor = 0.0  # sum of mask losses
         self.loss_count = 0.0
-        self._coarse_cameras: dict[int, tuple[Camera, Camera]] = {}  # view: a step's, and its coarse one
+        self._coarse_cameras: dict[int, tuple[Camera, Camera]] = {}  # view -> its camera in both sizes
 
     def setup(self, data: TrainData) -> None:
         self.data = data
@@ -198,7 +193,7 @@ class RobustSplatMask(PausingMask):
                 loss = self._loss(mask, step)
                 self.optimiser.zero_grad(set_to_none=True)
                 loss.backward()
-            keep = self._cut(mask.detach())  # of the net before this step, as the authors have it
+            keep = self._cut(mask.detach())  # from the net before this step, as in the authors' code
             self.optimiser.step()
             self.loss_sum = self.loss_sum + backend_of(loss.device).number(loss)
             self.loss_count += 1
@@ -208,7 +203,7 @@ class RobustSplatMask(PausingMask):
     def predict(self, step: Step) -> Tensor | None:
         return self._cut(self._map(step)) if self.begun(step) else None
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {
             "masked_share": self.shares.mean(),
             "mask_loss_mean": float(self.loss_sum) / self.loss_count if self.loss_count else None,
@@ -231,7 +226,7 @@ class RobustSplatMask(PausingMask):
     # -- the net ----------------------------------------------------------------------------------
 
     def _map(self, step: Step) -> Tensor:
-        """M [H, W] in (0, 1) at the step's resolution; differentiable where gradients are enabled."""
+        """Return M [H, W] in (0, 1) at the step's resolution; differentiable if gradients are enabled."""
         height, width = step.photo.shape[:2]
         if torch.is_grad_enabled():
             return self.net(self.inputs[step.view], height, width)
@@ -260,7 +255,7 @@ class RobustSplatMask(PausingMask):
     # -- supervision ------------------------------------------------------------------------------
 
     def _target(self, step: Step, *, learning: bool = False) -> Tensor:
-        """T_cos [H, W] of the render, coarse before the switch and fine after."""
+        """Return T_cos [H, W] of the render, coarse before the switch and fine after."""
         early = step.nominal < self.config.bootstrap
         features, phi = (self.coarse, self.phi_coarse) if early else (self.fine, self.phi)
         full = self.data.cameras[step.view]  # not the photo, which may not be on the device
@@ -276,9 +271,9 @@ class RobustSplatMask(PausingMask):
         return masking_common.resized(target, *step.photo.shape[:2])
 
     def _relative_target(self, cosine: Tensor, stage: int, learning: bool) -> Tensor:
-        """Against what the renders of this stage lately lacked."""
+        """Return the target relative to the distances that renders of this stage lately had."""
         distance = 0.5 * (1.0 - cosine).clamp(0.0, 2.0)
-        # counted by the root, or small distances would share a bin
+        # the histogram is of roots, or small distances would share a bin
         counts = masking_common.update_histogram(self.distances[stage], distance.sqrt(), self.config.decay)
         if learning:
             self.distances[stage] = counts
@@ -286,7 +281,7 @@ class RobustSplatMask(PausingMask):
         return masking_common.relative_target(distance, usual, self.config.reach)
 
     def _bounds(self, step: Step) -> tuple[Tensor, Tensor]:
-        """Lower and upper bound [H, W]; this step's residuals enter the running histogram first."""
+        """Return the bounds [H, W], after adding this step's residuals to the running histogram."""
         config = self.config
         if step.nominal < config.bootstrap:
             e = masking_common.residual(shrink(step.photo, config.coarse_divisor), self._coarse_render(step))
@@ -303,19 +298,19 @@ class RobustSplatMask(PausingMask):
         return lower, upper
 
     def _coarse_render(self, step: Step) -> Tensor:
-        """The scene at a quarter of the size. Its camera sees what the step's sees, so the optimiser has
-        brought every row it needs up to date; there is no backward pass."""
+        """Draw the scene at a quarter of the size, without a backward pass. The camera sees what the step's
+        camera sees, so the optimiser has already brought the rows up to date."""
         config = self.config
         if config.coarse_render == "shrink":
             return shrink(step.rendered.image.detach(), config.coarse_divisor)
-        known = self._coarse_cameras.get(step.view)
-        if known is None or known[0] is not step.camera:  # a renderer copies a camera it has not met
-            known = (step.camera, shrink_camera(step.camera, config.coarse_divisor))
-            self._coarse_cameras[step.view] = known
-        return step.draw(camera=known[1]).image.detach()
+        pair = self._coarse_cameras.get(step.view)
+        if pair is None or pair[0] is not step.camera:  # kept, because a renderer copies every new camera
+            pair = (step.camera, shrink_camera(step.camera, config.coarse_divisor))
+            self._coarse_cameras[step.view] = pair
+        return step.draw(camera=pair[1]).image.detach()
 
     def _coarse_picture(self, image: Tensor) -> Tensor:
-        """The input of coarse features: a smaller picture, except for nets that resize by themselves."""
+        """Return the input of coarse features: a smaller picture, except for nets that resize themselves."""
         if self.config.coarse_size is not None:
             return image
         share = self.config.coarse_share
@@ -329,7 +324,7 @@ class RobustSplatMask(PausingMask):
         return self.config.cosine == "calibrated" or (self.config.cosine == "auto" and self.config.local)
 
     def _inputs(self, phi: Tensor) -> Tensor:
-        """The net's input of a photo, [h, w, C']: features; local ones also averaged more widely."""
+        """Return the net's input of a photo: features, and means of local ones over boxes, [h, w, C']."""
         if not self.config.net_context:
             return phi
         maps = phi.permute(2, 0, 1)[None]
@@ -340,7 +335,7 @@ class RobustSplatMask(PausingMask):
         return torch.cat([maps, *wide], dim=1)[0].permute(1, 2, 0).contiguous()
 
     def _statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and std [C] that the net's inputs are standardised by."""
+        """Return mean and std [C] that standardise the net's inputs."""
         channels = self.inputs[0].shape[2]
         raw = self.config.inputs == "raw" or (self.config.inputs == "auto" and not self.config.local)
         if raw:
@@ -352,7 +347,7 @@ class RobustSplatMask(PausingMask):
     # -- when -------------------------------------------------------------------------------------
 
     def pause_iterations(self, step: Step) -> float:
-        # multiplied first: the last bit decides whether some runs of over 20 000 iterations rest one more
+        # multiplied first: the last bit decides whether long runs pause for one more iteration
         return self.config.reset_pause * step.iteration / step.nominal
 
     # -- state ------------------------------------------------------------------------------------
@@ -380,7 +375,7 @@ class RobustSplatMask(PausingMask):
 
 
 def _fit(features: Features, photos: list[Tensor], data: TrainData) -> None:
-    """Fit to the photos, which may be smaller than the scene's; tracks are in px of the scene's."""
+    """Fit features to photos, which may be smaller than the scene's; tracks are in px of the scene's."""
     if not isinstance(features, SceneFeatures):
         features.fit(photos)
         return
@@ -392,19 +387,19 @@ def _fit(features: Features, photos: list[Tensor], data: TrainData) -> None:
 
 
 def coarse_spec(config: RobustSplatConfig) -> str:
-    """The coarse stage's features: the same back end, a net's picture at `coarse_share` of the size."""
+    """Return the features of the coarse stage: the same back end with an input of `coarse_size`."""
     if config.coarse_size is None:
         return config.features
-    found = parse(config.features)
-    head = f"{found.name}@{config.coarse_size}"
-    return head + "".join(f",{key}={value}" for key, value in found.options.items())
+    spec = parse(config.features)
+    head = f"{spec.name}@{config.coarse_size}"
+    return head + "".join(f",{key}={value}" for key, value in spec.options.items())
 
 
 Config = RobustSplatConfig
 
 
 def build(options: RobustSplatConfig) -> Parts:
-    """Mask net, delayed growth, both pictures masked before SSIM; the rest of the loop is 3DGS."""
+    """Return 3DGS with a mask net, delayed growth, and both pictures masked before SSIM."""
     return Parts(
         mask=RobustSplatMask(options),
         density_config=options.density,

@@ -1,7 +1,8 @@
 """NAME+2passes: a method that trains twice, the second time from the start with the final masks of the first.
 
-T-3DGS and DualSplat do so. Of the method everything stays but its mask policy: density control, effects,
-fields and schedule. Losses of the mask policy itself belong to the first pass. Imports no torch.
+T-3DGS and DualSplat do so. In the second pass the method has fixed masks instead of its mask policy; density
+control, effects, fields and schedule stay. Losses of the mask policy belong to the first pass. Imports no
+torch.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ SUFFIX = "+2passes"
 
 
 def second_pass_name(name: str, passes: int) -> str:
-    """The name of a method that trains so many times; one of them changes nothing.
+    """Return the name of a method that trains this many times, once or twice.
 
     Raises:
-        AwError: more than two.
+        AwError: another number of passes.
     """
     if passes not in (1, 2):
         raise AwError(f"--passes {passes}: a method trains once or twice")
@@ -26,15 +27,15 @@ def second_pass_name(name: str, passes: int) -> str:
 
 
 def trained_once(name: str) -> str:
-    """The name without `SUFFIX`."""
+    """Return the name without `SUFFIX`."""
     return name.removesuffix(SUFFIX)
 
 
 def second_pass(entry: MethodEntry) -> MethodEntry:
-    """That method, trained twice.
+    """Return the method that trains twice.
 
     Raises:
-        AwError: another program trains it.
+        AwError: an external program trains it.
     """
     if entry.program is not None:
         raise AwError(

@@ -1,11 +1,10 @@
 """Splatfacto-W: harmonics by a net of the Gaussian's feature and the photo's embedding, and a background.
 
 Source: KevinXu02/splatfacto-w (its paper was not read). Ours: a test photo's embedding is fitted with the
-model frozen (the release trains on left halves of test photos); the background lies on a grid of every
-fourth pixel; rates of positions are 3DGS's (published 1.6e-5, for 55 000 steps); embeddings start at a
-tenth of a normal draw; positions learn nothing from directions; rules by screen size and pruning after
-growth are left out.
-Cost: the net, 120-256-256-48 on every visible Gaussian, takes most of a step; `width` makes it smaller.
+model frozen (the release trains on left halves of test photos); the background lies on a grid of every fourth
+pixel; rates of positions are 3DGS's (published 1.6e-5, for 55 000 steps); embeddings start at a tenth of a
+normal draw; positions get no gradient from directions; rules by screen size and pruning after growth are left
+out. Cost: the net, 120-256-256-48 on every visible Gaussian, takes most of a step; `width` makes it smaller.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.mask_net import enlarged
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
@@ -27,7 +26,7 @@ from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_
 from ambiguous_wild.splat.effects.placing import directions, harmonics, ray_directions
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -36,7 +35,7 @@ PHOTO, FEATURE = 48, 72
 
 def _density() -> DensityConfig:
     resets = tuple(2500.0 * k for k in range(1, 8))
-    # sizes of 0.01 and 0.5 in a scene whose cameras reach 3
+    # published: sizes of 0.01 and 0.5 in a scene of extent 3
     return DensityConfig(
         grow_grad=8e-4, stop=20_000.0, grow_scale=0.0033, prune_scale=0.17, prune_opacity=0.1,
         resets=resets, reset_opacity=0.2,
@@ -48,16 +47,16 @@ class SplatfactoWConfig:
     """Options; times in nominal iterations (of 30 000; published for 55 000)."""
 
     density: DensityConfig = field(default_factory=_density)
-    width: int = 256  # of the net's hidden layers
+    width: int = 256  # units of the net's hidden layers
     background: bool = True
     lr_photo: float = 0.02
     lr_feature: float = 0.02
     lr_net: float = 2e-3
-    lr_rest: float = 1e-4  # of the head for higher harmonics
+    lr_rest: float = 1e-4  # rate of the head for higher harmonics
     mask_start: float = 6000.0
-    most_masked: float = 0.4  # of the pixels
-    never_masked: float = 0.4  # upper part of the picture: a prior of tourist photos
-    alpha: float = 0.15  # times the mean alpha where the background explains the photo
+    most_masked: float = 0.4  # largest share of masked pixels
+    never_masked: float = 0.4  # upper share of the picture that is never masked, a prior of tourist photos
+    alpha: float = 0.15  # weight of the mean alpha where the background explains the photo
 
     def __post_init__(self) -> None:
         shares = dict.fromkeys(("most_masked", "never_masked"), (0, 1))
@@ -65,7 +64,7 @@ class SplatfactoWConfig:
 
 
 def build(options: SplatfactoWConfig) -> Parts:
-    """Colours, background and masks; growth by absolute gradients."""
+    """Return 3DGS with colours, background, masks, and growth by absolute gradients."""
     effect = SplatfactoColours(options)
     return Parts(
         mask=TrimmedLoss(effect), density=SplatfactoDensity, density_config=options.density,
@@ -75,7 +74,7 @@ def build(options: SplatfactoWConfig) -> Parts:
 
 
 class SplatfactoColours(Learnt):
-    """SH = net([embedding; feature]); picture + (1 - alpha) background(direction, embedding)."""
+    """Draws SH = net([embedding; feature]), and picture + (1 - alpha) background(direction, embedding)."""
 
     name, unseen = "splatfacto-w", "mean"
 
@@ -88,7 +87,7 @@ class SplatfactoColours(Learnt):
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
         photo = torch.tensor(0.1 * rng.normal(size=(len(data.photos), PHOTO)), dtype=torch.float32)
         lr, w, rest = self.config.lr_net, self.config.width, self.config.lr_rest
-        found = {"photo": Leaf(photo, self.config.lr_photo, 0.015, per_photo=True)}
+        leaves = {"photo": Leaf(photo, self.config.lr_photo, 0.015, per_photo=True)}
         nets = {
             "net": ((PHOTO + FEATURE, w, w), lr, 0.05), "dc": ((w, 3), lr, 0.05),
             "rest": ((w, 45), rest, 0.05), "sky": ((PHOTO, 128, 128), lr, 0.05),
@@ -97,8 +96,8 @@ class SplatfactoColours(Learnt):
         for name, (widths, rate, final) in nets.items():
             for key, leaf in mlp_leaves(name, widths, rng, rate).items():
                 values = torch.zeros_like(leaf.values) if name.endswith("rest") else leaf.values
-                found[key] = replace(leaf, values=values, final=final)
-        return found
+                leaves[key] = replace(leaf, values=values, final=final)
+        return leaves
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
         zeros = torch.zeros(len(gaussians), FEATURE, device=gaussians.device)
@@ -110,13 +109,14 @@ class SplatfactoColours(Learnt):
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         photo = leaf["photo"].expand(len(visible.means), PHOTO)
-        hidden = F.relu(mlp(torch.cat([photo, visible.extra["splatfacto_feature"]], dim=1), leaf, "net"))
+        feature = visible.attributes["splatfacto_feature"]
+        hidden = F.relu(mlp(torch.cat([photo, feature], dim=1), leaf, "net"))
         basis = _up_to(harmonics(directions(visible.means.detach(), shot.camera), 3), shot.nominal // 2000)
         rest = mlp(hidden, leaf, "rest").reshape(-1, 15, 3)
         return 0.5 + basis[:, :1] * mlp(hidden, leaf, "dc") + (basis[:, 1:, None] * rest).sum(dim=1)
 
     def background(self, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        """[H, W, 3] of the shot's photo, without an offset."""
+        """Return the background [H, W, 3] of the shot's photo, without an offset."""
         height, width = shot.camera.height, shot.camera.width
         small = (max(height // 4, 1), max(width // 4, 1))
         rays = ray_directions(shot.camera, *small, leaf["photo"])
@@ -131,13 +131,13 @@ class SplatfactoColours(Learnt):
 
 
 def _up_to(basis: Tensor, degree: float) -> Tensor:
-    """Zeros from the first harmonic above this degree on."""
+    """Zero the harmonics above this degree."""
     count = int(degree + 1) ** 2
     return torch.cat([basis[:, :count], torch.zeros_like(basis[:, count:])], dim=1)
 
 
 class TrimmedLoss(MaskPolicy):
-    """Leaves out the largest residuals: the more, the larger the photo's loss among all so far."""
+    """Masks the largest residuals: the more, the larger the photo's loss among all so far."""
 
     def __init__(self, effect: SplatfactoColours) -> None:
         self.effect, self.config = effect, effect.config
@@ -170,15 +170,15 @@ class TrimmedLoss(MaskPolicy):
         return trimmed(error, self._share(error.mean()))
 
     def _error(self, step: Step) -> Tensor:
-        """Mean over channels of |photo - render|, [H, W], 0 in the part that is never masked."""
+        """Return the mean over channels of |photo - render|, [H, W], 0 in the part that is never masked."""
         error = (step.photo - step.rendered.image.detach()).abs().mean(dim=2)
         error[: int(self.config.never_masked * len(error))] = 0.0
         return error
 
     def _share(self, loss: Tensor) -> Tensor:
-        """Of the pixels to leave out, a 0-d tensor."""
-        found = self.config.most_masked * (loss - self.low) / (self.high - self.low + 1e-6)
-        return found.clamp(0.0, 1.0)
+        """Return the share of pixels to mask, a 0-d tensor."""
+        share = self.config.most_masked * (loss - self.low) / (self.high - self.low + 1e-6)
+        return share.clamp(0.0, 1.0)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
         if not self.config.background or not self.config.alpha:
@@ -197,9 +197,9 @@ class TrimmedLoss(MaskPolicy):
 
 
 def trimmed(error: Tensor, share: Tensor) -> Tensor:
-    """Keep map [H, W]: not among this share of the largest errors, or over 40 % of the 5x5 around it not."""
+    """Return 0 for this share of the largest errors, unless over 40 % of the 5x5 window is kept; [H, W]."""
     ordered = error.reshape(-1).sort().values
-    at = ((1.0 - share) * (len(ordered) - 1)).reshape(1)  # of the quantile, between two of them
+    at = ((1.0 - share) * (len(ordered) - 1)).reshape(1)  # rank of the quantile, between two values
     low, high = (ordered.gather(0, k.long()) for k in (at.floor(), at.ceil()))
     inlier = (error <= low + (at - at.floor()) * (high - low)).float()
     near = F.avg_pool2d(inlier[None, None], 5, stride=1, padding=2)[0, 0] > 0.4
@@ -207,7 +207,7 @@ def trimmed(error: Tensor, share: Tensor) -> Tensor:
 
 
 class SplatfactoDensity(DensityControl):
-    """Growth by the absolute gradient; none until every photo was seen after an opacity reset."""
+    """Grows by the absolute gradient, but after an opacity reset only once every photo was seen."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
 

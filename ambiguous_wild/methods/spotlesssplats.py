@@ -1,28 +1,23 @@
-"""SpotLessSplats: a small net, or a vote in clusters, on frozen features says which residuals are outliers.
+"""SpotLessSplats: a small net, or a vote in clusters, on frozen features tells which residuals are outliers.
 
-Source: arXiv 2406.20055 and the authors' gsplat port, lilygoli/SpotLessSplats; how the original differs
-from that port is unverified. Ours: features (Lab and HOG for Stable Diffusion's, option `features`); with
-them the net's input is standardised; the port's 0.5 max|W1| max|W2| carries no gradient and is left out;
-the annealing counts iterations of the run where these are fewer than nominal ones; clusters lie on a grid
-of 50 cells.
-
-SpotLessSplats' net: features of a pixel and the place of the pixel to a static map.
-
-SpotLessSplats' density control: no opacity reset, harmonics cut once, Gaussians without use removed.
+Source: arXiv 2406.20055 and the authors' gsplat port, lilygoli/SpotLessSplats; how the original differs from
+it is unverified. Ours: features are Lab and HOG (published: Stable Diffusion's), and for them the net's input
+is standardised; the port's 0.5 max|W1| max|W2| carries no gradient and is left out; the annealing counts
+iterations of the run where these are fewer than nominal ones; clusters lie on a grid of 50 cells.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.dronesplat import label_means, nearest
 from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.methods.masking_common import (
@@ -37,7 +32,7 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features
@@ -47,29 +42,27 @@ from ambiguous_wild.vision.segments import ward_clusters
 
 @dataclass(frozen=True)
 class SpotLessDensityConfig(DensityConfig):
-    """3DGS's without opacity resets and without pruning by size."""
+    """Density control of 3DGS without opacity resets and without pruning by size."""
 
     resets: tuple[float, ...] = ()
     prune_scale: float = NO_SIZE_PRUNING
     free_colour: float = 8002.0  # nominal iteration at which higher harmonics are cut
-    most_colour: float = 0.001  # what they are cut to from above
-    least_use: float = (
-        0.0  # prune below this sum of squared screen gradients; published, off there too: 1e-14
-    )
+    most_colour: float = 0.001  # their largest value after the cut
+    least_use: float = 0.0  # prune below this sum of squared screen gradients; published 1e-14, also off
 
 
 class SpotLessDensity(DensityControl):
-    """Clone, split and prune as in 3DGS."""
+    """Clones, splits and prunes as 3DGS, and cuts the higher harmonics once."""
 
     config: SpotLessDensityConfig
-    cut = False  # whether higher harmonics were
+    cut = False  # whether the higher harmonics were cut
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
         gaussians, events = super().refine(step, gaussians, optimiser)
         if self._cut_due(step):
             optimiser.bind(gaussians)
-            optimiser.reset_moments(["sh_rest"])  # postponed steps are made first
+            optimiser.reset_moments(["sh_rest"])  # takes postponed steps first
             gaussians.sh_rest.clamp_(max=self.config.most_colour)
             self.cut = True
         return gaussians, events
@@ -80,16 +73,16 @@ class SpotLessDensity(DensityControl):
     def _cut_due(self, step: Step) -> bool:
         return not self.cut and step.nominal >= self.config.free_colour
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return super().state_dict() | {"cut": self.cut}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         super().load_state_dict(state)
         self.cut = bool(state["cut"])
 
 
 class PruningDensity(SpotLessDensity):
-    """Removes Gaussians on which pictures hardly depended since the last round."""
+    """Density control that also removes Gaussians on which pictures hardly depended since the last round."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"squared"})
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": (), "use_sum": ()}
@@ -105,7 +98,7 @@ class PruningDensity(SpotLessDensity):
     def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         grown = super()._grow(step, gaussians, optimiser)
         new = self.log.now.cloned + 2 * self.log.now.split
-        self.use_sum[len(grown) - new :] = 1.0  # nothing is known of them yet
+        self.use_sum[len(grown) - new :] = 1.0  # large: new Gaussians are not pruned before they were drawn
         return grown
 
     def _prune(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
@@ -121,12 +114,12 @@ OCTAVES = 20
 
 
 class PlacedNet(MaskNet):
-    """The net of RobustSplat, which is this one's, with the pixel's place beside its features."""
+    """The net of RobustSplat that also gets the position of the pixel."""
 
     def __init__(self, mean: Tensor, std: Tensor, hidden: int, seed: int) -> None:
         super().__init__(mean, std, hidden, seed)
         self.place = nn.Linear(4 * OCTAVES, hidden, bias=False, device=mean.device)
-        limit = (len(mean) + 4 * OCTAVES) ** -0.5  # both together are one layer
+        limit = (len(mean) + 4 * OCTAVES) ** -0.5  # features and position form the input of one layer
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():
             drawn = 2.0 * torch.rand(self.place.weight.shape, generator=generator) - 1.0
@@ -135,7 +128,7 @@ class PlacedNet(MaskNet):
                 values *= limit * len(mean) ** 0.5
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
-        """[height, width]; columns and rows are coded apart, for their code is a sum in the first layer."""
+        """Return the map [height, width]; columns and rows are encoded separately, then summed."""
         z = enlarged(self.first((features - self.mean) / self.std), height, width)
         x, y = (placed(size, z) for size in (width, height))
         across, down = self.place.weight[:, : 2 * OCTAVES], self.place.weight[:, 2 * OCTAVES :]
@@ -144,13 +137,13 @@ class PlacedNet(MaskNet):
 
 
 def placed(size: int, like: Tensor) -> Tensor:
-    """[size, 40]: sin and cos of pi 2^k x, k = 0..19, at x from 0 to 1 along a side."""
+    """Return sin and cos of pi 2^k x, k = 0..19, at x from 0 to 1 along a side, [size, 40]."""
     at = torch.arange(size, device=like.device, dtype=torch.float64) / max(size - 1, 1)
     angles = torch.pi * torch.stack([2.0**k * at for k in range(OCTAVES)], dim=1)
     return torch.cat([angles.sin(), angles.cos()], dim=1).to(like)
 
 
-CELLS, BINS = 50, 10_000  # on the longer side of the clusters' grid; of the histogram
+CELLS, BINS = 50, 10_000  # cells on the longer side of the clusters' grid; bins of the histogram
 
 
 @dataclass(frozen=True)
@@ -160,10 +153,10 @@ class SpotLessSplatsConfig:
     features: str = "labhog"  # see vision/backends.py
     mask: Literal["mlp", "cluster", "filter"] = "mlp"
     density: SpotLessDensityConfig = field(default_factory=SpotLessDensityConfig)
-    inliers: float = 0.7  # share of the smallest residuals, of `cluster` and `filter`
-    lower: float = 0.5  # of `mlp`: surely static; published also 0.3 (patio-high, spot)
-    upper: float = 0.9  # of `mlp`: may be static; published also 0.8
-    clusters: int = 100  # a photo
+    inliers: float = 0.7  # for `cluster` and `filter`: share of the smallest residuals that are inliers
+    lower: float = 0.5  # for `mlp`: share that is surely static; published also 0.3 (patio-high, spot)
+    upper: float = 0.9  # for `mlp`: share that may be static; published also 0.8
+    clusters: int = 100  # number in a photo
     beta: float = 0.003  # decay of the chance that a masked pixel is kept nevertheless
     lr: float = 1e-3
     lambda_dssim: float = 0.0
@@ -182,13 +175,13 @@ class ClusterConfig(SpotLessSplatsConfig):
 
 
 def build(options: SpotLessSplatsConfig) -> Parts:
-    """Masked L1, no opacity reset, harmonics that start anew."""
+    """Return 3DGS with masked L1, without opacity resets, and with harmonics that are cut once."""
     density = PruningDensity if options.density.least_use > 0 else SpotLessDensity
     return Parts(SpotLessMask(options), density, options.density, lambda_dssim=options.lambda_dssim)
 
 
 class SpotLessMask(MaskPolicy):
-    """Keep maps between the strict and the loose bound of the residual, drawn at random at first."""
+    """Keep maps between a strict and a loose bound of the residual, at first drawn at random."""
 
     def __init__(self, config: SpotLessSplatsConfig) -> None:
         self.config, self.features, self.shares = config, make_features(config.features), MaskedShares()
@@ -251,14 +244,14 @@ class SpotLessMask(MaskPolicy):
         return (self.config.upper, 1.0), (self.config.lower, 0.0)
 
     def _bound(self, error: Tensor, share: float, first: float) -> Tensor:
-        """Inliers [H, W] under the threshold of the steps before; `first` is that of the first step."""
+        """Return inliers [H, W] below the threshold of earlier steps; in the first step it is `first`."""
         return bound(error, percentile(self.histogram, share) if self.seen else first)
 
     def _vote(self, inlier: Tensor, view: int) -> Tensor:
         labels = nearest(self.labels[view], *inlier.shape)
         return (label_means(inlier, labels, self.config.clusters) > 0.5)[labels].float()
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         used = "none" if self.config.mask == "filter" else self.features.name
         return {"masked_share": self.shares.mean(), "features": used}
 

@@ -1,12 +1,10 @@
-"""SWAG: a net of a photo's embedding and a Gaussian's place gives its colour, and may switch it off.
+"""SWAG: a net of a photo's embedding and a Gaussian's position gives its colour, and may switch it off.
 
-Source: abstract and summaries of arXiv 2403.10427; no code was found. UNVERIFIED: every size, rate, the
-sign of the gate, its regulariser and the threshold of transients: all are choices of ours. The mechanism
-is theirs: hash-encoded positions, one embedding a photo, opacity times a Binary Concrete gate that learns
-without labels. Gaussians that the gate switches off in most of the photos that see them are left out of
-other views. A test photo's embedding is fitted without gates.
-
-The hash encoding of positions that Instant-NGP describes, for effects that learn one.
+Source: abstract and summaries of arXiv 2403.10427; no code was found. UNVERIFIED, hence ours: every size and
+rate, the sign of the gate, its regulariser and the threshold of transients. The mechanism is theirs:
+hash-encoded positions (as Instant-NGP describes), one embedding a photo, and opacity times a Binary Concrete
+gate that learns without labels. Gaussians that the gate switches off in most of the photos that see them are
+left out of other views. A test photo's embedding is fitted without gates.
 """
 
 from __future__ import annotations
@@ -32,14 +30,14 @@ from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, TrainData
 
-PARTS = 8  # that the positions are cut into
-PRIMES = (1, 2_654_435_761, 805_459_861)  # Instant-NGP's
+PARTS = 8  # parallel parts of the positions
+PRIMES = (1, 2_654_435_761, 805_459_861)  # as in Instant-NGP
 _SECOND, _THIRD = np.uint64(PRIMES[1]), np.uint64(PRIMES[2])
 
 
 @kernel
 def _corners(x, y, z, count, entries, keys, weights):
-    """Entries and trilinear weights of the eight corners around a position in [0, 1]^3."""
+    """Write table entries and trilinear weights of the eight corners around a position in [0, 1]^3."""
     x, y, z = x * count, y * count, z * count
     i, j, k = np.floor(x), np.floor(y), np.floor(z)
     a, b, c = x - i, y - j, z - k
@@ -56,8 +54,8 @@ def _corners(x, y, z, count, entries, keys, weights):
 
 
 @parallel_kernel
-def look_up(unit, grid, cells, found):
-    """found[n, 2 l + f] of positions unit [N, 3] from tables grid [L, T, 2] with cells [L] a side."""
+def look_up(unit, grid, cells, code):
+    """Write code [N, 2 L] of positions unit [N, 3] from tables grid [L, T, 2] with cells [L] a side."""
     for part in numba.prange(PARTS):
         keys, weights = np.empty(8, np.int64), np.empty(8, np.float32)
         for n in range(part * unit.shape[0] // PARTS, (part + 1) * unit.shape[0] // PARTS):
@@ -67,49 +65,49 @@ def look_up(unit, grid, cells, found):
                 for corner in range(8):
                     first += weights[corner] * grid[level, keys[corner], 0]
                     second += weights[corner] * grid[level, keys[corner], 1]
-                found[n, 2 * level], found[n, 2 * level + 1] = first, second
+                code[n, 2 * level], code[n, 2 * level + 1] = first, second
 
 
 @parallel_kernel
-def look_up_backward(unit, cells, d_found, d_grid):
-    """Adds to d_grid [L, T, 2]; a level is one thread's, so that sums keep their order."""
+def look_up_backward(unit, cells, d_code, d_grid):
+    """Add to d_grid [L, T, 2]; one thread has a whole level, so that sums keep their order."""
     for level in numba.prange(d_grid.shape[0]):
         keys, weights = np.empty(8, np.int64), np.empty(8, np.float32)
         for n in range(unit.shape[0]):
             _corners(unit[n, 0], unit[n, 1], unit[n, 2], cells[level], d_grid.shape[1], keys, weights)
-            first, second = d_found[n, 2 * level], d_found[n, 2 * level + 1]
+            first, second = d_code[n, 2 * level], d_code[n, 2 * level + 1]
             for corner in range(8):
                 d_grid[level, keys[corner], 0] += weights[corner] * first
                 d_grid[level, keys[corner], 1] += weights[corner] * second
 
 
 def hash_encoding(unit: Tensor, grid: Tensor, coarsest: int, finer: float) -> Tensor:
-    """[N, 2 L] of positions [N, 3] in [0, 1] from tables [L, T, 2]: trilinear, as Instant-NGP's.
+    """Encode positions [N, 3] in [0, 1] by tables [L, T, 2], trilinear as in Instant-NGP, [N, 2 L].
 
     Level l has floor(coarsest finer^l) cells a side; a corner's entry is the exclusive or of its integer
-    coordinates times `PRIMES`, modulo T. Positions outside of [0, 1] count as its ends, and learn nothing.
+    coordinates times `PRIMES`, modulo T. Positions are clamped to [0, 1], and get no gradient.
     """
     unit = unit.detach().to(grid).clamp(0.0, 1.0)
     cells = [float(int(coarsest * finer**level)) for level in range(len(grid))]
     if not backend_of(grid.device).kernels or grid.dtype != torch.float32:
         return in_torch(unit, grid, cells)
-    found: Tensor = _Encoding.apply(unit, grid, torch.tensor(cells))
-    return found
+    code: Tensor = _Encoding.apply(unit, grid, torch.tensor(cells))
+    return code
 
 
-def prepare(place: torch.device) -> None:
-    """Compile the kernel if it is needed there and was not yet, so that no training time goes into it."""
-    grid = torch.zeros(1, 1, 2, device=place, requires_grad=True)
+def prepare(device: torch.device) -> None:
+    """Compile the kernel if this device needs it, so that it takes no training time."""
+    grid = torch.zeros(1, 1, 2, device=device, requires_grad=True)
     with torch.enable_grad():
         torch.autograd.grad(hash_encoding(grid.new_zeros(1, 3), grid, 1, 1.0).sum(), grid)
 
 
 def in_torch(unit: Tensor, grid: Tensor, cells: list[float]) -> Tensor:
-    """The same in torch, for accelerators, and to check the kernel by."""
+    """Do as `hash_encoding` in torch, for accelerators, and to check the kernel."""
     levels, entries, _ = grid.shape
     scaled = torch.stack([unit * count for count in cells])  # [L, N, 3]
     low = scaled.floor()
-    share, corner, found = scaled - low, low.long(), torch.zeros_like(scaled[:, :, :2])
+    share, corner, code = scaled - low, low.long(), torch.zeros_like(scaled[:, :, :2])
     first = (torch.arange(levels, device=grid.device) * entries)[:, None]
     table = grid.reshape(levels * entries, 2)
     for number in range(8):
@@ -118,8 +116,8 @@ def in_torch(unit: Tensor, grid: Tensor, cells: list[float]) -> Tensor:
             up = number >> axis & 1
             weight = weight * (share[:, :, axis] if up else 1.0 - share[:, :, axis])
             key = key ^ ((corner[:, :, axis] + up) * PRIMES[axis])
-        found = found + weight[:, :, None] * table[first + key % entries]
-    return found.permute(1, 0, 2).reshape(len(unit), 2 * levels)
+        code = code + weight[:, :, None] * table[first + key % entries]
+    return code.permute(1, 0, 2).reshape(len(unit), 2 * levels)
 
 
 class _Encoding(torch.autograd.Function):
@@ -128,21 +126,21 @@ class _Encoding(torch.autograd.Function):
         unit = unit.contiguous()
         ctx.save_for_backward(unit, cells)
         ctx.size = grid.shape
-        found = torch.empty(len(unit), 2 * len(grid))
-        look_up(unit.numpy(), grid.detach().contiguous().numpy(), cells.numpy(), found.numpy())
-        return found
+        code = torch.empty(len(unit), 2 * len(grid))
+        look_up(unit.numpy(), grid.detach().contiguous().numpy(), cells.numpy(), code.numpy())
+        return code
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *d_found: Tensor) -> tuple[None, Tensor, None]:
+    def backward(ctx: Any, *d_code: Tensor) -> tuple[None, Tensor, None]:
         unit, cells = ctx.saved_tensors
         d_grid = torch.zeros(ctx.size)
-        look_up_backward(unit.numpy(), cells.numpy(), d_found[0].contiguous().numpy(), d_grid.numpy())
+        look_up_backward(unit.numpy(), cells.numpy(), d_code[0].contiguous().numpy(), d_grid.numpy())
         return None, d_grid, None
 
 
 PHOTO = 24
-CLOSED, LEAST = -20.0, 1e-7  # logit of what is left out; opacity below which nothing is drawn
+CLOSED, LEAST = -20.0, 1e-7  # logit of Gaussians that are left out; least opacity under a gate
 
 
 @dataclass(frozen=True)
@@ -150,18 +148,18 @@ class SwagConfig:
     """Options, all of them ours; times in nominal iterations (of 30 000)."""
 
     density: DensityConfig = field(default_factory=DensityConfig)
-    levels: int = 8  # of the hash grid, with two features each
-    entries: int = 2**14  # a level
-    coarsest: int = 16  # cells a side
-    finer: float = 1.5  # from level to level
-    width: int = 64  # of the net's three hidden layers
-    temperature: float = 0.1  # of the gate
+    levels: int = 8  # levels of the hash grid, with two features each
+    entries: int = 2**14  # entries of each level
+    coarsest: int = 16  # cells along a side of the first level
+    finer: float = 1.5  # ratio of cells from level to level
+    width: int = 64  # units of the net's three hidden layers
+    temperature: float = 0.1  # temperature of the gate
     gate_start: float = 3000.0
-    start_logit: float = -4.0  # of being off
-    off: float = 0.01  # times the mean gate in the loss
-    transient: float = 0.5  # left out below this share of photos in which it is on
+    start_logit: float = -4.0  # logit of being off, at the start
+    off: float = 0.01  # weight of the mean gate in the loss
+    transient: float = 0.5  # Gaussians that are on in a smaller share of photos are left out
     lr_grid: float = 0.01
-    lr_net: float = 1e-3  # this and the next for 30 000 iterations; more in shorter runs
+    lr_net: float = 1e-3  # this and the next for 30 000 iterations; higher in shorter runs
     lr_photo: float = 0.01
 
     def __post_init__(self) -> None:
@@ -172,12 +170,12 @@ class SwagConfig:
 
 
 def build(options: SwagConfig) -> Parts:
-    """3DGS with that net."""
+    """Return 3DGS with this net."""
     return Parts(effects=(GatedColours(options),), density_config=options.density)
 
 
 class GatedColours(Learnt):
-    """colour' = colour + 2 sigmoid(net) - 1; opacity' = opacity (1 - z), z = 1: switched off."""
+    """Draws colour + 2 sigmoid(net) - 1, and opacity (1 - z), where z = 1 switches a Gaussian off."""
 
     name = "swag"
 
@@ -186,7 +184,7 @@ class GatedColours(Learnt):
 
     def setup(self, data: TrainData) -> None:
         self.seed, self.unit, self.cameras = data.seed, Unit(data.scene.points.xyz, data.device), data.cameras
-        self._left_out: tuple[float, int, Tensor] | None = None  # of a moment and a number of Gaussians
+        self._left_out: tuple[float, int, Tensor] | None = None  # result of `_transient`, by time and number
         prepare(data.device)
         super().setup(data)
 
@@ -204,7 +202,7 @@ class GatedColours(Learnt):
         return {"grid": Leaf(grid, c.lr_grid, 0.01), "photo": codes, **net}
 
     def encoded(self, means: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
-        """[N, 2 levels] of positions; they learn nothing from it."""
+        """Return the codes of positions, [N, 2 levels], without a gradient to the positions."""
         unit = (0.5 + 0.25 * self.unit(means.detach())).clamp(0.0, 1.0)
         return hash_encoding(unit, leaf["grid"], self.config.coarsest, self.config.finer)
 
@@ -213,8 +211,8 @@ class GatedColours(Learnt):
         return mlp(torch.cat([places, photo, colours], dim=1), leaf, "net")
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        found = self._net(self.encoded(visible.means, leaf), visible.base, leaf)
-        return visible.base + 2.0 * torch.sigmoid(found[:, :3]) - 1.0
+        outputs = self._net(self.encoded(visible.means, leaf), visible.base, leaf)
+        return visible.base + 2.0 * torch.sigmoid(outputs[:, :3]) - 1.0
 
     def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
         logits = gaussians.opacity_logits
@@ -236,18 +234,18 @@ class GatedColours(Learnt):
 
     @torch.no_grad()
     def _transient(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        """[N] bool: off in most of the photos whose pictures it lies in, without noise."""
-        known = self._left_out
-        if known is None or known[:2] != (shot.nominal, len(gaussians)):
+        """Return Gaussians that are off, without noise, in most photos that show them, [N] bool."""
+        cached = self._left_out
+        if cached is None or cached[:2] != (shot.nominal, len(gaussians)):
             places, colours = self.encoded(gaussians.means, leaf), gaussians.sh0 * SH_C0 + 0.5
             on, seen = torch.zeros_like(gaussians.opacity_logits), torch.zeros_like(gaussians.opacity_logits)
             for row, camera in zip(self._adam["photo"].values, self.cameras):
                 inside = in_picture(gaussians.means, camera, margin=0.0).float()
                 a = self._net(places, colours, {**leaf, "photo": row})[:, 3]
                 on, seen = on + inside * (a <= 0.0), seen + inside
-            known = (shot.nominal, len(gaussians), on < self.config.transient * seen)
-            self._left_out = known
-        return known[2]
+            cached = (shot.nominal, len(gaussians), on < self.config.transient * seen)
+            self._left_out = cached
+        return cached[2]
 
     def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
         self._left_out = None

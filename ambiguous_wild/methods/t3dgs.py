@@ -1,11 +1,11 @@
-"""T-3DGS: a head predicts the distribution of errors; where photo and render differ in it is masked.
+"""T-3DGS: a head predicts the distribution of errors; pixels where photo and render differ in it are masked.
 
 Source: arXiv 2412.00155 and Vadim200116/T-3DGS; the divergence is the code's, the paper's may differ
 (unverified). Ours: features (Lab and HOG for DINOv2's, option `features`), enlarged bilinearly (FeatUp
-there); doublings of the head stop at half the photo's size; the annealing counts iterations of the run
-where these are fewer than nominal ones. Its second stage (SAM 2 tracks masks through the video, then
-trains anew) needs a video; `--passes 2` trains anew with the final masks.
-Cost: features of the render, and the head on two pictures forwards and on one back.
+there); doublings of the head stop at half the photo's size; the annealing counts iterations of the run where
+these are fewer than nominal ones. Its second stage (SAM 2 tracks masks through the video, then trains anew)
+needs a video; `--passes 2` trains anew with the final masks. Cost: features of the render, and the head on
+two pictures forward and on one backward.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.mask_net import adam_of, adam_state, load_adam_state
 from ambiguous_wild.methods.masking_common import (
     MaskedShares,
@@ -32,7 +31,7 @@ from ambiguous_wild.methods.masking_common import (
 )
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
-from ambiguous_wild.splat.parts import Parts, Schedule, State
+from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features
@@ -52,11 +51,11 @@ class T3dgsConfig:
     threshold: float = 50.0  # divergence from which a pixel is transient
     dilation: int = 5  # passes of a 3x3 maximum over the divergence
     beta: float = 0.001  # decay of the chance that a masked pixel is kept nevertheless
-    variation: float = 0.1  # times the total variation of inverse depth
+    variation: float = 0.1  # weight of the total variation of inverse depth
     lr: float = 5e-3
-    lr_final: float = 2e-4  # by a cosine over the run
+    lr_final: float = 2e-4  # reached by a cosine over the run
     lr_opacity: float = 0.025
-    normal_units: float = 10.0  # of hand-made features: distance, in units of blur, that is 1
+    normal_units: float = 10.0  # for hand-made features: distance in units of blur that counts as 1
 
     def __post_init__(self) -> None:
         check_features(self.features)
@@ -66,13 +65,13 @@ class T3dgsConfig:
 
 
 def build(options: T3dgsConfig) -> Parts:
-    """Masks and smooth depth; the rest of the loop is 3DGS."""
+    """Return 3DGS with masks and smooth depth."""
     rates = Schedule(lr_opacity=options.lr_opacity)
     return Parts(mask=Divergence(options), density_config=options.density, schedule=rates)
 
 
 class Head(nn.Module):
-    """Features [B, h, w, C] to (sigma1, sigma2, rho) [B, 3, H, W] of the two errors."""
+    """Maps features [B, h, w, C] to (sigma1, sigma2, rho) [B, 3, H, W] of the two errors."""
 
     def __init__(self, channels: int, doublings: int, seed: int) -> None:
         super().__init__()
@@ -101,17 +100,17 @@ class Head(nn.Module):
         return F.interpolate(x, scale_factor=2.0) if number < self.doublings else x
 
 
-def likelihood_loss(x: Tensor, y: Tensor, found: Tensor) -> Tensor:
-    """Mean of the negative log likelihood, up to constants, of errors x and y [H, W] under [3, H, W]."""
-    s1, s2, rho = found
+def likelihood_loss(x: Tensor, y: Tensor, prediction: Tensor) -> Tensor:
+    """Return the mean negative log likelihood, without constants, of errors x and y [H, W]."""
+    s1, s2, rho = prediction
     kept = (1.0 - rho.square()).clamp(min=1e-6)
     cross = 2.0 * rho * x * y / (s1 * s2).clamp(min=1e-6)
     squares = x.square() / s1.square().clamp(min=1e-6) + y.square() / s2.square().clamp(min=1e-6)
-    return ((squares - cross) / kept + _determinant(found).log()).mean()
+    return ((squares - cross) / kept + _determinant(prediction).log()).mean()
 
 
 def divergence(photo: Tensor, render: Tensor) -> Tensor:
-    """[H, W] of two predictions [3, H, W]; as coded, not the Kullback-Leibler divergence to the letter."""
+    """Return the divergence [H, W] of two predictions [3, H, W] as in the code, not exactly KL."""
     (a1, a2, rho), (b1, b2, r) = photo, render
     cross = rho * r * a1 * a2 / (b1 * b2).clamp(min=1e-6)
     squares = a1.square() / b1.square().clamp(min=1e-6) + a2.square() / b2.square().clamp(min=1e-6)
@@ -119,19 +118,19 @@ def divergence(photo: Tensor, render: Tensor) -> Tensor:
     return 0.5 * ((squares - cross) / (1.0 - rho.square()).clamp(min=1e-6) - share.log() - 2.0)
 
 
-def _determinant(found: Tensor) -> Tensor:
-    s1, s2, rho = found
+def _determinant(prediction: Tensor) -> Tensor:
+    s1, s2, rho = prediction
     return (s1.square() * s2.square() * (1.0 - rho.square())).clamp(min=1e-6)
 
 
 class Divergence(PausingMask):
-    """The head learns from the photo alone; after an opacity reset the last mask of a photo stands in."""
+    """Masks by the head, which learns from the photo alone; after an opacity reset by the last mask."""
 
     config: T3dgsConfig
 
     def __init__(self, config: T3dgsConfig) -> None:
         self.config, self.features, self.shares = config, make_features(config.features), MaskedShares()
-        self.bank: dict[int, Tensor] = {}  # last mask of a view, [H, W] bool
+        self.bank: dict[int, Tensor] = {}  # view -> its last mask, [H, W] bool
 
     def setup(self, data: TrainData) -> None:
         self.features.fit(data.photos)
@@ -156,7 +155,7 @@ class Divergence(PausingMask):
         return self._mask(step, learn=False) if self.begun(step) else None
 
     def _mask(self, step: Step, learn: bool) -> Tensor:
-        """1 where photo and render agree, before the draw; one step of the head, if it is to learn."""
+        """Return 1 where photo and render agree, before the random draw; trains the head if `learn`."""
         size, render = step.photo.shape[:2], step.rendered.image.detach()
         full = self.cameras[step.view]
         with torch.no_grad():
@@ -180,8 +179,8 @@ class Divergence(PausingMask):
                     1.0 + math.cos(math.pi * step.progress)
                 )
             self.optimiser.step()
-        found, side = divergence(photo.detach(), other.detach())[None, None], 2 * self.config.dilation + 1
-        return (F.max_pool2d(found, side, stride=1, padding=side // 2)[0, 0] < self.config.threshold).float()
+        apart, side = divergence(photo.detach(), other.detach())[None, None], 2 * self.config.dilation + 1
+        return (F.max_pool2d(apart, side, stride=1, padding=side // 2)[0, 0] < self.config.threshold).float()
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
         if step.nominal <= 500.0 or not self.config.variation:
@@ -193,7 +192,7 @@ class Divergence(PausingMask):
             pair = torch.autograd.grad(loss, (alpha, depth))
         return Cotangents(alpha=pair[0], depth=pair[1])
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"masked_share": self.shares.mean(), "features": self.features.name}
 
     def state_dict(self) -> State:
@@ -211,13 +210,13 @@ class Divergence(PausingMask):
 
 
 def inverse_depth(alpha: Tensor, depth: Tensor) -> Tensor:
-    """[H, W], 1 over the expected depth; 0 where the picture is nearly empty."""
+    """Return 1 over the expected depth, [H, W]; 0 where the picture is nearly empty."""
     solid = alpha > 0.1
     return torch.where(solid, alpha / depth.clamp(min=1e-6).where(solid, torch.ones_like(depth)), 0.0)
 
 
 def variation(values: Tensor) -> Tensor:
-    """Total variation of a map [H, W] over its own range: mean |differences| along rows and along columns."""
+    """Return the total variation of a map [H, W], scaled to [0, 1]: mean |differences| along both axes."""
     low, high = values.amin(), values.amax()
     unit = (values - low) / (high - low).clamp(min=1e-9)
     return unit.diff(dim=0).abs().mean() + unit.diff(dim=1).abs().mean()

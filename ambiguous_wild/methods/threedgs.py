@@ -10,5 +10,5 @@ from ambiguous_wild.splat.parts import Parts
 
 
 def build(options: NoOptions) -> Parts:
-    """Every place at its default: no mask, 3DGS density control with a working opacity reset."""
+    """Return the default parts: no mask, density control of 3DGS with a working opacity reset."""
     return Parts()

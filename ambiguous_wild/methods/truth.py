@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.images import load_image_float, read_gray
 from ambiguous_wild.methods.entry import NoOptions
@@ -27,7 +27,7 @@ from ambiguous_wild.splat.step import Step, TrainData
 
 @dataclass(frozen=True)
 class TruthConfig:
-    """Options of `3dgs+truth`, and of exact masks anywhere (`--mask truth`)."""
+    """Options of exact masks: of `3dgs+truth`, and of `--mask truth`."""
 
     dilation: int = 0  # px by which every mask grows on each side
 
@@ -37,17 +37,17 @@ class TruthConfig:
 
 
 def build_masked(options: TruthConfig) -> Parts:
-    """3DGS with the exact masks."""
+    """Return 3DGS with the exact masks."""
     return Parts(mask=TruthMask(options))
 
 
 def build_clean(options: NoOptions) -> Parts:
-    """3DGS on the clean photos; test side, poses and points are the capture's."""
+    """Return 3DGS on the clean photos, with test side, poses and points of the capture."""
     return Parts(train_data=clean_data)
 
 
 class TruthMask(MaskPolicy):
-    """The exact masks from the first step on."""
+    """Keeps everything outside of the exact masks, from the first step on."""
 
     def __init__(self, config: TruthConfig) -> None:
         self.config = config
@@ -61,12 +61,12 @@ class TruthMask(MaskPolicy):
     def keep(self, step: Step) -> Tensor | None:
         return shrink_keep(self.keeps[step.view], step.divisor)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"masked_share": float(np.mean([1.0 - float(keep.mean()) for keep in self.keeps]))}
 
 
 def keep_outside(mask: np.ndarray, dilation: int) -> Tensor:
-    """Keep map [H, W] float32 of a distractor mask [H, W] bool grown by `dilation` px on each side."""
+    """Return a keep map [H, W] float32 from a distractor mask [H, W] bool grown by `dilation` px."""
     transient = torch.from_numpy(mask.astype(np.float32))
     if dilation:
         side = 2 * dilation + 1
@@ -75,10 +75,10 @@ def keep_outside(mask: np.ndarray, dilation: int) -> Tensor:
 
 
 def clean_data(data: TrainData) -> TrainData:
-    """The training side with clean photos, every pixel of which is kept.
+    """Return the training side with clean photos, without masks.
 
     Raises:
-        AwError: the scene has no clean photos, or not of all views, or of another size.
+        AwError: the scene lacks clean photos of some views, or they have another size.
     """
     photos = [load_image_float(path) for path in truth_files(data.scene, "clean")]
     _check_sizes(data.scene, photos, "clean")
@@ -87,10 +87,10 @@ def clean_data(data: TrainData) -> TrainData:
 
 
 def truth_files(scene: Scene, kind: str) -> list[Path]:
-    """SCENE/truth/<kind>/<stem>.png of every train view.
+    """Return SCENE/truth/<kind>/<stem>.png of every train view.
 
     Raises:
-        AwError: there is no such folder, or a view has none.
+        AwError: there is no such folder, or a view has no file in it.
     """
     folder = scene.root / "truth" / kind
     if not folder.is_dir():

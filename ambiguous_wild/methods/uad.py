@@ -25,16 +25,16 @@ from ambiguous_wild.splat.step import Step
 
 @dataclass(frozen=True)
 class UadConfig(DensityConfig):
-    """3DGS's options; `grow_grad` is compared with the weighted mean."""
+    """Options of 3DGS's density control; `grow_grad` is the threshold of the weighted mean."""
 
 
 def build(options: UadConfig) -> Parts:
-    """3DGS with that density control, to be grafted onto methods with masks: METHOD@density=uad."""
+    """Return 3DGS with this density control; graft it onto methods with masks: METHOD@density=uad."""
     return Parts(density=UncertaintyAware, density_config=options)
 
 
 class UncertaintyAware(DensityControl):
-    """`seen` is the sum of weights, `grad_sum` that of weighted gradients; their ratio decides as in 3DGS.
+    """Grows by the ratio of `grad_sum`, a sum of weighted gradients, to `seen`, the sum of weights.
 
     A Gaussian whose weights sum to less than one pixel does not grow.
     """
@@ -66,9 +66,9 @@ def footprint_mean(
     radii: Tensor,  # [N] px
     camera: Camera,
 ) -> Tensor:
-    """[N] mean of `values` over the square of half side `radii` around each projected mean.
+    """Average `values` over the square of half side `radii` around each projected mean, [N].
 
-    1 where the square lies outside or the mean behind the camera. From an integral image, in float64.
+    The result is 1 if the square lies outside or the mean behind the camera. Sums are in float64.
     """
     pose = torch.as_tensor(camera.cam_from_world.copy(), dtype=means.dtype, device=means.device)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
@@ -81,5 +81,5 @@ def footprint_mean(
     top, bottom = (v - radii).floor().clamp(0, height).long(), (v + radii).ceil().clamp(0, height).long()
     area = (right - left) * (bottom - top)
     inside = total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
-    known = (area > 0) & (z > 0)
-    return torch.where(known, inside / area.clamp(min=1), torch.ones_like(inside)).to(means.dtype)
+    in_view = (area > 0) & (z > 0)
+    return torch.where(in_view, inside / area.clamp(min=1), torch.ones_like(inside)).to(means.dtype)

@@ -1,19 +1,18 @@
-"""WildGaussians on the shared trainer: masks of a learnt uncertainty, an embedding a Gaussian and a photo.
+"""WildGaussians: masks from a learnt uncertainty, and colours from embeddings of Gaussians and photos.
 
-Source: "WildGaussians: 3D Gaussian Splatting in the Wild", Kulhanek et al., NeurIPS 2024 (arXiv
-2407.08447), and its code. A linear head on features of the photo gives an uncertainty, which learns from the
-distance of the render's features; where it is high is masked. An MLP of (colour, embedding of the Gaussian,
-embedding of the photo) gives (o, m); the colour becomes m colour + o.
+Source: "WildGaussians: 3D Gaussian Splatting in the Wild", Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447),
+and its code. A linear head on features of the photo gives an uncertainty, which learns from their distance to
+the features of the render; pixels of high uncertainty are masked. An MLP of (colour, embedding of the
+Gaussian, embedding of the photo) gives (o, m); the colour becomes m colour + o.
+
 Different from the release: features (Lab and HOG for DINOv2's, option `features`) with a distance in units of
-what blur alone makes; the head normalises by all photos' features, drops channels after that, and learns from
-the first iteration on; masks begin at once, without a blend; a photo without a static pixel is kept; the MLP
-reads the colour in the view's direction, not the constant harmonic; m is 1 + its output, so that training
+what blur alone causes; the head normalises by all photos' features, drops channels after that, and learns
+from the first iteration on; masks begin at once, without a blend; a photo without a static pixel is kept; the
+MLP reads the colour in the view's direction, not the constant harmonic; m is 1 + its output, so that training
 starts from unchanged colours; D-SSIM is of the toned picture (one render a step); the MLP runs on visible
-Gaussians only; a test photo's embedding is fitted without masks. Sky, 3D filter and growth are not part of
-it.
-Cost: features of every render.
+Gaussians only; a test photo's embedding is fitted without masks. Left out: sky, 3D filter and growth.
 
-How far the features of a photo are from those of its render: what uncertainties are learnt from.
+Cost: features of every render.
 """
 
 from __future__ import annotations
@@ -21,14 +20,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.mask_net import adam_of, adam_state, load_adam_state
 from ambiguous_wild.methods.masking_common import (
     MaskedShares,
@@ -42,23 +40,23 @@ from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, State
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features
 from ambiguous_wild.vision.precompute import photo_features
 
 
 class FeatureDistance:
-    """WildGaussians' distance: clip(2 - 2 cosine, 0, 1), 1 from a cosine of 0.5 down."""
+    """The distance of features of photo and render: clip(2 - 2 cosine, 0, 1), as in WildGaussians."""
 
     def __init__(self, features: str, normal_units: float) -> None:
         """
         Args:
-            features: see vision/backends.py.
-            normal_units: of hand-made features: the distance, in units of what blur alone makes, that is 1.
+            features: a back end, see vision/backends.py.
+            normal_units: for hand-made features: distance in units of blur that counts as 1.
 
         Raises:
-            AwError: unknown features, or their weights are missing.
+            AwError: the features are unknown, or their weights are missing.
         """
         self.features = make_features(features)
         self.normal_units = normal_units if features.startswith("labhog") else None
@@ -74,7 +72,7 @@ class FeatureDistance:
 
     @torch.no_grad()
     def __call__(self, step: Step) -> Tensor:
-        """[H, W] at the size of the step's photo."""
+        """Return the distance [H, W] at the size of the step's photo."""
         full = self.cameras[step.view]  # not the photo, which may not be on the device
         seen = self.features(upsampled(step.rendered.image.detach(), full.height, full.width))
         cosine = F.cosine_similarity(self.photos[step.view], seen, dim=2)
@@ -83,7 +81,7 @@ class FeatureDistance:
         return resized((2.0 - 2.0 * cosine).clamp(0.0, 1.0), *step.photo.shape[:2])
 
 
-PHOTO, OCTAVES = 32, 4  # of the photo's embedding; of the Fourier features that the Gaussians' start from
+PHOTO, OCTAVES = 32, 4  # length of a photo's embedding; octaves of Fourier features for Gaussians' embeddings
 GAUSSIAN = 6 * OCTAVES
 
 
@@ -94,22 +92,22 @@ class WildGaussiansConfig:
     Its code has lr_photo 1e-3, lr_net 5e-4 and scale 0.01, for 70 000 to 200 000 iterations.
     """
 
-    masks: bool = True  # by the uncertainty
+    masks: bool = True  # masks by the uncertainty
     appearance: bool = True  # published: on for photo collections, off for captures
     features: str = "labhog"  # see vision/backends.py; published: dinov2-small-registers@350,blocks=6
-    normal_units: float = 80.0  # of hand-made features: distance, in units of blur, that is 1
+    normal_units: float = 80.0  # for hand-made features: distance in units of blur that counts as 1
     mask_start: float = 2000.0
     min_mask_start: int = 300  # iterations: earlier renders show too little
-    reset_pause: float = 500.0  # after an opacity reset the head does not learn
+    reset_pause: float = 500.0  # time after an opacity reset in which the head does not learn
     min_reset_pause: int = 100
-    prior: float = 0.5  # times the mean ln sigma
-    dropout: float = 0.5  # of channels that the head sees
-    lr_head: float = 1e-3  # published for 30 000 iterations; more in shorter runs
+    prior: float = 0.5  # weight of the mean ln sigma
+    dropout: float = 0.5  # share of the head's input channels
+    lr_head: float = 1e-3  # published for 30 000 iterations; higher in shorter runs
     lr_photo: float = 0.01
     lr_gaussian: float = 5e-3
     lr_net: float = 1e-3
-    width: int = 128  # of both hidden layers
-    scale: float = 0.1  # of the MLP's output; at 0.01 a run of 700 iterations gains 0.8 dB, at 0.1 2.0
+    width: int = 128  # units of both hidden layers
+    scale: float = 0.1  # factor of the MLP's output; at 0.01 a run of 700 iterations gains 0.8 dB, at 0.1 2.0
 
     def __post_init__(self) -> None:
         check_features(self.features)
@@ -117,7 +115,7 @@ class WildGaussiansConfig:
 
 
 def build(options: WildGaussiansConfig) -> Parts:
-    """3DGS with the masks, the appearance, or both."""
+    """Return 3DGS with the masks, the appearance, or both."""
     effects = (WildAppearance(options),) if options.appearance else ()
     return Parts(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
 
@@ -126,7 +124,7 @@ Config = WildGaussiansConfig
 
 
 class WildAppearance(Learnt):
-    """colour' = (1 + m) colour + o, (o, m) = scale MLP(colour, g of the Gaussian, a of the photo)."""
+    """Draws (1 + m) colour + o, with (o, m) = scale MLP(colour, g of the Gaussian, a of the photo)."""
 
     name = "wildgaussians"
 
@@ -151,15 +149,15 @@ class WildAppearance(Learnt):
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
         photo = leaf["photo"].expand(len(visible.base), PHOTO)
-        inputs = torch.cat([visible.base, visible.extra["wild_embedding"], photo], dim=1)
+        inputs = torch.cat([visible.base, visible.attributes["wild_embedding"], photo], dim=1)
         offset, gain = (self.config.scale * mlp(inputs, leaf, "net")).split(3, dim=1)
         return (1.0 + gain) * visible.base + offset
 
 
 def fourier(means: Tensor, points: Tensor) -> Tensor:
-    """[N, 24]: sin(2 pi 2^k x + {0, pi/2}), k = 0..3, of positions scaled by the 97 % quantile to [0, 1].
+    """Return sin(2 pi 2^k x + {0, pi/2}), k = 0..3, of positions scaled to [0, 1], [N, 24].
 
-    Centre and quantile are those of the SfM points [M, 3]: a skybox would shrink the scene.
+    The scale is the 97 % quantile of the SfM points [M, 3], because a skybox would shrink the scene.
     """
     centre = points.mean(dim=0)
     spread = torch.quantile((points - centre).abs(), 0.97, dim=0).clamp(min=1e-6)
@@ -169,13 +167,13 @@ def fourier(means: Tensor, points: Tensor) -> Tensor:
 
 
 class Head(nn.Module):
-    """Features [h, w, C] of a photo to sigma [H, W] > 0, which starts near 1."""
+    """Maps features [h, w, C] of a photo to sigma [H, W] > 0, which starts near 1."""
 
     def __init__(self, photos: Sequence[Tensor], seed: int) -> None:
         """
         Args:
-            photos: [h, w, C] features of every photo; their mean and deviation normalise.
-            seed: of the weights.
+            photos: [h, w, C] features of every photo, whose mean and deviation normalise.
+            seed: seed of the weights.
         """
         super().__init__()
         cells = sum(f.shape[0] * f.shape[1] for f in photos)
@@ -187,7 +185,7 @@ class Head(nn.Module):
         self.bias = nn.Parameter(photos[0].new_zeros(1))
 
     def forward(self, features: Tensor, height: int, width: int, kept: Tensor | None = None) -> Tensor:
-        """`kept` [C]: factors of channels."""
+        """Return sigma [H, W]; `kept` [C] are factors of channels."""
         normal = (features - self.mean) / self.deviation
         seen = normal if kept is None else normal * kept
         sigma = F.softplus(seen @ self.weight + self.bias + math.log(math.e - 1.0))
@@ -195,12 +193,12 @@ class Head(nn.Module):
 
 
 def uncertainty_loss(sigma: Tensor, distance: Tensor, prior: float) -> Tensor:
-    """Mean d / (2 sigma^2) + prior ln sigma; least at sigma^2 = d / prior."""
+    """Return the mean of d / (2 sigma^2) + prior ln sigma, which is least at sigma^2 = d / prior."""
     return (distance * 0.5 / sigma.square()).mean() + prior * sigma.log().mean()
 
 
 class Uncertainty(PausingMask):
-    """Static where 1 / (2 sigma^2) > 1; the head learns with the Gaussians, but not after opacity resets."""
+    """Keeps pixels with 1 / (2 sigma^2) > 1; the head learns in every step, but not after opacity resets."""
 
     config: WildGaussiansConfig
 
@@ -227,7 +225,7 @@ class Uncertainty(PausingMask):
 
     @torch.no_grad()
     def _static(self, step: Step) -> Tensor:
-        """A photo without a static pixel is kept whole, or it would teach nothing."""
+        """Return the keep map; a photo without a static pixel is kept whole, or nothing would be learnt."""
         sigma = self.head(self.distance.photos[step.view], *step.photo.shape[:2])
         static = sigma < math.sqrt(0.5)
         return torch.where(static.any(), static, True).float()
@@ -245,7 +243,7 @@ class Uncertainty(PausingMask):
             group["lr"] = rate_for_run_length(c.lr_head, NOMINAL_ITERATIONS, step)
         self.optimiser.step()
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"masked_share": self.shares.mean(), "features": self.distance.name}
 
     def state_dict(self) -> State:

@@ -27,11 +27,11 @@ COLOUR_METRIC = "colour_share_rgb_l2_below_0.3"
 class ColourCounts:
     """Pixel counts of one photo, or sums over several."""
 
-    pixels: int  # of the photo
-    distractor: int  # pixels of distractors
-    known: int  # of these, with a known background
-    close: int  # of these, closer to the background than the threshold
-    residual_sum: float  # sum of colour differences over the known ones
+    pixels: int  # number of pixels of the photo
+    distractor: int  # pixels that distractors cover
+    known: int  # distractor pixels with a known background
+    close: int  # known ones that differ from the background by less than the threshold
+    residual_sum: float  # sum of colour differences over the known pixels
 
     def __add__(self, other: ColourCounts) -> ColourCounts:
         return ColourCounts(
@@ -116,7 +116,7 @@ def colour_counts(
 
 
 def pooled(counts: Sequence[ColourCounts]) -> ColourCounts:
-    """The sum of the counts of several photos: each is weighted by its distractor pixels."""
+    """Sum the counts of several photos, so that each weighs by its distractor pixels."""
     return sum(counts, ColourCounts(0, 0, 0, 0, 0.0))
 
 
@@ -128,7 +128,7 @@ def ratio_interval(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Percentile bootstrap over photos of sum(part) / sum(whole).
+    """Return sum(part) / sum(whole) with its percentile bootstrap interval over photos.
 
     Photos are resampled, because pixels of one photo are not independent. A resample in which `whole` sums to
     0 is left out. One photo has a ratio but no interval.

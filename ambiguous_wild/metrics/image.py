@@ -19,7 +19,7 @@ C1, C2 = 0.01**2, 0.03**2  # for a data range of 1
 
 
 def checked_pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both images as [H, W, 3] float64 in [0, 1].
+    """Return both images as [H, W, 3] float64 in [0, 1].
 
     Args:
         a: [H, W, 3], uint8 or floating point in [0, 1].
@@ -144,7 +144,7 @@ def _as_float(image: np.ndarray, which: str) -> np.ndarray:
     return values
 
 
-RANK = 1e-12  # of the largest eigenvalue: below it a channel is a copy of others, as in grey pictures
+RANK = 1e-12  # share of the largest eigenvalue below which a channel copies others, as in grey pictures
 
 
 def psnr_affine(
@@ -153,8 +153,8 @@ def psnr_affine(
 ) -> float:
     """PSNR in dB after the affine colour map (3x3 and an offset, least squares) from render to photo.
 
-    The map is fitted to the whole picture, its result cut to [0, 1]. Never below `psnr`, as leaving the
-    colours alone is such a map. (Nerfstudio and gsplat fit a quadratic map for `cc_psnr`: other values.)
+    The map is fitted to the whole picture and its result clipped to [0, 1]. Never below `psnr`, because the
+    identity is such a map. (Nerfstudio and gsplat fit a quadratic map for `cc_psnr`: other values.)
 
     Raises:
         AwError: see `checked_pair`.
@@ -217,7 +217,7 @@ def flip_map(
 
 
 def _linear(image: np.ndarray) -> np.ndarray:
-    """sRGB to linear RGB."""
+    """Convert sRGB to linear RGB."""
     return np.where(image > 0.04045, ((image + 0.055) / 1.055) ** 2.4, image / 12.92)
 
 
@@ -246,7 +246,7 @@ def _luminance(opponent: np.ndarray) -> np.ndarray:
 
 
 def _perceived(opponent: np.ndarray) -> np.ndarray:
-    """Filtered by contrast sensitivity, in L*a*b* with Hunt's adjustment, [H, W, 3]."""
+    """Filter by contrast sensitivity; returns L*a*b* with Hunt's adjustment, [H, W, 3]."""
     widest = max(width for gaussians in _CSF.values() for _, width in gaussians)
     radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * PIXELS_PER_DEGREE)
     degrees = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE
@@ -304,8 +304,8 @@ def _feature_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     smooth /= smooth.sum()
     edge = _balanced(-x * smooth)
     point = _balanced((x**2 / deviation**2 - 1.0) * smooth)
-    found = [np.abs(_strength(a, kernel, smooth) - _strength(b, kernel, smooth)) for kernel in (edge, point)]
-    return np.clip(np.maximum(*found) / math.sqrt(2.0), 0.0, None) ** _FEATURE_EXPONENT
+    errors = [np.abs(_strength(a, kernel, smooth) - _strength(b, kernel, smooth)) for kernel in (edge, point)]
+    return np.clip(np.maximum(*errors) / math.sqrt(2.0), 0.0, None) ** _FEATURE_EXPONENT
 
 
 def _balanced(kernel: np.ndarray) -> np.ndarray:

@@ -36,16 +36,16 @@ EPS = 1e-10  # added to the norm over channels, as in the lpips package
 
 @dataclass(frozen=True)
 class _Backbone:
-    """A convolutional stack; numbers in `layers` are output channels, see `_stack`."""
+    """A convolutional network and the files of its weights."""
 
     name: str  # folder below AW_WEIGHTS, and name in 'aw doctor'
-    files: tuple[str, str]  # either will do; the second is torchvision's name
+    files: tuple[str, str]  # two names of one file; the second is torchvision's
     head_name: str
-    head_files: tuple[str, str]  # either will do
+    head_files: tuple[str, str]  # two names of one file
     layers: tuple[Any, ...]  # (channels, kernel, stride, padding), or "M" for a max pool
     pool: tuple[int, int]  # kernel, stride
     taps: tuple[int, ...]  # indices of the ReLU layers whose outputs are used
-    channels: tuple[int, ...]  # of the taps
+    channels: tuple[int, ...]  # of each tap's output
     smallest: int  # px, shortest side that leaves each tap at least one pixel
 
 
@@ -83,12 +83,12 @@ VARIANTS: dict[str, tuple[_Backbone, bool]] = {
 
 
 def available() -> dict[str, str | None]:
-    """For every variant None if its files exist, else which files are missing. Reads no file."""
+    """Return None for every variant whose files exist, else which are missing. Reads no file."""
     return {name: why_unavailable(backbone) for name, (backbone, _) in VARIANTS.items()}
 
 
 def too_small(name: str, height: int, width: int) -> str | None:
-    """Why an image of this size in px has no value of a variant of `VARIANTS`; None if it has one."""
+    """Return why an image of this size in px is too small for a variant of `VARIANTS`; None if it is not."""
     backbone = VARIANTS[name][0]
     if min(height, width) >= backbone.smallest:
         return None
@@ -99,12 +99,12 @@ def too_small(name: str, height: int, width: int) -> str | None:
 
 
 def missing_weights(name: str) -> list[str]:
-    """Names of the weights (see `vision.weights`) that a variant of `VARIANTS` lacks."""
+    """Return the names of weights (see `vision.weights`) that a variant of `VARIANTS` lacks."""
     return [weight for weight, files in _files(VARIANTS[name][0]) if find_file(weight, files) is None]
 
 
 def load(name: str) -> Metric:
-    """The metric of this name; weights are loaded once per process and file.
+    """Return the metric of this name; weights are loaded once per process and file.
 
     Args:
         name: a key of `VARIANTS`.
@@ -170,21 +170,21 @@ def _features(backbone: _Backbone, stack: nn.Sequential, image: np.ndarray, cent
     if centred:
         x = 2.0 * x - 1.0
     x = (x - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
-    found = []
+    normalised = []
     for index, layer in enumerate(stack):
         x = layer(x)
         if index in backbone.taps:
             norm = x.square().sum(dim=1, keepdim=True).sqrt()
-            found.append(x / (norm + EPS))
-    return found
+            normalised.append(x / (norm + EPS))
+    return normalised
 
 
 @lru_cache(maxsize=4)
 def network_of(
     backbone: _Backbone, stamps: tuple[tuple[str, int], ...]
 ) -> tuple[nn.Sequential, list[Tensor]]:
-    """The layers and the heads [C, 1, 1]; `stamps` are the files and their times, so that a replaced
-    file is read again."""
+    """Return the layers and the heads [C, 1, 1]. `stamps` are the files and their times: a replaced file is
+    read again."""
     trunk, head = (Path(path) for path, _ in stamps)
     stack = _stack(backbone)
     tensors = read_tensors(trunk, f"run: aw weights get {backbone.name}")
@@ -199,8 +199,8 @@ def network_of(
     stack.eval().requires_grad_(False)
     expected = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(backbone.channels)}
     linear = read_tensors(head, f"run: aw weights get {backbone.head_name}")
-    found = {key: tuple(value.shape) for key, value in linear.items()}
-    if found != expected:
+    shapes = {key: tuple(value.shape) for key, value in linear.items()}
+    if shapes != expected:
         raise AwError(
             f"{head} does not hold the LPIPS heads of {backbone.name} (five of [1, C, 1, 1]); "
             f"run: aw weights get {backbone.head_name}"
@@ -209,7 +209,7 @@ def network_of(
 
 
 def _stack(backbone: _Backbone) -> nn.Sequential:
-    """The layers, with the indices of the published files."""
+    """Return the layers at the indices that the published files use."""
     from torch import nn
 
     layers: list[nn.Module] = []

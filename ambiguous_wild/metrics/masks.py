@@ -75,7 +75,7 @@ def confusion(
 
 
 def pooled(counts: Iterable[Confusion]) -> Confusion:
-    """The sum of the counts of several photos."""
+    """Sum the counts of several photos."""
     return sum(counts, Confusion())
 
 
@@ -90,7 +90,7 @@ def psnr_valid(
     -10 log10(kept share). No kept pixel: NaN (missing). Identical on kept pixels: ``inf``.
 
     Raises:
-        AwError: sizes that differ; see `checked_pair`.
+        AwError: sizes differ; see `checked_pair`.
     """
     left, right = checked_pair(a, b)
     kept = as_keep(keep, "keep")
@@ -101,7 +101,7 @@ def psnr_valid(
 
 
 def as_keep(keep: np.ndarray, which: str) -> np.ndarray:
-    """A keep map as [H, W] bool: float >= 0.5, uint8 >= 128.
+    """Return a keep map as [H, W] bool: float >= 0.5, uint8 >= 128.
 
     Raises:
         AwError: not two-dimensional, or another number type.

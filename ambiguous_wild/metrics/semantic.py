@@ -23,8 +23,8 @@ from ambiguous_wild.core.errors import AwError
 
 AMBIGUOUS_ABOVE = 0.7  # cosine; stated by the paper for DINOv2 features
 LOOKALIKE_ABOVE = 0.25  # share of distractor pixels, for weight-free features; see docs/ambiguity.md
-USUAL = 0.05  # quantile of static regions' best matches; a match above it is usual
-MIN_SHARE = 0.002  # of a photo's pixels; smaller regions are ignored
+USUAL = 0.05  # quantile of static regions' best matches; a higher match is usual
+MIN_SHARE = 0.002  # smaller shares of a photo's pixels are ignored
 _ANCHOR_REGIONS = 2000  # most static regions used for the anchors, evenly chosen
 
 
@@ -48,7 +48,7 @@ class Regions:
 class RegionMatch:
     """One distractor region and its most similar static region."""
 
-    label: int  # of the distractor region
+    label: int  # label of the distractor region
     pixels: int
     cosine: float  # in [-1, 1]
     photo: int  # index of the photo with the static region
@@ -107,7 +107,7 @@ class ChannelStatistics:
 def region_means(
     features: np.ndarray,  # [h, w, C], a coarser grid over the same photo
     labels: np.ndarray,  # [H, W] int, 0 = no region
-    min_share: float = 0.0,  # of the photo; smaller regions are left out
+    min_share: float = 0.0,  # share of the photo; smaller regions are left out
 ) -> Regions:
     """Mean feature of each region; a cell is weighted by the number of its pixels in the region."""
     h, w, channels = features.shape
@@ -124,7 +124,7 @@ def matches(
     distractors: Sequence[Regions],  # one per photo
     statics: Sequence[Regions],  # one per photo
 ) -> list[list[RegionMatch]]:
-    """For each distractor region the most similar static region of another photo.
+    """Find the most similar static region of another photo for each distractor region.
 
     Only other photos are used, because a distractor's features leak into its surroundings. A scene of one
     photo is compared with itself. Regions with a zero feature are left out.
@@ -135,19 +135,19 @@ def matches(
     if len(distractors) != len(statics):
         raise AwError(f"{len(distractors)} photos of distractors, {len(statics)} of static regions")
     units, photo, label = _stacked(statics)
-    found = []
+    by_photo = []
     for k, regions in enumerate(distractors):
         rows = np.flatnonzero(photo != k) if len(statics) > 1 else np.arange(len(photo))
         norms = np.linalg.norm(regions.means, axis=1)
-        here = []
+        in_photo = []
         for r in np.flatnonzero(norms > 0) if len(rows) else []:
             cosines = units[rows] @ (regions.means[r] / norms[r])
             best = int(rows[np.argmax(cosines)])
             cosine = float(np.clip(cosines.max(), -1.0, 1.0))
             which, px = int(regions.labels[r]), int(regions.pixels[r])
-            here.append(RegionMatch(which, px, cosine, int(photo[best]), int(label[best])))
-        found.append(here)
-    return found
+            in_photo.append(RegionMatch(which, px, cosine, int(photo[best]), int(label[best])))
+        by_photo.append(in_photo)
+    return by_photo
 
 
 def anchors(
@@ -165,7 +165,7 @@ def anchors(
 
 
 def usual_match(statics: Sequence[Regions]) -> float:
-    """The cosine that 95 % of static regions reach with their best match in another photo; NaN without."""
+    """The cosine that 95 % of static regions reach with their best match in another photo, else NaN."""
     units, photo, _ = _stacked(statics)
     if len(np.unique(photo)) < 2:
         return math.nan
@@ -178,19 +178,19 @@ def _sampled(units: np.ndarray) -> range:
 
 
 def _best_in_other_photos(units: np.ndarray, photo: np.ndarray) -> list[float]:
-    """For each sampled region the cosine of its best match in another photo."""
+    """Return the cosine of each sampled region with its best match in another photo."""
     return [float((units @ units[k])[photo != photo[k]].max()) for k in _sampled(units)]
 
 
-def photo_cosine(found: Sequence[RegionMatch]) -> float:
+def photo_cosine(matched: Sequence[RegionMatch]) -> float:
     """Cosine of a photo's most similar distractor; NaN without distractors."""
-    return max((m.cosine for m in found), default=math.nan)
+    return max((m.cosine for m in matched), default=math.nan)
 
 
-def mean_cosine(found: Sequence[RegionMatch]) -> float:
+def mean_cosine(matched: Sequence[RegionMatch]) -> float:
     """Mean cosine over distractor regions, weighted by pixels; NaN without regions."""
-    pixels = sum(m.pixels for m in found)
-    return sum(m.pixels * m.cosine for m in found) / pixels if pixels else math.nan
+    pixels = sum(m.pixels for m in matched)
+    return sum(m.pixels * m.cosine for m in matched) / pixels if pixels else math.nan
 
 
 def _cells(shape: tuple[int, ...], h: int, w: int) -> np.ndarray:  # [H, W] int

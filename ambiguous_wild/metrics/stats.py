@@ -28,7 +28,7 @@ class Interval:
 def mean(values: Sequence[float] | np.ndarray) -> float:
     """Arithmetic mean of the finite values; NaN if any value is NaN or none is finite.
 
-    An infinite PSNR of a few equal pixels would decide every mean that it entered.
+    Infinite values are left out: the PSNR of a few equal pixels would decide every mean.
     """
     array = _checked(values)
     finite = array[np.isfinite(array)]

@@ -1,11 +1,9 @@
 """Where a run computes: Numba's kernels on the CPU, or torch and gsplat on a GPU.
 
-A run holds one of the two (`TrainData.backend`), and `backend_of` gives that of a tensor. Whatever differs
-between them is a call here, so that effects and methods are written once. Tests run the GPU's calls on the
-CPU, as numbers by letting `device.accelerated` say yes to every device, and without numbers on torch's `meta`
-device, where whatever would make the host wait raises.
-
-Devices: whether what lies on one is left to a GPU, and waiting for it; `backend.py` is what differs.
+A run holds one of the two (`TrainData.backend`); `backend_of` gives the one of a tensor's device. Whatever
+differs between them is a call here, so that effects and methods are written once. Tests run the GPU's calls
+without a GPU: with numbers, by letting `accelerated` say yes to the CPU; and without numbers, on torch's
+`meta` device, where everything that would make the host wait raises an error.
 """
 
 from __future__ import annotations
@@ -22,32 +20,32 @@ from ambiguous_wild.splat.rendered import GSPLAT_SUMS, NEEDS, Rendered
 
 
 def accelerated(device: torch.device | str) -> bool:
-    """Whether what lies there is left to torch and gsplat; reading it back makes the host wait."""
+    """Whether torch and gsplat compute on this device; reading a value back makes the host wait."""
     return torch.device(device).type != "cpu"
 
 
 def wait(device: torch.device | str) -> None:
-    """Until what was launched there is done; elsewhere than on a GPU it is already."""
+    """Wait until a GPU has done what was launched on it; for other devices return at once."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
 
 
 Photometric = tuple[float | Tensor, float | Tensor, Tensor]  # L1, 1 - SSIM, gradient [H, W, 3] of their mix
-_LANES = 64  # sums a label while a GPU adds up
+_LANES = 64  # partial sums of each label while a GPU adds up
 
 
 class Backend:
-    """Every call, as the CPU answers it: by Numba's kernels, or torch's."""
+    """The calls that differ between back ends, as the CPU answers them: by Numba's kernels, or torch."""
 
-    statistics: ClassVar[Sequence[str]] = NEEDS  # what a backward pass can sum
-    kernels: ClassVar[bool] = True  # Numba's kernels take its tensors
-    reads_at_once: ClassVar[bool] = True  # a value is known at once; else the host waits for all queued work
-    same_bits: ClassVar[bool] = True  # one seed gives the same bits
+    statistics: ClassVar[Sequence[str]] = NEEDS  # what a backward pass can sum beside gradients
+    kernels: ClassVar[bool] = True  # Numba's kernels can read its tensors
+    reads_at_once: ClassVar[bool] = True  # False: to read a value, the host waits for all queued work
+    same_bits: ClassVar[bool] = True  # whether one seed gives the same bits
 
     # -- a step of training -----------------------------------------------------------------------
 
     def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
-        """A picture with its backward pass; `render.render` with every option given."""
+        """Draw a picture that has a backward pass: `render.render` with every option given."""
         from ambiguous_wild.splat.cpu.render import render_cpu
 
         return render_cpu(gaussians, camera, **options)
@@ -55,13 +53,13 @@ class Backend:
     def photometric(
         self, render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
     ) -> Photometric:
-        """The parts of `losses.photometric`, of arguments that were checked."""
+        """Return the parts of `losses.photometric`, for arguments that were checked."""
         from ambiguous_wild.splat.cpu.photometric import photometric_cpu
 
         return photometric_cpu(render, photo, keep, lambda_dssim, weighting)
 
     def ssim_map(self, a: Tensor, b: Tensor) -> Tensor:
-        """SSIM of every pixel and channel, [H, W, 3]."""
+        """Return SSIM of every pixel and channel, [H, W, 3]."""
         from ambiguous_wild.splat.cpu.photometric import ssim_map_cpu
 
         return ssim_map_cpu(a, b)
@@ -69,9 +67,9 @@ class Backend:
     def prepare_loss(
         self, device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
     ) -> None:
-        """Before the clock starts: compile the loss for photos of these heights and widths.
+        """Compile the loss for photos of these heights and widths, before the clock starts.
 
-        The CPU's kernels are compiled for all sizes, before any run.
+        Nothing to do on the CPU: its kernels are compiled for all sizes, before any run.
         """
 
     def adam_step(
@@ -86,11 +84,11 @@ class Backend:
         """One step of Adam (0.9, 0.999, 1e-15) on a tensor and its moments, float32, contiguous, in place.
 
         Args:
-            parameter, gradient: of one shape.
+            parameter, gradient: tensors of one shape.
             moments: mean and mean square.
             rate: learning rate.
-            steps: that were taken, this one included; on a GPU 0-d there.
-            called_off: on a GPU, [1] float32 there: 1 = change nothing.
+            steps: number of steps, this one included; on a GPU a 0-d tensor.
+            called_off: on a GPU a tensor [1] float32: 1 = change nothing.
         """
         from ambiguous_wild.splat.cpu import adam
 
@@ -98,13 +96,13 @@ class Backend:
         adam.dense_step(parameter, gradient, moments, rate, steps)
 
     def all_finite(self, tensors: Sequence[Tensor]) -> bool:
-        """Whether every value is finite; on a GPU a large but sound sum may say no."""
+        """Whether every value is finite; a GPU may say no where a sum of finite values overflows."""
         from ambiguous_wild.splat.cpu.adam import all_finite
 
         return all_finite(tensors)
 
     def max_alpha(self, device: torch.device | str) -> float:
-        """Where alpha is clamped."""
+        """Return the value at which alpha is clamped."""
         return 0.99
 
     def use_threads(self, n: int) -> None:
@@ -117,19 +115,19 @@ class Backend:
     # -- what effects and methods need ------------------------------------------------------------
 
     def number(self, value: Tensor) -> float | Tensor:
-        """The number in a 0-d tensor; on a GPU a float64 tensor, which `float(...)` reads later."""
+        """Return the number in a 0-d tensor; on a GPU a float64 tensor that `float(...)` reads later."""
         return float(value.detach())
 
     def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
-        """Rows [M] int64 where `visible()` [N] bool holds; on a GPU all rows, because the host would wait."""
+        """Return rows [M] int64 where `visible()` [N] bool holds; on a GPU all, or the host would wait."""
         return torch.nonzero(visible()).squeeze(1)
 
     def mean_of_rows(self, values: Tensor, visible: Callable[[], Tensor]) -> Tensor:
-        """Mean of values [M, ...] of `rows`; on a GPU of the rows [N, ...] where `visible()` holds."""
+        """Average values [M, ...] of `rows`; on a GPU those of the rows [N, ...] where `visible()` holds."""
         return values.mean()
 
     def neighbours(self, points: Tensor, count: int) -> Tensor:
-        """Rows [M, count] int64 of the points [M, 3] nearest to each, the nearest, itself, first."""
+        """Return the rows of the points nearest to each point [M, 3], itself first, [M, count] int64."""
         from scipy.spatial import cKDTree
 
         xyz = points.detach().double().numpy()
@@ -138,20 +136,20 @@ class Backend:
         return torch.from_numpy(tree.query(xyz, k=list(range(1, count + 1)))[1])
 
     def label_sums(self, labels: Tensor, count: int, values: Tensor | None = None) -> Tensor:
-        """[count] float64: sums of values [P] float64 by labels [P] int64 below `count`; None counts them."""
+        """Sum values [P] by their labels [P] int64 below `count`, [count] float64; None counts the labels."""
         return torch.bincount(labels, weights=values, minlength=count).double()
 
     def pose(self, camera: Camera, like: Tensor) -> Tensor:
-        """`cam_from_world` [4, 4] where `like` lies."""
+        """Return `cam_from_world` [4, 4] on the device of `like`."""
         return torch.tensor(camera.cam_from_world.tolist(), dtype=like.dtype)
 
     def adam(self, parameters: Iterable[torch.nn.Parameter], lr: float) -> torch.optim.Adam:
-        """Adam on a net's parameters; on a GPU one kernel, which keeps the step count there."""
+        """Return Adam for a net's parameters; on a GPU it is one kernel, and the step count lies there."""
         return torch.optim.Adam(parameters, lr=lr)
 
 
 class GpuBackend(Backend):
-    """torch and gsplat; the host waits once a picture, in gsplat."""
+    """The calls as torch and gsplat answer them; the host waits once for each picture, in gsplat."""
 
     statistics = GSPLAT_SUMS
     kernels = reads_at_once = same_bits = False
@@ -197,7 +195,7 @@ class GpuBackend(Backend):
         )  # fmt: skip
 
     def all_finite(self, tensors: Sequence[Tensor]) -> bool:
-        # a sum each: several times as fast as isfinite().all(), which writes a tensor of its own
+        # one sum for each tensor: several times as fast as isfinite().all(), which writes a tensor of its own
         return bool(torch.isfinite(torch.stack([tensor.sum() for tensor in tensors])).all())
 
     def max_alpha(self, device: torch.device | str) -> float:
@@ -245,5 +243,5 @@ _CPU, _GPU = Backend(), GpuBackend()
 
 
 def backend_of(device: torch.device | str) -> Backend:
-    """The back end that computes with tensors on this device."""
+    """Return the back end that computes with tensors on this device."""
     return _GPU if accelerated(device) else _CPU

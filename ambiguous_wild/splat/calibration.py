@@ -1,9 +1,9 @@
-"""Kernels before a run: compiled once a machine, and timed, to know how fast the machine is now.
+"""What is done with kernels before a run: compile them once a machine, and time a fixed piece of training.
 
-The timed kernel is a fixed piece of training: blending and Adam. It runs the trainer's own code with the
-trainer's threads, so that other programs slow it down as they slow a training down. The scene never changes:
-learning rates are 0. A change of the work needs a new name in `KERNELS`, because seconds of different kernels
-cannot be compared.
+The timed kernel, blending and Adam, tells how fast the machine is now. It runs the trainer's own code with
+the trainer's threads, so that other programs slow it down as they slow down a training. Its scene never
+changes: learning rates are 0. If its work is changed, its name in `KERNELS` must change too, because seconds
+of different kernels cannot be compared.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from ambiguous_wild.splat.rendered import Cotangents
 
 @dataclass(frozen=True)
 class Size:
-    """Work of a kernel."""
+    """The work of a calibration kernel."""
 
-    name: str  # in the record of a run
+    name: str  # name in the record of a run
     reference_s: float  # seconds on the reference machine
     gaussians: int
     width: int
     height: int
     steps: int
-    serial_steps: int = 0  # on one thread; 0 = none, as on a GPU
+    serial_steps: int = 0  # further steps on one thread; 0 = none, as on a GPU
     serial_reference_s: float = 1.0
 
 
@@ -50,19 +50,19 @@ KERNELS = {
 
 @dataclass(frozen=True)
 class Reading:
-    """One calibration.
+    """The result of one calibration.
 
-    Load slows work on one thread less than work on several: a training is compared with both.
+    Load slows work on one thread less than work on several, so a training is compared with both.
     """
 
-    seconds: float  # of the kernel
-    processors: float = 1.0  # that it got: processor seconds a second
-    serial_s: float | None = None  # of the steps on one thread
+    seconds: float  # wall time of the kernel
+    processors: float = 1.0  # processor seconds that it got in a second
+    serial_s: float | None = None  # wall time of the steps on one thread
     serial_processors: float = 1.0
 
 
 class Calibration:
-    """The kernel on one device."""
+    """The calibration kernel on one device."""
 
     def __init__(self, device: torch.device, size: Size) -> None:
         self.device, self.size = device, size
@@ -75,10 +75,10 @@ class Calibration:
         self.cameras = [Camera(*lens, _moved(shift)) for shift in (-0.4, 0.0, 0.4)]
         self.photo = torch.full((size.height, size.width, 3), 0.5, device=device)
         self.optimiser = SplatAdam(self.gaussians, {name: 0.0 for name, _ in self.gaussians.items()})
-        self._steps(1)  # first use allocates
+        self._steps(1)  # the first use allocates memory
 
     def seconds(self) -> float:
-        """Run the kernel once; returns its wall seconds, on a GPU those between two of its events."""
+        """Run the kernel once; returns its wall seconds, on a GPU the seconds between two GPU events."""
         if self.device.type != "cuda":
             begin = time.perf_counter()
             self._steps(self.size.steps)
@@ -115,7 +115,7 @@ class Calibration:
 
 @lru_cache(maxsize=1)
 def calibration(device: torch.device) -> Calibration:
-    """The kernel of a device; made once a process."""
+    """Return the kernel of a device, made once a process."""
     return Calibration(device, KERNELS["cuda" if device.type == "cuda" else "cpu"])
 
 
@@ -125,7 +125,7 @@ def _moved(shift: float) -> np.ndarray:
     return pose
 
 
-COLD_S = 35  # measured, one core at 2.6 GHz
+COLD_S = 35  # seconds to compile all kernels, measured on one core at 2.6 GHz
 
 
 def _tiny_scene() -> tuple[Gaussians, Camera]:
@@ -147,7 +147,7 @@ def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
     """Run every kernel that all methods need on eight Gaussians; returns the seconds it took.
 
     Args:
-        announce: told once, before, if the compiled kernels are not on disk yet.
+        announce: gets a message before the compilation, if the compiled kernels are not on disk yet.
     """
     from ambiguous_wild.splat.cpu.adam import all_finite
     from ambiguous_wild.splat.cpu.render import render_cpu
@@ -169,7 +169,7 @@ def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
     gradients = rendered.backward(loss.d_image)
     rendered.backward(Cotangents(loss.d_image, extra=loss.d_image))
     rendered.backward(loss.d_image, frozenset({"absolute"}))
-    # as many tensors as the watchdog gives: of gradients, of parameters
+    # the watchdog passes as many tensors of gradients and of parameters
     all_finite([tensor for name, tensor in gaussians.items() if name != "sh_rest"])
     all_finite([tensor for _, tensor in gaussians.items()])
     optimiser.step(gradients, rendered.visible)
@@ -183,8 +183,8 @@ def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: N
     """Set the threads of the kernels and compile them, once per machine.
 
     Args:
-        threads: of the kernels; None = as many as there are.
-        say: told when something is compiled.
+        threads: number of threads; None = all that the machine has.
+        say: gets a message when kernels are compiled.
     """
     from ambiguous_wild.splat.cpu import set_threads
 

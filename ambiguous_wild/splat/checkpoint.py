@@ -17,17 +17,18 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import State
 from ambiguous_wild.io.files import atomic_path
 
 FORMAT = "ambiguous_wild/1"
 _TENSOR = "@tensor"  # stands in the plain tree where a tensor was
 
 
-def save(path: Path | str, tree: Mapping[str, Any]) -> None:
+def save(path: Path | str, tree: State) -> None:
     """Write a nested dict of tensors, arrays, numbers, strings, lists and None, atomically.
 
     Raises:
-        TypeError: a value that is none of these.
+        TypeError: a value is of another type.
     """
     tensors: dict[str, torch.Tensor] = {}
     plain = _split(tree, "", tensors)
@@ -35,11 +36,11 @@ def save(path: Path | str, tree: Mapping[str, Any]) -> None:
         save_file(tensors, temporary, metadata={"format": FORMAT, "plain": json.dumps(plain)})
 
 
-def load(path: Path | str) -> dict[str, Any]:
-    """Read what `save` wrote; tensors land on the CPU.
+def load(path: Path | str) -> State:
+    """Read what `save` wrote, with tensors on the CPU.
 
     Raises:
-        AwError: not such a file, or damaged.
+        AwError: the file is no checkpoint of this version, or is damaged.
     """
     try:
         with safe_open(str(path), framework="pt", device="cpu") as f:

@@ -1,8 +1,9 @@
-"""Photos of the training side: read, at every resolution of the schedule, where the training reads them.
+"""Photos of the training side, at every resolution of the schedule, on the device that trains.
 
 Photos that fit into `RESIDENT` of a GPU's free memory stay there for the whole run. Others stay in pinned
-memory of the host, as 8-bit codes if their files have 8 bits: a quarter of the bytes. The loop announces the
-next view (`prefetch`), its photo is copied while the GPU computes, and the GPU, not the host, waits for it.
+memory of the host, as 8-bit codes if their files have 8 bits: a quarter of the bytes. The training loop
+announces the next view (`prefetch`); its photo is copied while the GPU computes, and the GPU, not the host,
+waits for it.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from ambiguous_wild.splat.step import TrainData
 def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir: Path) -> TrainData:
     """Read the train photos and the user's own keep masks.
 
-    Masks lie on the device; so do photos, unless they would fill it.
+    Masks are put on the device, and photos too, unless they would fill it.
 
     Raises:
-        AwError: no train view, or a photo whose size is not its camera's.
+        AwError: there is no train view, or a photo differs in size from its camera.
     """
     if not scene.train:
         raise AwError(f"scene {scene.root} has no training views: check train_list.txt")
@@ -68,13 +69,15 @@ def _load_photo(view: View) -> np.ndarray:
 def load_keep(
     view: View, *, with_alpha: bool = True
 ) -> np.ndarray | None:  # [H, W] float32 in {0, 1}, 1 = static
-    """What a photo's keep mask and its alpha keep, None without both; a mask of the full photo is reduced.
+    """Return the keep map of a photo, from its mask and its alpha; None if it has neither.
+
+    A mask of the full-size photo is reduced.
 
     Args:
-        with_alpha: not in scene folders of ours, whose masks hold what the import kept of alpha.
+        with_alpha: whether alpha is read; masks of our own scene folders contain it already.
 
     Raises:
-        AwError: a mask of another shape than its photo.
+        AwError: the mask and its photo differ in shape.
     """
     size = (view.camera.height, view.camera.width)
     alpha = read_alpha(view.image_path) if with_alpha else None
@@ -92,7 +95,7 @@ def load_keep(
 
 
 def shrink(image: Tensor, divisor: int) -> Tensor:
-    """[H, W, 3] to [H // divisor, W // divisor, 3], area-averaged; divisor 1 returns it unchanged."""
+    """Average [H, W, 3] over areas to [H // divisor, W // divisor, 3]; divisor 1 returns it unchanged."""
     if divisor == 1:
         return image
     height, width = image.shape[0] // divisor, image.shape[1] // divisor
@@ -102,7 +105,7 @@ def shrink(image: Tensor, divisor: int) -> Tensor:
 
 
 def shrink_keep(keep: Tensor, divisor: int) -> Tensor:
-    """[H, W] to [H // divisor, W // divisor]: kept only where every parent pixel is kept."""
+    """Reduce [H, W] to [H // divisor, W // divisor]: kept only where every pixel below is kept."""
     if divisor == 1:
         return keep
     height, width = keep.shape[0] // divisor, keep.shape[1] // divisor
@@ -110,88 +113,86 @@ def shrink_keep(keep: Tensor, divisor: int) -> Tensor:
 
 
 def shrink_camera(camera: Camera, divisor: int) -> Camera:
-    """The camera of `shrink`'s image."""
+    """Return the camera of an image that `shrink` made."""
     return camera if divisor == 1 else camera.resized(camera.width // divisor, camera.height // divisor)
 
 
 class Pyramid:
-    """Smaller photos are made when they are first asked for."""
+    """The train photos and cameras at every size; smaller photos are made when they are first asked for."""
 
     def __init__(self, data: TrainData) -> None:
         self._data = data
         self._photos: dict[tuple[int, int], Tensor] = {}
         self._cameras: dict[tuple[int, int], Camera] = {}
-        # where photos do not fit on the device: copies the next one there while a step runs
+        # copies the next photo to the device while a step runs; None = all photos fit on it
         self.prefetch = getattr(data.photos, "prefetch", None)
 
     def sizes(self, divisors: Iterable[int]) -> frozenset[tuple[int, int]]:
-        """Heights and widths of all photos at these divisors."""
+        """Return the heights and widths of all photos at these divisors."""
         full = {(camera.height, camera.width) for camera in self._data.cameras}
         return frozenset((h // d, w // d) for h, w in full for d in divisors)
 
     def photo(self, view: int, divisor: int) -> Tensor:
-        """[H // divisor, W // divisor, 3] of a train photo."""
+        """Return a train photo at this size, [H // divisor, W // divisor, 3]."""
         if divisor == 1:
             return self._data.photos[view]
-        if (
-            self.prefetch is not None
-        ):  # photos do not fit on the device: neither would smaller ones beside them
+        if self.prefetch is not None:  # the device has no room for photos, so none for smaller copies either
             return shrink(self._data.photos[view], divisor)
         if (view, divisor) not in self._photos:
             self._photos[view, divisor] = shrink(self._data.photos[view], divisor)
         return self._photos[view, divisor]
 
     def camera(self, view: int, divisor: int) -> Camera:
-        """Its camera. Made once: what a back end keeps of a camera it finds again by the object."""
+        """Return the camera of `photo`, always the same object: back ends remember cameras by identity."""
         if (view, divisor) not in self._cameras:
             self._cameras[view, divisor] = shrink_camera(self._data.cameras[view], divisor)
         return self._cameras[view, divisor]
 
 
-RESIDENT = 0.25  # of a GPU's free memory; Gaussians, their moments and gsplat's lists need the rest
-READY = 3  # photos on the device at a time: of this step, of the next, and one more for comparisons
+RESIDENT = 0.25  # share of a GPU's free memory; Gaussians, their moments and gsplat's lists need the rest
+READY = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
 
 
 class CudaCopies:
-    """Sends tensors to a GPU on a stream of their own, without making the host wait."""
+    """Sends tensors to a GPU on a separate stream, without making the host wait."""
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.stream = device, torch.cuda.Stream(device)
 
     def hold(self, tensor: Tensor) -> Tensor:
-        """The tensor in memory that it can be sent from."""
+        """Return the tensor in pinned memory, from which it can be sent."""
         try:
             return tensor.pin_memory()
-        except RuntimeError:  # the system pins no more: the host waits for such a copy
+        except RuntimeError:  # no more memory can be pinned: the host will wait for this copy
             return tensor
 
     def begin(self, tensor: Tensor) -> tuple[Tensor, Any]:
-        """Start to send it; returns what `finish` needs."""
+        """Start to send the tensor; returns what `finish` needs."""
         with torch.cuda.stream(self.stream):
-            there = tensor.to(self.device, non_blocking=True)
-        return there, self.stream.record_event()
+            on_gpu = tensor.to(self.device, non_blocking=True)
+        return on_gpu, self.stream.record_event()
 
     def finish(self, sent: tuple[Tensor, Any]) -> Tensor:
-        """The tensor on the device, for what is launched from now on."""
-        there, arrived = sent
+        """Return the tensor on the device; work launched from now on waits for it."""
+        on_gpu, arrived = sent
         current = torch.cuda.current_stream(self.device)
         current.wait_event(arrived)
-        there.record_stream(current)  # its memory is not given away before `current` has read it
-        return there
+        on_gpu.record_stream(current)  # its memory is not given away before `current` has read it
+        return on_gpu
 
 
 class Photos(Sequence[Tensor]):
-    """Photos [H, W, 3] float32 in [0, 1] on the device, of which a few lie there at a time."""
+    """Photos [H, W, 3] float32 in [0, 1], of which only a few lie on the device at a time."""
 
     def __init__(self, held: Sequence[Tensor], device: torch.device, copies: CudaCopies) -> None:
         """
         Args:
-            held: [H, W, 3] each, in the host's memory: uint8 codes, or float32.
-            device: where they are read.
-            copies: sends them there.
+            held: photos [H, W, 3] in the host's memory, uint8 codes or float32.
+            device: where photos are read.
+            copies: sends them to the device.
         """
         self._held, self._device, self._copies = held, device, copies
-        # On the device: by a number of the host, torch's division there multiplies by its reciprocal.
+        # A tensor on the device: a division by a Python number would multiply by its rounded reciprocal.
         self._most = torch.tensor(255.0, device=device)
         self._coming: dict[int, Any] = {}
         self._ready: dict[int, Tensor] = {}
@@ -212,13 +213,13 @@ class Photos(Sequence[Tensor]):
             self.prefetch(index)
             photo = self._copies.finish(self._coming.pop(index))
             photo = photo if photo.dtype == torch.float32 else photo.float() / self._most
-        self._ready[index] = photo  # last: read most recently
+        self._ready[index] = photo  # at the end: read most recently
         while len(self._ready) > READY:
             del self._ready[next(iter(self._ready))]
         return photo
 
     def prefetch(self, index: int) -> None:
-        """Start to send this photo, unless it is there or on its way."""
+        """Start to send this photo, unless it is on the device or on its way."""
         if index not in self._ready and index not in self._coming:
             while len(self._coming) >= READY:  # announced and never read
                 del self._coming[next(iter(self._coming))]
@@ -226,12 +227,12 @@ class Photos(Sequence[Tensor]):
 
 
 def fit(needed: int, device: torch.device) -> bool:
-    """Whether so many bytes of photos may lie on the device for the whole run."""
+    """Whether this many bytes of photos may stay on the device for the whole run."""
     return device.type != "cuda" or needed <= RESIDENT * torch.cuda.mem_get_info(device)[0]
 
 
 def on_device(photos: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
-    """Photos [H, W, 3] float32 of the host where the training reads them, all there or a few at a time."""
+    """Put photos [H, W, 3] float32 of the host on the device, all or a few at a time."""
     if fit(sum(4 * photo.numel() for photo in photos), device):
         return [photo.to(device) for photo in photos]
     copies = CudaCopies(device)

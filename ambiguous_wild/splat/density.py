@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.gaussians import rotation_matrices as rotation_matrices
 from ambiguous_wild.splat.records import DensityLog
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
 
 
-NO_SIZE_PRUNING = 1e9  # `prune_scale` of those who prune by opacity alone
+NO_SIZE_PRUNING = 1e9  # `prune_scale` for methods that prune by opacity alone
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class DensityConfig:
     min_every: int = 50  # a short run densifies less often, so that each decision averages enough views
     resets: tuple[float, ...] = (3000.0, 6000.0, 9000.0, 12_000.0)
     min_reset_spacing: int = 3000  # real iterations between resets, and before the first
-    min_reset_rest: int = 6000  # real iterations that must remain: a reset costs decibels until it heals
+    min_reset_rest: int = 6000  # real iterations left after a reset: until then it costs decibels
     grow_grad: float = 2e-4  # mean norm of dL/d(u, v), scaled to half the image size
     grow_scale: float = 0.01  # of the scene extent: clone below, split above
     prune_opacity: float = 0.005
     prune_scale: float = 0.1  # of the scene extent, applied after the first reset
     reset_opacity: float = 0.01
-    max_gaussians: int = 1_000_000  # growth stops here unless the run says otherwise: largest gradients first
+    max_gaussians: int = 1_000_000  # growth stops here; largest gradients first
 
     def __post_init__(self) -> None:
         check_limits(
@@ -60,7 +60,7 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class Growth:
-    """What one round of growth makes more of."""
+    """The rows that one round of growth copies or splits."""
 
     clones: Tensor  # [a] int64, rows that are copied
     splits: Tensor  # [b] int64, rows that two smaller samples replace
@@ -69,16 +69,16 @@ class Growth:
 class DensityControl:
     """Accumulates the screen-space statistic and changes the set of Gaussians on schedule.
 
-    Override `statistic` to decide by another gradient, `choose` to decide otherwise who grows,
-    `before_step` to add a regulariser, `refine` for a schedule of your own.
+    Override `statistic` to decide by another gradient, `choose` to select other rows for growth,
+    `before_step` to add a regulariser, `refine` for another schedule.
     """
 
     # statistics of the backward pass beyond the signed sums, of `rendered.NEEDS`
     needs: ClassVar[frozenset[str]] = frozenset()
-    reads_keep: ClassVar[bool] = False  # whether `observe` does
-    # as WildGaussians: rows change before the optimiser moves, which then leaves out that step
+    reads_keep: ClassVar[bool] = False  # whether `observe` reads the keep map
+    # True as in WildGaussians: rows change before the optimiser's step, which is then left out
     before_optimiser: ClassVar[bool] = False
-    # sums of every Gaussian since the last round, by attribute, with what follows [N]
+    # sums for each Gaussian since the last round: attribute name, and the shape after [N]
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": ()}
 
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
@@ -93,7 +93,7 @@ class DensityControl:
         self.last_reset = 0  # iteration
         self.resets_done = 0
         self.log = DensityLog()  # for pictures; decides nothing
-        # of means [N, 3] the rows [N] that are neither copied nor removed: an effect's; None = there are none
+        # function of means [N, 3] that returns rows [N] bool which an effect protects; None = there are none
         self.protected: Callable[[Tensor], Tensor] | None = None
         self._halves: dict[tuple[int, int], Tensor] = {}
 
@@ -101,21 +101,21 @@ class DensityControl:
         """Called once before the first step, and again when a run resumes."""
 
     def before_step(self, step: Step, gradients: Gradients) -> Gradients:
-        """The gradients that the optimiser takes: a place for regularisers of the parameters."""
+        """Return the gradients for the optimiser: a place for regularisers of the parameters."""
         return gradients
 
     def statistic(self, gradients: Gradients) -> Tensor:
-        """The screen-space gradient [N, 2] in 1/px that decides growth."""
+        """Return the screen-space gradient [N, 2] in 1/px that decides growth."""
         return gradients.screen
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
-        """Add one view's statistic, scaled to half the image size so that it is resolution-free.
+        """Add one view's statistic, times half the image size, so that it does not depend on resolution.
 
         Args:
-            step: the view's.
-            gradients: of the whole loss.
-            keep: [H, W] what weighed the loss, 1 = static; None = all of it. Not read here.
+            step: the training step of the view.
+            gradients: gradients of the whole loss.
+            keep: [H, W] weights of the loss, 1 = static; None = 1 everywhere. Not read here.
         """
         if step.nominal > self.config.stop:
             return
@@ -131,15 +131,15 @@ class DensityControl:
         """Grow, prune and reset if it is time.
 
         Returns:
-            The Gaussians to go on with and what happened: any of "grow", "reset".
+            The Gaussians to go on with, and the events: any of "grow", "reset".
         """
         events: list[str] = []
         if self._growth_due(step):
             self._match(gaussians)
-            # Lazily stepped rows are brought up to date first: growth copies parameters.
+            # Bring postponed rows up to date first: growth copies parameters.
             optimiser.flush()
             self.log.begin(step.iteration)
-            self._ignore_spared(gaussians)
+            self._ignore_protected(gaussians)
             gaussians = self._grow(step, gaussians, optimiser)
             gaussians = self._prune(gaussians, optimiser)
             gaussians = self.after_growth(step, gaussians, optimiser)
@@ -155,22 +155,22 @@ class DensityControl:
         return gaussians, events
 
     def mutable_rows(self, rows: Tensor, gaussians: Gaussians) -> Tensor:
-        """[N] bool: of these rows those that may be copied and removed."""
+        """Return those of these rows that are not protected, [N] bool."""
         return rows if self.protected is None else rows & ~self.protected(gaussians.means)
 
     def leaves_only_protected(self, drop: Tensor, gaussians: Gaussians) -> bool:
-        """Whether nothing but spared rows would stay: such a model cannot learn again, so all rows stay."""
+        """Whether only protected rows would remain; then no row is dropped, or nothing could learn."""
         return not bool(self.mutable_rows(~drop, gaussians).any())
 
     def weights(self, gaussians: Gaussians) -> Tensor:
-        """[N] of a mean over the Gaussians, for losses on them: the spared ones count nothing."""
-        free = self.mutable_rows(
+        """Return weights [N] for a mean over the Gaussians in a loss; protected ones have weight 0."""
+        mutable = self.mutable_rows(
             torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians
         )
-        return free / free.sum().clamp(min=1)
+        return mutable / mutable.sum().clamp(min=1)
 
-    def _ignore_spared(self, gaussians: Gaussians) -> None:
-        """As if no view had seen the spared rows since the last round."""
+    def _ignore_protected(self, gaussians: Gaussians) -> None:
+        """Zero the sums of protected rows, as if no view had seen them since the last round."""
         if self.protected is not None:
             rows = self.protected(gaussians.means)
             for name in self.sums:
@@ -181,9 +181,9 @@ class DensityControl:
         gaussians.opacity_logits.clamp_(max=_logit(self.config.reset_opacity))
 
     def due(self, step: Step) -> bool:
-        """Whether `refine` may change something now; whoever overrides `refine` extends this.
+        """Whether `refine` may change something now; classes that override `refine` extend it.
 
-        On an accelerator the host asks then, and only then, whether the photo was all masked.
+        Only then does the host of an accelerator check whether the photo was fully masked.
         """
         config = self.config
         resets = self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]
@@ -196,15 +196,15 @@ class DensityControl:
         return due and self._crossed(step, config.every)
 
     def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
-        """Hook: change the set once more after growth and pruning (merging, for one)."""
+        """Hook: change the set once more after growth and pruning, for example by merging."""
         return gaussians
 
     def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
-        """Hook: where copies go relative to their originals, [len(rows), 3]; None = the same place."""
+        """Hook: return the offsets of copies from their originals, [len(rows), 3]; None = none."""
         return None
 
     def _half(self, width: int, height: int, device: torch.device) -> Tensor:
-        """[2] half a picture's size, copied once: a copy from the host in every step makes it wait."""
+        """Return half a picture's size [2], copied once: a copy in every step would make the host wait."""
         if (width, height) not in self._halves:
             self._halves[width, height] = torch.tensor([width / 2, height / 2]).to(device)
         return self._halves[width, height]
@@ -217,7 +217,7 @@ class DensityControl:
     def _reset_due(self, step: Step) -> bool:
         config = self.config
         while self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]:
-            grows = config.resets[self.resets_done] <= config.stop  # as in 3DGS: none after growth
+            grows = config.resets[self.resets_done] <= config.stop  # as in 3DGS: no reset after growth ends
             self.resets_done += 1
             rest = step.iteration * (NOMINAL_ITERATIONS / step.nominal - 1.0)
             apart = step.iteration - self.last_reset >= config.min_reset_spacing
@@ -226,18 +226,18 @@ class DensityControl:
         return False
 
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
-        """The rows that grow in this round, no more than `room` says."""
+        """Choose the rows that grow in this round, at most `room` of them."""
         score = self.grad_sum / self.seen.clamp(min=1)
         chosen = largest(score, score > self.config.grow_grad, self.room(step, gaussians))
         small = self.small(gaussians)
         return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
 
     def room(self, step: Step, gaussians: Gaussians) -> int:
-        """Gaussians that may be added now."""
+        """Return how many Gaussians may be added now."""
         return max(step.ceiling - len(gaussians), 0)
 
     def small(self, gaussians: Gaussians) -> Tensor:
-        """[N] bool, no larger than what growth clones; the others are split."""
+        """Return which Gaussians are small enough to be cloned, [N] bool; growth splits the others."""
         return gaussians.log_scales.exp().amax(dim=1) <= self.config.grow_scale * self.extent
 
     def _grow(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
@@ -260,7 +260,7 @@ class DensityControl:
         return gaussians
 
     def _split_half(self, parents: Gaussians) -> Gaussians:
-        """One of two samples drawn from each parent, 1.6 times smaller."""
+        """Draw one sample from each parent, 1.6 times smaller."""
         noise = torch.from_numpy(self.rng.standard_normal((len(parents), 3)).astype(np.float32))
         parents.means += shaped(noise.to(parents.device), parents)
         parents.log_scales -= float(np.log(1.6))
@@ -278,7 +278,7 @@ class DensityControl:
         return self.keep_rows(gaussians, optimiser, ~drop)
 
     def keep_rows(self, gaussians: Gaussians, optimiser: SplatAdam, stay: Tensor) -> Gaussians:
-        """Drop rows everywhere at once: parameters, moments, statistics."""
+        """Keep these rows and drop the others, in parameters, moments and statistics at once."""
         optimiser.select(stay)
         self._select(stay)
         return gaussians.select(stay)
@@ -299,7 +299,7 @@ class DensityControl:
         for name, shape in self.sums.items():
             setattr(self, name, torch.zeros(len(gaussians), *shape, device=gaussians.device))
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {
             **{name: getattr(self, name) for name in self.sums},
             "last_growth": self.last_growth,
@@ -309,7 +309,7 @@ class DensityControl:
             "log": self.log.state_dict(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         for name in self.sums:
             setattr(self, name, state[name])
         self.last_growth, self.last_reset = state["last_growth"], state["last_reset"]
@@ -319,7 +319,7 @@ class DensityControl:
 
 
 def largest(score: Tensor, chosen: Tensor, room: int) -> Tensor:
-    """[N] bool: of the chosen rows the `room` with the largest score."""
+    """Return those `room` of the chosen rows that have the largest score, [N] bool."""
     if int(chosen.sum()) <= room:
         return chosen
     # stable sort: ties are broken by row, so the same seed gives the same set
@@ -332,7 +332,7 @@ def largest(score: Tensor, chosen: Tensor, room: int) -> Tensor:
 
 
 def shaped(noise: Tensor, gaussians: Gaussians) -> Tensor:
-    """Normal draws [N, 3] as offsets from the means [N, 3], with the Gaussians' covariances."""
+    """Turn normal draws [N, 3] into offsets from the means [N, 3] with the Gaussians' covariances."""
     local = noise * gaussians.log_scales.exp()
     return (rotation_matrices(gaussians.quats) @ local[:, :, None]).squeeze(2)
 

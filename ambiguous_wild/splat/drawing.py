@@ -1,4 +1,4 @@
-"""One call that draws a shot as a run does: effects, fields, SH degree, background and filter."""
+"""One call that draws a shot as the run does: with its effects, fields, SH degree, background and filter."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import State
 from ambiguous_wild.splat.effects.chain import Chain
 from ambiguous_wild.splat.field import Field
 from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart, renders_of
@@ -20,7 +21,7 @@ from ambiguous_wild.splat.step import Shot, Step, TrainData
 
 
 class SceneRenderer:
-    """Draws for one run, and holds the fields beside the static one."""
+    """Draws the pictures of one run, and holds its fields beside the static one."""
 
     def __init__(self, data: TrainData, parts: Parts, static: Field, effects: Chain | None) -> None:
         """
@@ -28,10 +29,10 @@ class SceneRenderer:
             data: the training side.
             parts: the method.
             static: the first field.
-            effects: of the run.
+            effects: the run's effects; None = it has none.
 
         Raises:
-            AwError: a field is called as the static one is.
+            AwError: a field has the name of the static one.
         """
         self.parts, self.effects, self.static = parts, effects, static
         self.others: dict[str, Field] = {}
@@ -41,7 +42,7 @@ class SceneRenderer:
                 self._add(name, start, data)
 
     def _static_rates(self, progress: float) -> dict[str, float]:
-        """Of the static field's parameters; those of effects' rows are not another field's."""
+        """Return the learning rates of the static field's parameters, without those of attributes."""
         rates = self.static.rates(progress)
         return {name: rates[name] for name in PARAMETERS}
 
@@ -58,13 +59,13 @@ class SceneRenderer:
     # -- pictures ---------------------------------------------------------------------------------
 
     def __call__(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
-        """Draw the model; the shot's camera is as the effects have it."""
+        """Draw the model; effects have already changed the shot's camera."""
         if self.effects is None:
             return self._compose(gaussians, shot, None)
         return self.effects.render(gaussians, shot, self._compose, without)
 
     def again(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
-        """Another picture of a step, see `Step.draw`."""
+        """Draw another picture of a step, see `Step.draw`."""
         if gaussians is self.static.gaussians:
             return self(gaussians, shot, without)
         shot = replace(shot, other_gaussians=True)
@@ -73,13 +74,13 @@ class SceneRenderer:
         return self.effects.render(gaussians, shot, self._draw, without)
 
     def fit(self, gaussians: Gaussians, shot: Shot, photo: Tensor, keep: Tensor) -> Tensor:
-        """A picture under the colours of its photo, see `Chain.fit_view`."""
+        """Draw a picture in the colours of its photo, see `Chain.fit_view`."""
         if self.effects is None:
             return self(gaussians, shot).image
         return self.effects.fit_view(gaussians, shot, photo, keep, self._draw)
 
     def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
-        """The Gaussians as they are drawn for no photo in particular."""
+        """Return the Gaussians as they are drawn when the picture belongs to no photo."""
         if self.effects is None:
             return gaussians
         return self.effects.neutral_model(gaussians, iteration)
@@ -101,39 +102,40 @@ class SceneRenderer:
         fields = self.parts.fields
         if fields is None or shot.view is None:
             return rendered
-        bent = {name: fields.deform(name, self.others[name].gaussians, shot) for name in fields.drawn(shot)}
+        names = fields.drawn(shot)
+        deformed = {name: fields.deform(name, self.others[name].gaussians, shot) for name in names}
         drawn = {
             name: self._draw(gaussians.share_pending_updates(self.others[name].gaussians), shot, None)
-            for name, (gaussians, _) in bent.items()
+            for name, (gaussians, _) in deformed.items()
         }
-        pulls = {name: pull for name, (_, pull) in bent.items()}
+        pulls = {name: pull for name, (_, pull) in deformed.items()}
         needs = {name: control.needs for name in drawn if (control := self.others[name].density) is not None}
         return Composite(fields, {STATIC: rendered, **drawn}, needs, shot, pulls)
 
     # -- the other fields -------------------------------------------------------------------------
 
     def with_other_pictures(self, step: Step, keep: Tensor | None, gradients: Gradients) -> Gradients:
-        """The step's gradients with those of pictures that the fields drew by themselves."""
+        """Add the gradients of pictures that the fields drew themselves to the step's gradients."""
         if self.parts.fields is None:
             return gradients
         more = dict(self.parts.fields.gradients(step, keep))
         static = more.pop(STATIC, None)
         if static is not None:
             gradients = gradients + static
-        known = gradients.fields
-        summed = {name: known[name] + g if name in known else g for name, g in more.items()}
-        return replace(gradients, fields={**known, **summed})
+        present = gradients.fields
+        summed = {name: present[name] + g if name in present else g for name, g in more.items()}
+        return replace(gradients, fields={**present, **summed})
 
     def learn(
         self, step: Step, gradients: Mapping[str, Gradients], progress: float, called_off: Tensor | None
     ) -> None:
-        """A step of every other field that has gradients, and its density control."""
+        """Run the optimiser and density control of every other field that has gradients."""
         for name, own in gradients.items():
             field = self.others[name]
             most = self._most[name]
             if called_off is not None and own.visible is not None:
                 own = replace(own, visible=own.visible & (called_off == 0))
-            # density control reads who was seen of the field's own render
+            # density control takes the visible rows from the field's own render
             rendered = renders_of(step.rendered).get(name, step.rendered)
             if own.visible is not None and rendered is not step.rendered:
                 rendered = with_visible(rendered, own.visible)
@@ -146,15 +148,15 @@ class SceneRenderer:
             field.learn(own, progress, called_off)
             field.refine(seen, own, None)
 
-    def state_dict(self) -> dict[str, object]:
-        """Of the other fields; nothing where there are none."""
+    def state_dict(self) -> State:
+        """Return the state of the other fields by name; empty if there are none."""
         return {name: field.state_dict() for name, field in self.others.items()}
 
-    def load_state_dict(self, state: Mapping[str, dict[str, object]], device: torch.device) -> None:
+    def load_state_dict(self, state: State, device: torch.device) -> None:
         """Restore what `state_dict` returned.
 
         Raises:
-            KeyError: a field is missing.
+            KeyError: the state lacks a field.
         """
         for name, field in self.others.items():
             field.load_state_dict(state[name], device)

@@ -1,7 +1,7 @@
 """Fields beside the static one, and how the pictures of several fields become one.
 
-Test views show the static field alone. DeSplat's distractors of a view, HybridGS's 2D Gaussians of a photo,
-a deformed transient field or the twin of AsymGS are fields of their own.
+Test views show the static field alone. Other fields are DeSplat's distractors of a view, HybridGS's 2D
+Gaussians of a photo, a deformed transient field, and the twin of AsymGS.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.field import Rates
@@ -32,7 +32,7 @@ from ambiguous_wild.splat.rendered import (
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
 STATIC = "static"  # name of the first field, the one that is the result
-# dL/d(composed pictures) to those of every field's own pictures
+# from dL/d(composed pictures) to dL/d(pictures of every field), by field
 ComposePull = Callable[[Cotangents], Mapping[str, Cotangents]]
 
 
@@ -43,7 +43,7 @@ class FieldStart:
     gaussians: Gaussians
     rates: Rates
     density: DensityControl | None = None
-    most: int | None = 1_000_000  # its growth stops there; None = where the static field's does
+    most: int | None = 1_000_000  # its growth stops there; None = at the limit of the static field
 
 
 class Fields(ABC):
@@ -51,7 +51,7 @@ class Fields(ABC):
 
     @abstractmethod
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
-        """The other fields by name, once before the first step (and when a run resumes).
+        """Return the other fields by name; called before the first step, and again when a run resumes.
 
         Args:
             data: the training side.
@@ -60,36 +60,36 @@ class Fields(ABC):
         """
 
     def required_effect(self) -> Effect | None:
-        """The effect of their method that they cannot work without; a graft that lacks it is refused."""
+        """Return the effect that the fields need to work; a graft without it is refused."""
         return None
 
     def drawn(self, shot: Shot) -> Sequence[str]:
-        """Fields that take part in this picture beside the static one; only asked for train photos."""
+        """Return the names of the other fields in this picture; only called for train photos."""
         return ()
 
     def deform(self, name: str, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
-        """A field's Gaussians as they are drawn for this picture, and the pull to those that learn."""
+        """Return a field's Gaussians as they are drawn for this picture, and the pull to its parameters."""
         return gaussians, lambda gradients: gradients
 
     def compose(self, frames: Mapping[str, Frame], shot: Shot) -> tuple[Frame, ComposePull]:
-        """One picture of the frames of `STATIC` and of those that `drawn` names, and the pull."""
+        """Compose the frames of `STATIC` and of the fields in `drawn` to one; also returns the pull."""
         return frames[STATIC], lambda cotangents: {STATIC: cotangents}
 
     def regularise(self, frames: Mapping[str, Frame], shot: Shot) -> Mapping[str, Cotangents]:
-        """Gradients of losses on the fields' own pictures (coverage, for one), by field."""
+        """Return gradients of losses on the fields' own pictures, for example on their coverage, by field."""
         return {}
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
-        """Gradients of pictures of one's own (`Step.draw`), added to the step's; by field."""
+        """Return gradients of further pictures (`Step.draw`) by field; they are added to the step's."""
         return {}
 
-    def facts(self) -> dict[str, Any]:
-        """Plain values for the run's metrics."""
+    def facts(self) -> Facts:
+        """Return plain values for the run's metrics."""
         return {}
 
 
 class Composite:
-    """A `Rendered` made of the pictures of several fields; gradients of the others lie in `fields`."""
+    """A `Rendered` composed of several fields; its gradients hold those of the other fields in `fields`."""
 
     def __init__(
         self,
@@ -97,17 +97,17 @@ class Composite:
         drawn: Mapping[str, Rendered],
         needs: Mapping[str, frozenset[str]],
         shot: Shot,
-        bent: Mapping[str, Pull],
+        pulls: Mapping[str, Pull],
     ) -> None:
         """
         Args:
-            fields: what composes.
-            drawn: renders of `STATIC` and of the others.
+            fields: the method's fields, which compose.
+            drawn: renders of `STATIC` and of the other fields.
             needs: statistics of the backward pass that each other field asks for.
-            shot: of the picture.
-            bent: pulls of `Fields.bend`, by field.
+            shot: the shot that was drawn.
+            pulls: pulls of `Fields.deform`, by field.
         """
-        self._bent = bent
+        self._deform_pulls = pulls
         frames = {name: frame_of(rendered) for name, rendered in drawn.items()}
         frame, self._pull = fields.compose(frames, shot)
         self._own = fields.regularise(frames, shot)
@@ -125,38 +125,38 @@ class Composite:
 
     @torch.no_grad()
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
-        """As `Rendered.backward`, of the static field; see `Gradients.fields` for the others."""
+        """Return the gradients of the static field; those of the others are in `Gradients.fields`."""
         given = dict(self._pull(as_cotangents(cotangents)))
         for name, more in self._own.items():
             given[name] = given[name] + more if name in given else more
-        found = {
+        by_field = {
             name: rendered.backward(given[name], needs if name == STATIC else self._needs.get(name, NOTHING))
             for name, rendered in self.renders.items()
             if name in given or name == STATIC
         }
-        static = found.pop(STATIC)
-        found = {name: self._bent[name](gradients) if name in self._bent else gradients
-                 for name, gradients in found.items()}  # fmt: skip
+        static = by_field.pop(STATIC)
+        by_field = {name: self._deform_pulls[name](gradients) if name in self._deform_pulls else gradients
+                 for name, gradients in by_field.items()}  # fmt: skip
         own = static.own
-        for gradients in found.values():
+        for gradients in by_field.values():
             own = sum_own(own, gradients.own)
-        return replace(static, fields=found, own=own)
+        return replace(static, fields=by_field, own=own)
 
 
 def frames_of(rendered: Rendered) -> Mapping[str, Frame]:
-    """The fields' own pictures that a picture is made of, by field; empty where there is one field."""
-    found: Mapping[str, Frame] = getattr(rendered, "frames", {})
-    return found
+    """Return the fields' own pictures that a picture is composed of; empty if there is one field."""
+    frames: Mapping[str, Frame] = getattr(rendered, "frames", {})
+    return frames
 
 
 def renders_of(rendered: Rendered) -> Mapping[str, Rendered]:
-    """The fields' own renders that a picture is made of, by field; empty where there is one field."""
-    found: Mapping[str, Rendered] = getattr(rendered, "renders", {})
-    return found
+    """Return the fields' own renders that a picture is composed of; empty if there is one field."""
+    renders: Mapping[str, Rendered] = getattr(rendered, "renders", {})
+    return renders
 
 
 def over(front: Frame, back: Frame) -> tuple[Frame, Callable[[Cotangents], tuple[Cotangents, Cotangents]]]:
-    """`front` over `back`, both premultiplied by their alpha: C = C_f + (1 - A_f) C_b, A likewise.
+    """Blend `front` over `back`, both premultiplied by alpha: C = C_f + (1 - A_f) C_b, A likewise.
 
     Returns:
         The frame, with the depth of `back`, and the pull to the cotangents of front and back.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,22 +11,22 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 
-# what the renderer reads, in the order of its arguments
-LEAST_POINTS = 4  # to start from: a size is the distance of three neighbours
+LEAST_POINTS = 4  # points to start from: the size of a Gaussian is the distance of three neighbours
+# what the renderer reads, in the order of the fields of `Gaussians` and `Gradients`
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 SH_C0 = 0.28209479177387814  # zeroth real spherical harmonic, 1 / (2 sqrt(pi))
 
 
 class Postponed:
-    """Updates of the rows of `sh_rest` that an optimiser has put off until somebody reads them.
+    """Updates of rows of `sh_rest` that an optimiser has put off until they are read.
 
-    Gaussians that hold the optimiser's `sh_rest` share one object, so that each can have the updates made.
+    All Gaussians with the optimiser's `sh_rest` share one object, so that each can ask for the updates.
     """
 
     def __init__(self, make: Callable[[np.ndarray | None], None]) -> None:
         """
         Args:
-            make: lets these rows (int32 indices; None = all) take the updates that were put off.
+            make: makes the updates of these rows (int32 indices; None = all).
         """
         self._make: Callable[[np.ndarray | None], None] | None = make
 
@@ -37,7 +36,7 @@ class Postponed:
             self._make(rows)
 
     def end(self) -> None:
-        """Make all updates; the optimiser puts off none of these rows from now on."""
+        """Make all updates; from now on the optimiser puts off no update of these rows."""
         self.make()
         self._make = None
 
@@ -56,11 +55,13 @@ class Gaussians:
     opacity_logits: Tensor  # [N]
     sh0: Tensor  # [N, 3] coefficient of the constant harmonic
     sh_rest: Tensor  # [N, (D + 1)^2 - 1, 3] the others, D = largest degree (0 to 3)
-    # [N, ...] what a method carries with each Gaussian, by name; density control copies and drops it too
-    extra: Mapping[str, Tensor] = field(default_factory=dict)
+    _: KW_ONLY
+    # [N, ...] further tensors of a method, by name; density control copies and drops their rows too
+    attributes: Mapping[str, Tensor] = field(default_factory=dict)
 
-    # Of an optimiser that puts off updates of rows nobody sees; None = `sh_rest` is up to date. The renderer
-    # has them made for the rows about to be drawn. `dataclasses.replace` keeps it, copies are up to date.
+    # Updates that an optimiser has put off for rows that no view saw; None = `sh_rest` is up to date. The
+    # renderer applies them to the rows that it is about to draw. `dataclasses.replace` keeps them; copies are
+    # up to date.
     postponed: Postponed | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -78,10 +79,10 @@ class Gaussians:
         rest = tuple(self.sh_rest.shape)
         if len(rest) != 3 or rest[0] != n or rest[1] not in (0, 3, 8, 15) or rest[2] != 3:
             raise AwError(f"sh_rest must be [{n}, 0|3|8|15, 3], got {list(rest)}")
-        for name, tensor in self.extra.items():
+        for name, tensor in self.attributes.items():
             if name in PARAMETERS or tensor.shape[:1] != (n,):
                 raise AwError(
-                    f"extra {name!r} must be [{n}, ...] under a name of its own, got {list(tensor.shape)}"
+                    f"attribute {name!r} must be [{n}, ...] under a name of its own, got {list(tensor.shape)}"
                 )
 
     def __len__(self) -> int:
@@ -93,32 +94,32 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Largest SH degree the parameters can hold."""
+        """Largest SH degree that the parameters can hold."""
         return round((self.sh_rest.shape[1] + 1) ** 0.5) - 1
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
-        """(name, tensor) of what the renderer reads, in a fixed order."""
+        """Yield name and tensor of what the renderer reads, in the order of `PARAMETERS`."""
         for name in PARAMETERS:
             yield name, getattr(self, name)
 
     def rows(self) -> Iterator[tuple[str, Tensor]]:
-        """(name, tensor) of everything that a Gaussian has: `items`, then `extra`."""
+        """Yield name and tensor of everything that a Gaussian has: `items`, then `attributes`."""
         yield from self.items()
-        yield from self.extra.items()
+        yield from self.attributes.items()
 
     def settle(self) -> None:
-        """Have updates made that an optimiser has put off, so that `sh_rest` may be read."""
+        """Make the updates that an optimiser has put off, so that `sh_rest` may be read."""
         if self.postponed is not None:
             self.postponed.make()
 
     def share_pending_updates(self, source: Gaussians) -> Gaussians:
-        """These, made anew of `source` for one picture with its `sh_rest`: its updates are made here too."""
+        """Let these Gaussians, made of `source` with its `sh_rest`, ask for its updates; returns them."""
         if self.postponed is None:
             self.postponed = source.postponed
         return self
 
     def select(self, rows: Tensor) -> Gaussians:
-        """The rows given by a bool mask [N] or an index tensor, copied and up to date."""
+        """Copy the rows of a bool mask [N] or an index tensor; the copy is up to date."""
         return self._each(lambda name, tensor: tensor[rows].contiguous())
 
     def of_degree(self, degree: int) -> Gaussians:
@@ -128,36 +129,36 @@ class Gaussians:
         return replace(self, sh_rest=torch.nn.functional.pad(self.sh_rest, padding).contiguous())
 
     def cat(self, other: Gaussians) -> Gaussians:
-        """These rows followed by the other's.
+        """Return these rows followed by those of `other`.
 
         Raises:
-            AwError: the other does not carry what these carry.
+            AwError: the two have different attributes.
         """
-        if self.extra.keys() != other.extra.keys():
-            differing = ", ".join(sorted(self.extra.keys() ^ other.extra.keys()))
-            raise AwError(f"cannot join Gaussians: one side alone carries {differing}")
+        if self.attributes.keys() != other.attributes.keys():
+            differing = ", ".join(sorted(self.attributes.keys() ^ other.attributes.keys()))
+            raise AwError(f"cannot join Gaussians: only one side has the attributes {differing}")
         other.settle()
         theirs = dict(other.rows())
         return self._each(lambda name, tensor: torch.cat([tensor, theirs[name]]).contiguous())
 
     def to(self, device: torch.device | str) -> Gaussians:
-        """These on a device; tensors that lie there already are shared."""
+        """Return the Gaussians on a device; tensors that lie there already are shared."""
         return self._each(lambda name, tensor: tensor.to(device).contiguous())
 
     def clone(self) -> Gaussians:
-        """A copy whose `sh_rest` is up to date."""
+        """Return a copy whose `sh_rest` is up to date."""
         return self._each(lambda name, tensor: tensor.clone())
 
-    def carrying(self, extra: Mapping[str, Tensor]) -> Gaussians:
-        """The same rows with these as `extra` beside what they carry already."""
-        return replace(self, extra={**self.extra, **extra})
+    def carrying(self, attributes: Mapping[str, Tensor]) -> Gaussians:
+        """Return the same Gaussians with these further attributes."""
+        return replace(self, attributes={**self.attributes, **attributes})
 
     def _each(self, change: Callable[[str, Tensor], Tensor]) -> Gaussians:
         self.settle()
-        changed: dict[str, Any] = {name: change(name, tensor) for name, tensor in self.items()}
-        extra = {name: change(name, tensor) for name, tensor in self.extra.items()}
-        shared = changed["sh_rest"] is self.sh_rest  # they lie on that device already: no copy was made
-        return Gaussians(**changed, extra=extra, postponed=self.postponed if shared else None)
+        changed = [change(name, tensor) for name, tensor in self.items()]
+        attributes = {name: change(name, tensor) for name, tensor in self.attributes.items()}
+        shared = changed[-1] is self.sh_rest  # it lay on that device already: no copy was made
+        return Gaussians(*changed, attributes=attributes, postponed=self.postponed if shared else None)
 
     @classmethod
     def from_points(
@@ -169,14 +170,14 @@ class Gaussians:
         opacity: float = 0.1,
         device: torch.device | str = "cpu",
     ) -> Gaussians:
-        """3DGS's start: one isotropic Gaussian a point, as large as its three neighbours are far.
+        """Start as 3DGS: one isotropic Gaussian at each point, as large as its three neighbours are far.
 
         Args:
-            xyz: points, world.
-            rgb: their colours, uint8.
+            xyz: points in the world.
+            rgb: colours of the points, uint8.
             sh_degree: largest SH degree to hold, 0 to 3.
-            opacity: of every Gaussian.
-            device: where the Gaussians lie.
+            opacity: opacity of every Gaussian.
+            device: device of the Gaussians.
 
         Raises:
             AwError: fewer than 4 points.
@@ -188,7 +189,7 @@ class Gaussians:
             )
         from scipy.spatial import cKDTree
 
-        distances = cKDTree(xyz).query(xyz, k=4)[0][:, 1:]  # of the three nearest other points
+        distances = cKDTree(xyz).query(xyz, k=4)[0][:, 1:]  # distances to the three nearest other points
         scale = np.sqrt((distances**2).mean(axis=1)).clip(min=1e-7)  # coincident points stay finite
         n = len(xyz)
         quats = torch.zeros(n, 4)
@@ -205,7 +206,7 @@ class Gaussians:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), normalised here."""
+    """Return rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), which are normalised here."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

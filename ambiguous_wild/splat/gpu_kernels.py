@@ -1,13 +1,12 @@
-"""Functions that torch compiles on a GPU: the loss, and what gsplat lacks.
+"""What a GPU computes outside of gsplat: functions that torch compiles, and exact nearest neighbours.
 
 Value and gradient of the photometric loss are one function. The gradient is written out, so that no graph is
 kept and every step runs the same few kernels: SSIM's window is symmetric and padded with zeros, hence its own
 adjoint, and gradients of the three blurred pictures that depend on the render are blurred once more.
 
-gsplat does not say whether a splat covers a pixel, as the CPU's kernels do, and loses the opacity of needles.
-Nothing here reads a tensor's values.
-
-Exact nearest neighbours of many points on a device, without a tree on the host.
+gsplat does not tell whether a splat covers a pixel centre, and it loses the opacity of needles; the CPU's
+kernels do neither, so both are computed here. Neighbours need no tree on the host. Nothing here reads a
+tensor's values.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from torch import Tensor
 
 from ambiguous_wild.splat.gaussians import rotation_matrices
 
-BOX = 128  # points a box
-FIRST = 8  # boxes that are looked at first, the nearest ones
-_AT_A_TIME = 2**25  # distances in memory
+BOX = 128  # points in a box
+FIRST = 8  # nearest boxes that are searched first
+_AT_A_TIME = 2**25  # distances in memory at a time
 
 
 @torch.no_grad()
 def nearest(points: Tensor, count: int) -> Tensor:
-    """Rows of the nearest points of every point, itself among them, the nearest first.
+    """Return the rows of the points nearest to every point, the nearest first, itself among them.
 
-    Points are halved along their longest side into boxes of `BOX`; each box is compared with the boxes
-    nearest to it, and with more of them as long as another could hold a nearer point. Ties are in no order.
+    Points are halved along their longest side into boxes of `BOX`. Each box is compared with the boxes
+    nearest to it, and with more boxes while another could hold a nearer point. Ties have no fixed order.
 
     Args:
         points: [M, 3] float, finite.
@@ -45,40 +44,40 @@ def nearest(points: Tensor, count: int) -> Tensor:
     rows = _boxes(points)  # [S, L], M = none
     ends = torch.cat([points, points.new_full((1, 3), torch.inf)])
     inside = ends[rows]
-    there = rows < len(points)
+    filled = rows < len(points)
     low = inside.amin(1)
-    high = torch.where(there[..., None], inside, -torch.inf).amax(1)
-    found = rows.new_empty((len(points) + 1, count))
-    todo, looked = torch.arange(len(rows), device=points.device), min(FIRST, len(rows))
-    while len(todo):
+    high = torch.where(filled[..., None], inside, -torch.inf).amax(1)
+    neighbours = rows.new_empty((len(points) + 1, count))
+    open_boxes, searched = torch.arange(len(rows), device=points.device), min(FIRST, len(rows))
+    while len(open_boxes):
         again = []
-        for part in todo.split(max(_AT_A_TIME // (looked * rows.shape[1] ** 2), 1)):
+        for part in open_boxes.split(max(_AT_A_TIME // (searched * rows.shape[1] ** 2), 1)):
             gaps = torch.maximum(low[None] - high[part, None], low[part, None] - high[None])
             gaps = gaps.clamp(min=0).square().sum(2)
             gaps[torch.arange(len(part), device=part.device), part] = -1.0  # itself is first
-            more = min(looked + 1, len(rows))
+            more = min(searched + 1, len(rows))
             distance, order = gaps.topk(more, dim=1, largest=False)
-            others = rows[order[:, :looked]].flatten(1)  # [P, looked * L]
+            others = rows[order[:, :searched]].flatten(1)  # [P, looked * L]
             squares = _squares(inside[part], ends[others])
             near = squares.topk(min(count, squares.shape[2]), dim=2, largest=False)
             chosen = others[:, None].expand(-1, rows.shape[1], -1).gather(2, near.indices)
-            short = near.values[..., -1]
+            farthest = near.values[..., -1]
             enough = chosen.shape[2] == count
-            if more == looked:
-                far = torch.zeros(len(part), dtype=torch.bool, device=part.device)
+            if more == searched:
+                unfinished = torch.zeros(len(part), dtype=torch.bool, device=part.device)
             elif not enough:
-                far = torch.ones(len(part), dtype=torch.bool, device=part.device)
+                unfinished = torch.ones(len(part), dtype=torch.bool, device=part.device)
             else:
-                far = (there[part] & ~(short <= distance[:, looked, None])).any(1)
+                unfinished = (filled[part] & ~(farthest <= distance[:, searched, None])).any(1)
             if enough:
-                found[rows[part].flatten()] = chosen.flatten(0, 1)
-            again.append(part[far])
-        todo, looked = torch.cat(again), min(2 * looked, len(rows))
-    return found[: len(points)]
+                neighbours[rows[part].flatten()] = chosen.flatten(0, 1)
+            again.append(part[unfinished])
+        open_boxes, searched = torch.cat(again), min(2 * searched, len(rows))
+    return neighbours[: len(points)]
 
 
 def _squares(points: Tensor, others: Tensor) -> Tensor:
-    """[P, L, K] squared distances; by differences: a product of matrices cancels where points are close."""
+    """Squared distances [P, L, K] by differences: a product of matrices cancels where points are close."""
     squares = points.new_zeros(*points.shape[:2], others.shape[1])
     for axis in range(3):
         squares += (points[:, :, None, axis] - others[:, None, :, axis]).square_()
@@ -86,7 +85,7 @@ def _squares(points: Tensor, others: Tensor) -> Tensor:
 
 
 def _boxes(points: Tensor) -> Tensor:
-    """[S, L] rows of the points in boxes, S a power of 2; M where there is none."""
+    """Return the rows of the points in S boxes, [S, L], S a power of 2; M marks an empty place."""
     boxes = 1
     while boxes * BOX < len(points):
         boxes *= 2
@@ -103,7 +102,7 @@ def _boxes(points: Tensor) -> Tensor:
 
 
 def compiled(function: Callable[..., Any], what: str) -> Callable[..., Any]:
-    """The function, compiled at its first call on a GPU, for tensors of any size.
+    """Return a function that is compiled at its first call on a GPU, for tensors of any size.
 
     torch's compiler needs Triton, which comes with its CUDA builds on Linux. Where it fails, the function
     runs without it and a warning says why.
@@ -120,7 +119,7 @@ def compiled(function: Callable[..., Any], what: str) -> Callable[..., Any]:
             return versions[0](*arguments)
         except torch.cuda.OutOfMemoryError:
             raise
-        except Exception as error:  # of the compiler: many kinds, none of them the user's
+        except Exception as error:  # the compiler raises many kinds, none of them caused by the user
             if versions[0] is function:
                 raise
             versions[0] = function
@@ -136,7 +135,7 @@ def compiles(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
-_REACH = 5  # px, of the 11 taps to either side
+_REACH = 5  # px to either side of a window of 11 taps
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -149,7 +148,7 @@ _TAPS = _window()
 
 
 def _blurred(maps: Tensor) -> Tensor:
-    """[C, H, W] under the window, zeros beyond the border; shifted sums, which a compiler makes one pass."""
+    """Blur maps [C, H, W], with zeros beyond the border; a compiler fuses the shifted sums to one pass."""
     for axis in (1, 2):
         size = maps.shape[axis]
         pad = (0, 0, _REACH, _REACH) if axis == 1 else (_REACH, _REACH, 0, 0)
@@ -161,7 +160,7 @@ def _blurred(maps: Tensor) -> Tensor:
 
 
 def _ssim(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """SSIM of [3, H, W] pictures, and its derivatives by blur(x), blur(x x) and blur(x y)."""
+    """Return SSIM of pictures [3, H, W], and its derivatives by blur(x), blur(x x) and blur(x y)."""
     mean_x, mean_y, xx, yy, xy = _blurred(torch.cat([x, y, x * x, y * y, x * y])).split(3)
     a1, a2 = 2 * mean_x * mean_y + _C1, 2 * (xy - mean_x * mean_y) + _C2
     b1 = mean_x**2 + mean_y**2 + _C1
@@ -209,32 +208,32 @@ _compiled_loss, _compiled_map = compiled(_loss, "the loss"), compiled(_map, "SSI
 def photometric_fused(
     render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """L1, 1 - SSIM (0-d) and the gradient of their mix [H, W, 3]; arguments as `losses.photometric`."""
+    """Return L1, 1 - SSIM (0-d) and the gradient of their mix [H, W, 3]; see `losses.photometric`."""
     keep = None if keep is None else keep.to(render.dtype)
-    found: tuple[Tensor, Tensor, Tensor] = _compiled_loss(
+    parts: tuple[Tensor, Tensor, Tensor] = _compiled_loss(
         render.detach(), photo, keep, lambda_dssim, weighting == "images"
     )
-    return found
+    return parts
 
 
 @torch.no_grad()
 def ssim_map_fused(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM of every pixel and channel, [H, W, 3]."""
-    found: Tensor = _compiled_map(a, b)
-    return found
+    """Return SSIM of every pixel and channel, [H, W, 3]."""
+    ssim: Tensor = _compiled_map(a, b)
+    return ssim
 
 
 @functools.cache
 def prepare(
     device: torch.device, sizes: frozenset[tuple[int, int]], lambda_dssim: float, weighting: str
 ) -> None:
-    """Compile before the clock starts, once a process.
+    """Compile the loss before the clock starts, once a process.
 
     Args:
         device: nothing is done unless it is a GPU.
-        sizes: heights and widths that the run has. One version covers all sizes where the compiler keeps
-            height and width as symbols; where it does not, every size is compiled here.
-        lambda_dssim, weighting: as of `losses.photometric`.
+        sizes: heights and widths of the run's photos. Where the compiler keeps them as symbols, one version
+            serves all sizes; where it does not, every size is compiled here.
+        lambda_dssim, weighting: as for `losses.photometric`.
     """
     if not compiles(device):
         return
@@ -269,13 +268,13 @@ def visible(
     opacities: Tensor,  # [N], antialiasing included
     size: Tensor,  # [2] width and height in px
 ) -> Tensor:
-    """[N] bool, drawn and with a pixel centre in the box of the 1/255 contour.
+    """Return which splats are drawn and have a pixel centre in the box of the 1/255 contour, [N] bool.
 
-    gsplat's box is rounded up to whole pixels. Splats between pixel centres, or beyond the last ones, have
-    no gradient; the mean statistic of growth must not count them.
+    gsplat rounds this box up to whole pixels. Splats between pixel centres, or beyond the last ones, have
+    no gradient, and the mean statistic of growth must not count them.
     """
-    found: Tensor = _compiled_covers(radii, means2d.detach(), conics.detach(), opacities.detach(), size)
-    return found
+    covered: Tensor = _compiled_covers(radii, means2d.detach(), conics.detach(), opacities.detach(), size)
+    return covered
 
 
 def _ratio(
@@ -314,8 +313,8 @@ def _pull(
         return _ratio(m, q, s, viewmat, intrinsics, size, blur)
 
     pull = torch.func.vjp(ratio, means, quats, scales)[1]
-    found: tuple[Tensor, Tensor, Tensor] = pull(cotangent)
-    return found
+    gradients: tuple[Tensor, Tensor, Tensor] = pull(cotangent)
+    return gradients
 
 
 _compiled_ratio = compiled(_ratio, "antialiasing")
@@ -327,8 +326,8 @@ class _Compensation(torch.autograd.Function):
     def forward(ctx: Any, blur: float, *tensors: Tensor) -> Tensor:
         ctx.save_for_backward(*tensors)
         ctx.blur = blur
-        found: Tensor = _compiled_ratio(*tensors, blur)
-        return found
+        ratio: Tensor = _compiled_ratio(*tensors, blur)
+        return ratio
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> Any:
@@ -344,9 +343,10 @@ def compensation(
     size: Tensor,  # [2]
     blur: float,  # px^2
 ) -> Tensor:
-    """sqrt(|Sigma2| / |Sigma2 + blur I|), [N]: what antialiasing multiplies opacities by; differentiable.
+    """Return the factor of opacities under antialiasing, sqrt(|S| / |S + blur I|), [N]; differentiable.
 
-    gsplat's own subtracts products in float32: 0 for needles, and for them its gradient is 0 as well.
+    S is the 2D covariance. gsplat's own factor subtracts products in float32: for needles it and its gradient
+    are 0.
     """
-    found: Tensor = _Compensation.apply(blur, means, quats, scales, viewmat, intrinsics, size)
-    return found
+    factor: Tensor = _Compensation.apply(blur, means, quats, scales, viewmat, intrinsics, size)
+    return factor

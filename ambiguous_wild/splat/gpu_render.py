@@ -1,9 +1,9 @@
 """The `render` call on an NVIDIA GPU, through gsplat (extra `[cuda]`).
 
-A picture is made in two stages: Gaussians to splats, then splats to pixels. Each has a graph of its own, and
-the splats lie at the cut between them. Every cotangent goes back through the pixels by itself; their sum at
-the cut goes back to the Gaussians once. A shading function makes a second cut, between the harmonics and the
-colours of the splats.
+A picture is made in two stages: Gaussians to splats, then splats to pixels. Each stage has its own graph;
+the splats lie at the cut between the two. Every cotangent goes back through the pixels separately; their sum
+at the cut goes back to the Gaussians once. A shading function makes a second cut, between the harmonics and
+the colours of the splats.
 Nothing here reads a tensor's values: the host waits once a picture, in gsplat, for the number of tiles.
 """
 
@@ -37,11 +37,11 @@ from ambiguous_wild.splat.rendered import (
 
 @dataclass(frozen=True)
 class Shaded:
-    """Of a render whose colours a function gave."""
+    """State of a render whose colours came from a shading function."""
 
     gaussians: Gaussians
     base: Tensor  # [N, 3] SH + 0.5, part of the graph of the parameters
-    colours: Tensor  # [N, 3] of the function, not clamped
+    colours: Tensor  # [N, 3] from the function, not clamped
     pull: ShadePull
 
 
@@ -64,11 +64,11 @@ class RenderedCuda:
         """
         Args:
             leaves: raw parameters that gradients are asked for.
-            splats, colours: made of them.
-            tiles: of the splats.
+            splats, colours: made of `leaves`.
+            tiles: splats by tile.
             background: [1, 3].
             size: width and height in px.
-            shaded: where a function gave the colours.
+            shaded: given if the colours came from a shading function.
         """
         self._leaves, self._splats, self._colours = leaves, splats, colours
         self._tiles, self._background, self._size = tiles, background, size
@@ -78,18 +78,18 @@ class RenderedCuda:
         self._image, self._alpha, _ = self._blend(self._cut)
         self._depth: Tensor | None = None
         self.image, self.alpha = self._image.detach(), self._alpha.detach()
-        there = seam.size_on(*size, splats.radii.device)
-        self.visible = visible(splats.radii, splats.means2d, splats.conics, splats.opacities, there)
+        size_px = seam.size_on(*size, splats.radii.device)
+        self.visible = visible(splats.radii, splats.means2d, splats.conics, splats.opacities, size_px)
         self._shown = splats.radii
 
     @property
     def radii(self) -> Tensor:
-        """[N] float32 px; made when it is asked for, no step does."""
+        """[N] float32 px; computed only on demand, as no training step reads it."""
         return torch.where(self.visible, self._shown.amax(dim=1), 0).to(torch.float32)
 
     @property
     def depth(self) -> Tensor:
-        """[H, W], sum of weight times z; blended when it is first asked for."""
+        """[H, W], sum of weight times z; blended at the first access."""
         if self._depth is None:
             with torch.no_grad():
                 s = self._splats
@@ -101,13 +101,13 @@ class RenderedCuda:
 
     @torch.no_grad()
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
-        """As `Rendered.backward`; once for a picture, because torch frees its graph.
+        """Do as `Rendered.backward`, but only once for a picture, because torch frees its graph.
 
-        Absolute sums are those of image and alpha: gsplat blends depth apart.
+        Absolute sums do not contain depth, which gsplat blends separately.
 
         Raises:
-            AwError: a statistic that is unknown, or that gsplat does not offer.
-            RuntimeError: the picture was drawn under `torch.no_grad`, or had its backward pass.
+            AwError: a statistic is unknown, or gsplat does not offer it.
+            RuntimeError: the picture was drawn under `torch.no_grad`, or this is its second backward pass.
         """
         check_needs(needs, GSPLAT_SUMS)
         if not self._graph:
@@ -115,52 +115,51 @@ class RenderedCuda:
         if self._done:
             raise RuntimeError("this picture had its backward pass: on an accelerator draw it again first")
         self._done = True
-        given = as_cotangents(cotangents)
-        d_image, d_extra = given.image, given.extra
+        cotangent = as_cotangents(cotangents)
+        d_image, d_extra = cotangent.image, cotangent.extra
         cut, image, alpha, batch = self._cut, self._image, self._alpha, None
         if "absolute" in needs:
-            # gsplat must know before it draws: only a method that asks pays for a second drawing
+            # gsplat must be told before it draws, so methods that need the sums pay for a second drawing
             with torch.enable_grad():
                 cut = self._leaves_of_the_cut()
                 image, alpha, batch = self._blend(cut, absolute=True)
-            if d_image is None and given.alpha is None:
+            if d_image is None and cotangent.alpha is None:
                 d_image = torch.zeros_like(self.image)
-        found = _pull(image, alpha, cut, d_image, given.alpha, keep=d_extra is not None)
-        screen = found[0]
+        at_cut = _pull(image, alpha, cut, d_image, cotangent.alpha, keep=d_extra is not None)
+        screen = at_cut[0]
         screen_abs = None if batch is None else seam.absolute_gradient(batch)
         depths = None
-        if given.depth is not None:
-            *through, depths = self._depth_gradients(given.depth)
-            found = _add(found, [through[0], through[1], None, through[2]])
-            screen = found[0]
+        if cotangent.depth is not None:
+            *through, depths = self._depth_gradients(cotangent.depth)
+            at_cut = _add(at_cut, [through[0], through[1], None, through[2]])
+            screen = at_cut[0]
         screen_extra = None
         if d_extra is not None:
             second = _pull(image, alpha, cut, d_extra, None, keep=False)
             screen_extra = second[0]
-            found = _add(found, second)
+            at_cut = _add(at_cut, second)
         return self._gradients(
-            found, depths, given, screen=screen, screen_extra=screen_extra, screen_abs=screen_abs
+            at_cut, depths, cotangent, screen=screen, screen_extra=screen_extra, screen_abs=screen_abs
         )
 
     def _gradients(
-        self, found: list[Tensor], depths: Tensor | None, given: Cotangents, **screens: Any
+        self, at_cut: list[Tensor], depths: Tensor | None, given: Cotangents, **screens: Any
     ) -> Gradients:
-        """From the cut to the parameters."""
+        """Pull gradients from the cut back to the parameters."""
         s, shaded = self._splats, self._shaded
         colours, through = self._colours, None
-        if shaded is not None:  # stopped where the clamp at 0 acted, then through the function
-            d_colours = torch.where(shaded.colours > 0, found[2], 0.0)
+        if shaded is not None:  # 0 where colours were clamped at 0, then through the function
+            d_colours = torch.where(shaded.colours > 0, at_cut[2], 0.0)
             through = shaded.pull(d_colours)
-            colours, found = shaded.base, [found[0], found[1], through.base, found[3]]
-        outputs, cotangents = [s.means2d, s.conics, colours, s.opacities], list(found)
+            colours, at_cut = shaded.base, [at_cut[0], at_cut[1], through.base, at_cut[3]]
+        outputs, cotangents = [s.means2d, s.conics, colours, s.opacities], list(at_cut)
         if depths is not None:
             outputs.append(s.depths)
             cotangents.append(depths)
         values = torch.autograd.grad(
             outputs, list(self._leaves.values()), cotangents, allow_unused=True, materialize_grads=True
         )
-        named: dict[str, Any] = dict(zip(self._leaves, values, strict=True))
-        gradients = Gradients(**named, **screens, visible=self.visible, own=given.own)
+        gradients = Gradients(*values, **screens, visible=self.visible, own=given.own)
         if shaded is not None and through is not None:
             gradients = spread(gradients, through, slice(None), shaded.gaussians)
         return gradients
@@ -178,7 +177,7 @@ class RenderedCuda:
         )  # fmt: skip
 
     def _depth_gradients(self, d_depth: Tensor) -> tuple[Tensor, ...]:
-        """Of means2d, conics, opacities and depths."""
+        """Return dL/d of means2d, conics, opacities and depths."""
         s = self._splats
         leaves = [v.detach().requires_grad_(True) for v in (s.means2d, s.conics, s.opacities, s.depths)]
         with torch.enable_grad():
@@ -198,10 +197,10 @@ def render_cuda(
     blur: float = seam.BLUR,
     shade: Shade | None = None,
 ) -> RenderedCuda:
-    """Render on the GPU; see `render.render`. `shade` gets all rows, those that are not visible as 0.
+    """Render on the GPU; see `render.render`. `shade` gets all rows; those that are not visible are 0.
 
     Raises:
-        AwError: gsplat is missing or cannot be used; says the command that mends it.
+        AwError: gsplat is missing or cannot be used; the message holds the command that mends it.
     """
     seam.gsplat()
     if gaussians.device.type == "cuda":
@@ -236,7 +235,7 @@ def _check_gpu() -> None:
 
 
 def _base_colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, degree: int) -> Tensor:
-    """[N, 3], SH + 0.5, not clamped; rows that are not visible may hold anything."""
+    """Return SH + 0.5 [N, 3], not clamped; rows that are not visible may hold any value."""
     if degree == 0:
         return leaves["sh0"] * SH_C0 + 0.5
     active = leaves["sh_rest"][:, : (degree + 1) ** 2 - 1]
@@ -246,10 +245,10 @@ def _base_colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor
 
 
 def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splats) -> Shaded:
-    """Colours by the function.
+    """Call the shading function.
 
     Raises:
-        AwError: it gives another shape than one colour a row.
+        AwError: it does not return one colour for each row.
     """
     visible = (splats.radii > 0).all(dim=1)
     # a net must not see what gsplat left in rows that it did not compute: 0 times NaN is NaN in its gradients
@@ -262,7 +261,7 @@ def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splat
 
 @functools.cache
 def _background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:
-    """[1, 3], copied once."""
+    """Return the background [1, 3] on the device; it is copied once."""
     return torch.tensor([background], dtype=torch.float32).to(device)
 
 
@@ -275,7 +274,7 @@ def _pull(
     *,
     keep: bool,
 ) -> list[Tensor]:
-    """Gradients of what lies at the cut; `keep`: the graph is needed once more."""
+    """Return the gradients at the cut; `keep`: the graph is needed once more."""
     pairs = [(picture, d) for picture, d in ((image, d_image), (alpha, d_alpha)) if d is not None]
     if not pairs:
         return [torch.zeros_like(value) for value in cut]

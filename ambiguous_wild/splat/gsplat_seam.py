@@ -1,6 +1,6 @@
-"""The calls of gsplat that a picture is made of.
+"""The calls of gsplat that draw a picture, and the only module that imports it.
 
-No other module imports gsplat. Release 1.5.3 (`readiness.GSPLAT`) was read line by line.
+They were checked against the source of release 1.5.3 (`readiness.GSPLAT`).
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Tiles:
 
 @functools.cache
 def gsplat() -> Any:
-    """The installed package.
+    """Return the installed package.
 
     Raises:
-        AwError: there is none; says the command that installs it.
+        AwError: it is not installed; the message holds the command that installs it.
     """
     try:
         import gsplat
@@ -60,11 +60,10 @@ def gsplat() -> Any:
 
 @functools.cache
 def max_alpha(device: str = "cuda") -> float:
-    """Where alpha is clamped: 0.999 in release 1.5.3, 0.99 on the CPU and in later sources.
+    """Return the value at which gsplat clamps alpha: 0.999 in release 1.5.3, 0.99 in later sources.
 
-    Sources after that release have the same version number, so it is measured: every call is made once, for
-    an opaque Gaussian in front of one pixel. The clamp matters only for opacities above 0.99, and changes how
-    much light passes through them.
+    Later sources have the same version number, so the value is measured: one picture of an opaque Gaussian in
+    front of one pixel. The CPU clamps at 0.99; only opacities above it are drawn differently.
     """
     one = torch.ones(1, device=device)
     pose, k = torch.eye(4, device=device)[None], torch.eye(3, device=device)[None]
@@ -90,8 +89,8 @@ def project(
     antialias: bool,
     blur: float = BLUR,  # px^2 added to both variances
 ) -> Splats:
-    """EWA projection and culls; differentiable."""
-    if not len(means):  # gsplat divides by their number, in C++: the process would end
+    """Project by EWA and cull; differentiable."""
+    if not len(means):  # gsplat's C++ code divides by their number, which would end the process
         none = means.new_zeros((0, 2), dtype=torch.int32)
         return Splats(none, means[:, :2], means[:, 2], scales, opacities)
     if antialias:
@@ -117,7 +116,7 @@ def project(
 
 @functools.cache
 def size_on(width: int, height: int, device: torch.device) -> Tensor:
-    """[2] float32; copied once: a copy from the host in every step would make it wait."""
+    """Return the size [2] float32, copied once: a copy in every step would make the host wait."""
     return torch.tensor([width, height], dtype=torch.float32).to(device)
 
 
@@ -126,15 +125,15 @@ def shade(
     means: Tensor,  # [N, 3]
     centre: Tensor,  # [3] of the camera
     coefficients: Tensor,  # [N, K, 3], K at least (degree + 1)^2
-    visible: Tensor,  # [N] bool; the others' colours may be anything
+    visible: Tensor,  # [N] bool; other rows may get any colour
 ) -> Tensor:
-    """Colours [N, 3] of spherical harmonics, 0.5 not added; differentiable."""
+    """Return colours [N, 3] of spherical harmonics, without the offset 0.5; differentiable."""
     colours: Tensor = gsplat().spherical_harmonics(degree, means - centre, coefficients, masks=visible)
     return colours
 
 
 def sort(splats: Splats, width: int, height: int) -> Tiles:
-    """Tiles and order. The host waits here for their number, which decides how much memory is allocated."""
+    """List the splats of every tile by depth. The host waits for their number, to allocate memory."""
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
     _, ids, flatten_ids = gsplat().isect_tiles(
         splats.means2d.detach()[None],
@@ -160,10 +159,10 @@ def blend(
     background: Tensor | None = None,  # [1, C]
     absolute: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pictures [H, W, C], alpha [H, W], and the tensor for `absolute_gradient`; differentiable.
+    """Return a picture [H, W, C], alpha [H, W], and the tensor for `absolute_gradient`; differentiable.
 
     Args:
-        absolute: the backward pass also sums absolute values over pixels (AbsGS).
+        absolute: let the backward pass also sum absolute values over pixels (AbsGS).
     """
     batch = means2d[None]
     picture, alpha = gsplat().rasterize_to_pixels(
@@ -184,6 +183,6 @@ def blend(
 
 
 def absolute_gradient(batch: Tensor) -> Tensor:
-    """Sums over pixels of |dL/du| and |dL/dv|, [N, 2], after the backward pass of `blend(absolute=True)`."""
+    """Return sums over pixels of |dL/du| and |dL/dv|, [N, 2], after the backward pass of `blend`."""
     sums: Tensor = batch.absgrad[0]  # type: ignore[attr-defined]  # gsplat stores it on its argument
     return sums

@@ -17,9 +17,9 @@ _WEIGHTINGS = ("map", "images", "none")
 
 @dataclass(frozen=True)
 class PhotometricLoss:
-    """A loss and its gradient."""
+    """A photometric loss and its gradient."""
 
-    # on an accelerator 0-d tensors: turning them into numbers makes the host wait
+    # numbers; on an accelerator 0-d tensors, because reading them makes the host wait
     value: float | Tensor  # (1 - lambda) l1 + lambda dssim
     l1: float | Tensor  # mean of keep |render - photo| over all pixels and channels
     dssim: float | Tensor  # mean of keep (1 - SSIM) over all pixels and channels
@@ -34,16 +34,16 @@ def photometric(
     lambda_dssim: float = 0.2,
     weighting: Weighting = "map",
 ) -> PhotometricLoss:
-    """(1 - lambda) mean(keep |render - photo|) + lambda mean(keep (1 - SSIM)).
+    """Return (1 - lambda) mean(keep |render - photo|) + lambda mean(keep (1 - SSIM)) and its gradient.
 
-    Means run over all pixels and channels, masked or not, so a photo that is all masked has loss 0 and
-    gradient 0. SSIM: 11 x 11 Gaussian window of sigma 1.5, zero padding, per channel.
+    Means run over all pixels and channels, masked or not, so a fully masked photo has loss 0 and gradient 0.
+    SSIM: 11 x 11 Gaussian window of sigma 1.5, zero padding, per channel.
 
     Args:
-        render: the picture the gradient is for.
-        photo: what it should be.
-        keep: keep map; None for none.
-        lambda_dssim: share of 1 - SSIM.
+        render: the picture that the gradient is for.
+        photo: the picture that it should become.
+        keep: keep map; None = 1 everywhere.
+        lambda_dssim: share of 1 - SSIM in the loss.
         weighting: ``"map"`` weighs the SSIM map (RefineSplat, RobustSplat); ``"images"`` multiplies both
             pictures by keep before SSIM; ``"none"`` ignores keep.
 
@@ -69,7 +69,7 @@ def ssim_map(
     a: Tensor,  # [H, W, 3] in [0, 1]
     b: Tensor,  # [H, W, 3] in [0, 1]
 ) -> Tensor:
-    """SSIM of every pixel and channel, [H, W, 3]; window as in `photometric`. Values in [-1, 1]."""
+    """Return SSIM in [-1, 1] of every pixel and channel, [H, W, 3]; window as in `photometric`."""
     if a.dim() != 3 or a.shape[2] != 3 or a.shape != b.shape:
         raise AwError(f"pictures must both be [H, W, 3], got {list(a.shape)} and {list(b.shape)}")
     return backend_of(a.device).ssim_map(a, b)

@@ -1,22 +1,22 @@
-"""Adam over the Gaussians that costs what a view sees and equals Adam over all of them, bit for bit.
+"""Adam over the Gaussians that costs only what a view sees, with the same bits as Adam over all of them.
 
-Culling reads means, quats, scales and opacity (and every view reads sh0): these 14 floats a Gaussian step
-at once, seen or not. The harmonics above the constant, 45 floats, are read only when a Gaussian is drawn:
-a row nobody sees is put off and takes its steps with gradient zero when the renderer is about to draw it
-(`Gaussians.postponed`), or at `flush`. On an accelerator torch's fused kernel steps every row, one
-launch a tensor, and a flag there can call the step off without the host's knowing.
+Means, quats, scales and opacity are read by culling, and sh0 by every view: these 14 floats of a Gaussian are
+stepped at once, seen or not. The higher harmonics, 45 floats, are read only when a Gaussian is drawn. Steps
+of a row that no view sees are put off; it takes them, with gradient zero, when the renderer is about to draw
+it (`Gaussians.postponed`), or at `flush`. On an accelerator torch's fused kernel steps every row, one launch
+a tensor; there a flag on the device can call off the step without the host's knowledge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import State
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians, Postponed
@@ -28,15 +28,15 @@ _LAZY = "sh_rest"
 class SplatAdam:
     """Adam (Kingma and Ba) with one step count for all rows; new rows start with zero moments.
 
-    Holds the tensors of one `Gaussians` and changes them in place. Whoever replaces the Gaussians tells
-    the rows (`select`, `append`) and then hands over the new object (`bind`). Read `sh_rest` outside the
-    CPU renderer only after `flush`.
+    It holds the tensors of one `Gaussians` and changes them in place. Code that replaces the Gaussians first
+    changes the rows here (`select`, `append`) and then passes the new object (`bind`). Read `sh_rest` outside
+    of the CPU renderer only after `flush`.
     """
 
     def __init__(
         self,
         gaussians: Gaussians,
-        # one a tensor, names as Gaussians.rows(); what is carried (`extra`) and has none is not learnt
+        # rates by name in Gaussians.rows(); an attribute without a rate is not learnt
         learning_rates: Mapping[str, float],
         *,
         lazy: bool = True,  # False steps every row of sh_rest at once: the same bits, more memory traffic
@@ -54,7 +54,7 @@ class SplatAdam:
         self._history = np.zeros((2, 256), np.float32)  # a step's lr / bias1 of sh_rest, and 1 / sqrt(bias2)
         self._rows = len(gaussians)
         self._bound: Gaussians | None = None
-        self._postponed: Postponed | None = None  # of the Gaussians bound now, where rows are put off
+        self._postponed: Postponed | None = None  # that of the Gaussians bound now, if rows are put off
         self.bind(gaussians)
         self._set_rates(learning_rates)
 
@@ -62,7 +62,7 @@ class SplatAdam:
 
     @property
     def gaussians(self) -> Gaussians:
-        """What is optimised.
+        """The Gaussians that are optimised.
 
         Raises:
             RuntimeError: rows were selected or appended and no new Gaussians were bound since.
@@ -72,10 +72,10 @@ class SplatAdam:
         return self._bound
 
     def bind(self, gaussians: Gaussians) -> None:
-        """Go on with these tensors: the same rows as the moments, after `select` and `append`.
+        """Optimise these Gaussians from now on; their rows match the moments after `select` and `append`.
 
         Raises:
-            RuntimeError: another number of rows than moments.
+            RuntimeError: the numbers of rows and of moments differ.
         """
         if len(gaussians) != self._rows:
             raise RuntimeError(f"{len(gaussians)} Gaussians but moments for {self._rows} rows")
@@ -93,10 +93,10 @@ class SplatAdam:
             name: (m[rows].contiguous(), v[rows].contiguous()) for name, (m, v) in self._moments.items()
         }
         self._rows = len(self._moments["means"][0])
-        self._all_took()
+        self._mark_up_to_date()
 
     def append(self, n: int) -> None:
-        """n rows of zero moments at the end; `bind` comes next."""
+        """Append n rows of zero moments; `bind` comes next."""
         self._unbind()
 
         def longer(moment: Tensor) -> Tensor:
@@ -104,11 +104,11 @@ class SplatAdam:
 
         self._moments = {name: (longer(m), longer(v)) for name, (m, v) in self._moments.items()}
         self._rows += n
-        self._all_took()
+        self._mark_up_to_date()
 
     @property
     def rates(self) -> Mapping[str, float]:
-        """Learning rates of the last step, or of the first before it."""
+        """Learning rates of the last step; before the first step, the initial ones."""
         return self._rates
 
     def reset_moments(self, names: Iterable[str], rows: Tensor | None = None) -> None:
@@ -135,11 +135,11 @@ class SplatAdam:
         self,
         grads: Gradients,
         visible: Tensor,  # [N] bool; rows of sh_rest outside have gradient zero
-        learning_rates: Mapping[str, float] | None = None,  # for this step and on; None keeps the last
+        learning_rates: Mapping[str, float] | None = None,  # from this step on; None keeps the last
         *,
         called_off: Tensor | None = None,  # on an accelerator, [1] float32 there: 1 = change nothing
     ) -> None:
-        """One step of every row.
+        """Step every row once.
 
         Raises:
             AwError: a learning rate is missing or has an unknown name.
@@ -149,7 +149,7 @@ class SplatAdam:
         gaussians = self.gaussians
         self.steps += 1
         for name, tensor in self._learnt(gaussians):
-            gradient = _of(grads, name, tensor)
+            gradient = _gradient_of(grads, name, tensor)
             if name == _LAZY and self._lazy:
                 self._step_visible(tensor, gradient, visible)
             elif tensor.numel():
@@ -160,7 +160,7 @@ class SplatAdam:
             self.steps -= called_off.reshape(())
 
     def _step_visible(self, parameter: Tensor, gradient: Tensor, visible: Tensor) -> None:
-        """The step of the visible rows of sh_rest; the others are put off."""
+        """Step the visible rows of sh_rest; steps of the others are put off."""
         from ambiguous_wild.splat.cpu import adam
         from ambiguous_wild.splat.cpu.compile import threads
 
@@ -175,7 +175,7 @@ class SplatAdam:
             )  # fmt: skip
 
     def catch_up(self, rows: np.ndarray | None = None) -> None:
-        """Let these rows of sh_rest (indices; None: all) take the steps they were put off."""
+        """Take the steps of these rows of sh_rest (indices; None = all) that were put off."""
         if not self._lazy or self.steps == 0 or self.gaussians.sh_rest.shape[1] == 0:
             return
         from ambiguous_wild.splat.cpu import adam
@@ -194,13 +194,13 @@ class SplatAdam:
         self.catch_up(None)
 
     def _counted(self, steps: int, gaussians: Gaussians) -> int | Tensor:
-        """So many steps, as this back end counts them; a GPU does it for itself."""
+        """Return a number of steps as this back end counts it: an int, or a tensor on a GPU."""
         if self._backend.reads_at_once:
             return steps
         return torch.full((), float(steps), device=gaussians.device)
 
-    def _all_took(self) -> None:
-        """No row of sh_rest has steps put off."""
+    def _mark_up_to_date(self) -> None:
+        """Note that no row of sh_rest has steps that were put off."""
         self._taken = np.full(self._rows, self.steps if self._lazy else 0, np.int64)
 
     def _learnt(self, gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
@@ -217,8 +217,8 @@ class SplatAdam:
 
     # -- state ------------------------------------------------------------------------------------
 
-    def state_dict(self) -> dict[str, Any]:
-        """Steps and moments as plain tensors, every row up to date; the parameters are the caller's."""
+    def state_dict(self) -> State:
+        """Return steps, rates and moments, with every row up to date; parameters are not part of it."""
         self.flush()
         return {
             "steps": int(self.steps),
@@ -227,11 +227,11 @@ class SplatAdam:
             "second": {name: v for name, (_, v) in self._moments.items()},
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict` with the Gaussians bound now.
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned, for the Gaussians bound now.
 
         Raises:
-            AwError: moments of another shape than the Gaussians.
+            AwError: moments and Gaussians differ in shape.
         """
         gaussians = self.gaussians
         moments = {}
@@ -248,14 +248,14 @@ class SplatAdam:
         steps = int(state["steps"])
         self.steps = self._counted(steps, gaussians)
         self._rates = {name: float(rate) for name, rate in state["rates"].items()}
-        self._all_took()
+        self._mark_up_to_date()
         size = 256
         while size <= steps:
             size *= 2
         self._history = np.zeros((2, size), np.float32)
 
 
-def _of(gradients: Gradients, name: str, tensor: Tensor) -> Tensor:
-    """float32 and contiguous; zero for what this render did not read."""
-    found = gradients.extra.get(name) if name not in PARAMETERS else getattr(gradients, name)
-    return torch.zeros_like(tensor) if found is None else found.detach().to(torch.float32).contiguous()
+def _gradient_of(gradients: Gradients, name: str, tensor: Tensor) -> Tensor:
+    """Return the gradient of a tensor, float32 and contiguous; zeros for an attribute that was not read."""
+    gradient = gradients.attributes.get(name) if name not in PARAMETERS else getattr(gradients, name)
+    return torch.zeros_like(tensor) if gradient is None else gradient.detach().to(torch.float32).contiguous()

@@ -1,8 +1,8 @@
-"""What a run does when: how far it is, which view comes next, at what size and at which learning rates.
+"""What a run does when: its progress, the next view, and the resolution and learning rates of each step.
 
 How small the training photos may be at each point of a short run is DashGaussian's rule (arXiv 2503.18402):
-the resolution follows how much of the photos' spectrum has been learnt. It reads the photos' own
-frequencies and no residual, so distractors do not mislead it.
+the resolution follows the share of the photos' spectrum that has been learnt. It reads the frequencies of the
+photos and no residual, so distractors do not mislead it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from ambiguous_wild.splat.parts import Schedule
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData
 from ambiguous_wild.splat.watchdog import OnNonFinite
 
-SMALLEST_SIDE = 96  # px; below it SSIM's 11-tap window and a 16 px tile see too little
+SMALLEST_SIDE = 96  # px; smaller photos are too small for SSIM's 11-tap window and a 16 px tile
 
 
 @dataclass(frozen=True)
 class Level:
-    """From `begin` (share of the run) on, images are trained at their size over `divisor`."""
+    """From `begin` (share of the run) on, photos are trained at 1/`divisor` of their size."""
 
     begin: float
     divisor: int
@@ -34,10 +34,10 @@ FULL = (Level(0.0, 1),)
 
 
 def coarse_to_fine(photos: list[np.ndarray], until: float = 0.4) -> tuple[Level, ...]:
-    """Divisors 4, 2, 1 with the begin of each by the photos' mean spectrum.
+    """Choose when divisors 4, 2 and 1 begin, from the photos' mean spectrum.
 
     Args:
-        photos: [H, W, 3] float, a sample of the training photos.
+        photos: a sample of the training photos, [H, W, 3] float.
         until: share of the run at which full resolution is reached at the latest.
 
     Returns:
@@ -54,7 +54,7 @@ def coarse_to_fine(photos: list[np.ndarray], until: float = 0.4) -> tuple[Level,
         return FULL  # flat photos carry no frequencies to wait for
     levels = [Level(0.0, divisors[0])]
     for previous, divisor in itertools.pairwise(divisors):
-        # Dash: begin = until * ln(E / E_min) / ln(E_total / E_min), of the level that is left behind.
+        # Dash: begin = until * ln(E / E_min) / ln(E_total / E_min), with E of the level that ends.
         share = np.log(energies[divisor] / start) / np.log(total / start)
         before = np.log(energies[previous] / start) / np.log(total / start)
         levels.append(Level(float(until * (before + share) / 2), divisor))
@@ -62,7 +62,7 @@ def coarse_to_fine(photos: list[np.ndarray], until: float = 0.4) -> tuple[Level,
 
 
 def divisor_at(levels: tuple[Level, ...], progress: float) -> int:
-    """The divisor in force at that share of the run."""
+    """Return the divisor at this share of the run."""
     current = levels[0].divisor
     for level in levels:
         if progress >= level.begin:
@@ -71,9 +71,9 @@ def divisor_at(levels: tuple[Level, ...], progress: float) -> int:
 
 
 def ceiling_at(start: int, most: int, divisor: int, progress: float, until: float) -> int:
-    """How many Gaussians the current resolution can use (Dash's count schedule).
+    """Return how many Gaussians the current resolution can use (Dash's count schedule).
 
-    N0 + (Nmax - N0) / r^(2 - progress / until); at full resolution it is Nmax.
+    This is N0 + (Nmax - N0) / r^(2 - progress / until); at full resolution Nmax.
     """
     if divisor == 1 or start >= most:
         return most
@@ -82,7 +82,7 @@ def ceiling_at(start: int, most: int, divisor: int, progress: float, until: floa
 
 
 def _spectrum_share(photo: np.ndarray, divisor: int) -> float:
-    """Sum of the magnitudes of the frequencies an image `divisor` times smaller can hold."""
+    """Sum the magnitudes of the frequencies that an image `divisor` times smaller can hold."""
     grey = photo.mean(axis=2)
     spectrum = np.abs(np.fft.fftshift(np.fft.fft2(grey - grey.mean())))
     height, width = spectrum.shape
@@ -95,19 +95,18 @@ COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How long, on what, how often saved. What is learnt how is the method's (`Parts`)."""
+    """Length, resolution and checkpointing of a run; the method (`Parts`) sets the rest."""
 
     iterations: int = NOMINAL_ITERATIONS
     budget_s: float | None = None  # seconds of training instead of a number of iterations
     seed: int = 0
     resolution: Literal["auto", "full", "coarse-to-fine"] = "auto"  # auto: coarse-to-fine under a budget
-    max_gaussians: int | None = None  # None: the method's own ceiling
-    torch_threads: int = 1  # fixed, not the machine's: the split of a sum decides its last bits
+    max_gaussians: int | None = None  # None: the limit of the method
+    torch_threads: int = 1  # fixed for all machines: how a sum is split decides its last bits
     checkpoint_every_s: float = 60.0
-    probes: int = 8  # times the test PSNR is probed; the clock stands still meanwhile
-    on_nonfinite: OnNonFinite = (
-        "stop"  # or go back to the last checkpoint and leave the photo out, see watchdog.py
-    )
+    probes: int = 8  # how often the test PSNR is measured, with the clock stopped
+    # stop, or go back to the last checkpoint and leave the photo out, see watchdog.py
+    on_nonfinite: OnNonFinite = "stop"
 
     def __post_init__(self) -> None:
         if not 1 <= self.iterations <= 100_000_000:  # months on a GPU
@@ -127,7 +126,7 @@ def room(
 
 
 class Pace:
-    """Every schedule of one run, from its settings and how far it is: nothing of it is saved."""
+    """Every schedule of one run, computed from its settings and progress: it has no state to save."""
 
     def __init__(
         self, config: TrainConfig, schedule: Schedule, data: TrainData, *, start: int, most: int
@@ -135,47 +134,49 @@ class Pace:
         """
         Args:
             config: length and seed.
-            schedule: of the method.
-            data: photos, and the extent that learning rates of means are scaled by.
-            start: Gaussians before the first step.
-            most: Gaussians at which the method's growth stops.
+            schedule: the method's schedule.
+            data: photos, and the extent that scales the learning rate of means.
+            start: number of Gaussians before the first step.
+            most: number of Gaussians at which the method's growth stops.
         """
         self.config, self.schedule = config, schedule
         self.extent = data.scene.extent
         self.views = len(data.photos)
-        self._order: tuple[int, np.ndarray] | None = None  # of the epoch last asked about
+        self._order: tuple[int, np.ndarray] | None = (
+            None  # epoch and order of views of the last call of `view`
+        )
         self.start = start
         self.short = config.budget_s is not None or config.iterations < schedule.short_below
         self.most = self._most(data, most)
         self.levels = self._levels(data)
 
     def progress(self, iteration: int, elapsed_s: float) -> float:
-        """Share of the run that lies behind after so many steps and seconds of training, in [0, 1]."""
+        """Return the share of the run done after these steps and seconds of training, in [0, 1]."""
         if self.config.budget_s is not None:
             return min(elapsed_s / self.config.budget_s, 1.0)
         return min(iteration / self.config.iterations, 1.0)
 
     def marks(self, count: int, iteration: int, elapsed_s: float) -> int:
-        """How many of `count` evenly spaced marks, the last at the end, lie behind; exact for iterations."""
+        """Return how many of `count` evenly spaced marks are passed, the last at the end of the run."""
         if self.config.budget_s is not None:
             return int(self.progress(iteration, elapsed_s) * count)
         return min(iteration, self.config.iterations) * count // self.config.iterations
 
     def divisor(self, progress: float) -> int:
-        """Photos are trained at their size over this."""
+        """Return the divisor of the photos' size at this share of the run."""
         return divisor_at(self.levels, progress)
 
     @property
     def divisors(self) -> tuple[int, ...]:
-        """All that the run trains at."""
+        """Every resolution divisor that the run uses."""
         return tuple(sorted({level.divisor for level in self.levels}))
 
     def ceiling(self, divisor: int, progress: float) -> int:
-        """Growth stops at this many Gaussians now."""
+        """Return the number of Gaussians at which growth stops now."""
         return ceiling_at(self.start, self.most, divisor, progress, COARSE_UNTIL)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        """Of every tensor, at this share of the run."""
+        """Return the learning rate of every tensor at this share of the run."""
         s = self.schedule
         last = s.lr_means_final_short if self.short else s.lr_means_final
         return {
@@ -188,19 +189,19 @@ class Pace:
         }
 
     def epoch(self, iteration: int) -> int:
-        """Passes over all views that were complete before this iteration."""
+        """Return how many passes over all views were complete before this iteration."""
         return (iteration - 1) // self.views
 
     def view(self, iteration: int) -> int:
-        """Every view once an epoch, in an order of the epoch's own that the seed decides."""
+        """Return the view of an iteration; each epoch visits every view once, in an order from the seed."""
         epoch = self.epoch(iteration)
-        if self._order is None or self._order[0] != epoch:  # asked for several times a step
+        if self._order is None or self._order[0] != epoch:  # kept, as a step calls this several times
             rng = np.random.default_rng([self.config.seed, 0x51, epoch])
             self._order = epoch, rng.permutation(self.views)
         return int(self._order[1][(iteration - 1) % self.views])
 
     def _most(self, data: TrainData, most: int) -> int:
-        """Growth ends here: a short run can neither afford nor settle more than the photos can tell apart.
+        """Return the number of Gaussians at which growth ends; in short runs it follows the photos' pixels.
 
         Simulated courtyard at 240x135, 3000 iterations: 14 000, 20 000, 32 000 and 64 000 Gaussians gave
         RefineSplat 30.3, 31.1, 31.3 and 30.7 dB at 9.5, 11.3, 13.6 and 19.6 ms an iteration.
@@ -209,10 +210,10 @@ class Pace:
         return room(self.config, self.schedule, sizes, most, self.start)
 
     def _levels(self, data: TrainData) -> tuple[Level, ...]:
-        wanted: str = self.config.resolution
-        if wanted == "auto":
-            wanted = "coarse-to-fine" if self.config.budget_s is not None else self.schedule.resolution
-        if wanted == "full":
+        resolution: str = self.config.resolution
+        if resolution == "auto":
+            resolution = "coarse-to-fine" if self.config.budget_s is not None else self.schedule.resolution
+        if resolution == "full":
             return FULL
         sample = data.photos[:: max(len(data.photos) // 8, 1)]
         return coarse_to_fine([photo.cpu().numpy() for photo in sample], COARSE_UNTIL)

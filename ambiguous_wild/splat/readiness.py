@@ -1,7 +1,7 @@
-"""Whether torch and gsplat can use the GPU of this machine; if not, what is missing and its command.
+"""Whether torch and gsplat can use this machine's GPU; if not, what is missing and the command that helps.
 
 `look` collects the facts, functions without side effects judge them, and `load_kernels` draws one Gaussian.
-Only `torch_facts` imports torch, so that `aw doctor` can run it in a process of its own.
+Only `torch_facts` imports torch, so that `aw doctor` can call it in another process.
 """
 
 from __future__ import annotations
@@ -12,39 +12,50 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from ambiguous_wild.core.errors import AwError, install_command, torch_command
 from ambiguous_wild.io.files import patient_lock
 
-GSPLAT = "1.5.3"  # the release whose calls are known
+GSPLAT = "1.5.3"  # the release that gsplat_seam.py is written for
 INSTALL_GSPLAT = f"{sys.executable} -m pip install 'gsplat=={GSPLAT}'"
 TOOLKIT = "https://developer.nvidia.com/cuda-toolkit-archive"
-COMPILE_S = 3600.0  # longest wait for another process that compiles gsplat's kernels
+COMPILE_S = 3600.0  # longest wait for another process that compiles gsplat's kernels, seconds
 
 
 @dataclass(frozen=True)
 class Lack:
-    """A missing dependency of the GPU."""
+    """A missing dependency of training on the GPU."""
 
     what: str
-    fix: str  # the command that mends it, or what to do
+    fix: str  # the command that installs it, or what to do
 
     def __str__(self) -> str:
         return f"{self.what}: {self.fix}"
+
+
+class TorchFacts(TypedDict):
+    """Facts about the installed torch."""
+
+    version: str
+    built: str | None  # version of CUDA that it is built for; None = a CPU build
+    cuda: bool  # whether it can use a GPU
+    names: list[str]  # names of the GPUs that it sees
+    toolkit: str | None  # folder of the CUDA toolkit that it compiles with
+    error: str  # why a CUDA build sees no GPU
 
 
 @dataclass(frozen=True)
 class GpuFacts:
     """Facts about this machine."""
 
-    torch: Mapping[str, Any]  # see `torch_facts`
-    driver: str | None  # what nvidia-smi says of the first GPU; None = it is absent or sees none
+    torch: TorchFacts
+    driver: str | None  # name and driver of the first GPU, from nvidia-smi; None = it is absent or fails
     gsplat: str | None  # installed version
-    prebuilt: bool  # its kernels came compiled, in a wheel of one's own
+    prebuilt: bool  # whether the installed gsplat contains compiled kernels
     compiler: str | None  # path of the C++ compiler
     hidden: str | None  # $CUDA_VISIBLE_DEVICES
 
@@ -54,8 +65,8 @@ class GpuFacts:
         return self.driver is not None or bool(self.torch["cuda"])
 
 
-def torch_facts() -> dict[str, Any]:
-    """torch's version, the GPUs that it sees and the CUDA toolkit that it compiles with, as plain values."""
+def torch_facts() -> TorchFacts:
+    """Return facts about the installed torch, as plain values."""
     import torch
 
     cuda, error, toolkit = torch.cuda.is_available(), "", None
@@ -78,11 +89,11 @@ def torch_facts() -> dict[str, Any]:
     }
 
 
-def look(torch: Mapping[str, Any] | None = None) -> GpuFacts:
+def look(torch: TorchFacts | None = None) -> GpuFacts:
     """Collect the facts about this machine.
 
     Args:
-        torch: result of `torch_facts`, if another process called it; None calls it here.
+        torch: result of `torch_facts` in another process; None calls it in this one.
     """
     spec = importlib.util.find_spec("gsplat")
     package = None if spec is None or spec.origin is None else Path(spec.origin).parent
@@ -104,12 +115,12 @@ def _version(package: str) -> str | None:
 
 
 def why_not(facts: GpuFacts) -> Lack | None:
-    """The first missing dependency of training on the GPU; None if there is none."""
+    """Return the first missing dependency of training on the GPU; None if nothing is missing."""
     return no_cuda(facts) or no_gsplat(facts) or no_compiler(facts)
 
 
 def no_cuda(facts: GpuFacts) -> Lack | None:
-    """Why torch cannot compute on the GPU."""
+    """Return why torch cannot compute on the GPU; None if it can."""
     torch = facts.torch
     if torch["cuda"]:
         return None
@@ -126,7 +137,7 @@ def no_cuda(facts: GpuFacts) -> Lack | None:
 
 
 def no_gsplat(facts: GpuFacts) -> Lack | None:
-    """Why there is no gsplat that can be called."""
+    """Return why gsplat cannot be called; None if it can."""
     if facts.gsplat is None:
         return Lack("gsplat is not installed", install_command("cuda"))
     if facts.gsplat.partition("+")[0] != GSPLAT:
@@ -135,17 +146,15 @@ def no_gsplat(facts: GpuFacts) -> Lack | None:
 
 
 def no_compiler(facts: GpuFacts) -> Lack | None:
-    """What gsplat needs to compile its kernels, once; to load them it looks for nvcc again."""
+    """Return what gsplat lacks to compile or load its kernels (to load them it needs nvcc too)."""
     if facts.prebuilt:
         return None
-    built = facts.torch["built"]
-    absent = {
-        f"nvcc (the CUDA toolkit {built}: {TOOLKIT}, then export CUDA_HOME=ITS_FOLDER)": facts.torch[
-            "toolkit"
-        ],
+    built, toolkit = facts.torch["built"], facts.torch["toolkit"]
+    tools = {
+        f"nvcc (the CUDA toolkit {built}: {TOOLKIT}, then export CUDA_HOME=ITS_FOLDER)": toolkit,
         "a C++17 compiler (sudo apt-get install g++, or export CXX=ITS_PATH)": facts.compiler,
     }
-    wanted = [text for text, found in absent.items() if not found]
+    wanted = [text for text, path in tools.items() if not path]
     if not wanted:
         return None
     names = " and ".join(text.partition(" (")[0] for text in wanted)
@@ -155,9 +164,9 @@ def no_compiler(facts: GpuFacts) -> Lack | None:
 
 
 def load_kernels() -> None:
-    """Draw one Gaussian on the GPU; gsplat compiles its kernels before its first picture, for minutes.
+    """Draw one Gaussian on the GPU. Before its first picture gsplat compiles its kernels, for minutes.
 
-    One process at a time: gsplat's compiles of several break each other.
+    Only one process compiles at a time, because parallel compilations of gsplat break each other.
 
     Raises:
         AwError: the kernels cannot be compiled or loaded, or the installed gsplat takes other arguments.
@@ -166,13 +175,13 @@ def load_kernels() -> None:
 
     from ambiguous_wild.splat.gsplat_seam import max_alpha
 
-    own = str(Path(sys.executable).parent)  # pip puts ninja there, also where nobody activated it
+    own = str(Path(sys.executable).parent)  # pip installs ninja here, activated or not
     if own not in (path := os.environ.get("PATH", "")).split(os.pathsep):
         os.environ["PATH"] = os.pathsep.join(filter(None, (path, own)))
     with patient_lock(Path(get_default_build_root()) / "gsplat", "a compile of gsplat", COMPILE_S):
         try:
             max_alpha("cuda")
-        except Exception as error:  # of compilers, loaders and CUDA: many kinds
+        except Exception as error:  # compilers, loaders and CUDA raise many kinds
             lines = str(error).strip().splitlines() or [type(error).__name__]
             reason = next((line for line in lines if "error:" in line), lines[0]).strip()[:300]
             raise AwError(
@@ -185,7 +194,7 @@ def require(facts: GpuFacts) -> None:
     """Make sure that gsplat can draw on this machine's GPU.
 
     Raises:
-        AwError: what is missing, and its command.
+        AwError: something is missing; the message holds the command that installs it.
     """
     lack = why_not(facts)
     if lack is not None:
@@ -194,10 +203,10 @@ def require(facts: GpuFacts) -> None:
 
 
 def choose(device: str, say: Callable[[str], None], *, looking: Callable[[], GpuFacts] | None = None) -> str:
-    """ "cpu" or "cuda" for "auto", "cpu" or "cuda"; says so if a GPU stays unused.
+    """Return "cpu" or "cuda" for "auto", "cpu" or "cuda"; warns through `say` if a GPU stays unused.
 
     Raises:
-        AwError: cuda was asked for and is not usable; says what is missing.
+        AwError: cuda was requested and cannot be used; the message says what is missing.
     """
     if device == "cpu":
         return "cpu"
@@ -215,7 +224,7 @@ def choose(device: str, say: Callable[[str], None], *, looking: Callable[[], Gpu
 
 
 def first_line(*words: str) -> str | None:
-    """The first line that a program prints; None if it is missing or fails."""
+    """Return the first line that a program prints; None if the program is missing or fails."""
     if shutil.which(words[0]) is None:
         return None
     try:

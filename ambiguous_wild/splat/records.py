@@ -1,4 +1,4 @@
-"""What is written down of a run: training time, the timeline, and what density control did where."""
+"""What a run records: training time, the timeline, and where density control added and merged Gaussians."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.io.files import write_text
 
-# On a GPU the parts of every so many-th step are timed: an event costs a launch. A prime: growth comes every
-# hundredth step, merging every thousandth, and a divisor of theirs would time them too often or never.
+# On a GPU the parts of every 17th step are timed, because an event costs a launch. The number is prime:
+# growth comes every hundredth step, merging every thousandth; a divisor of these would time them too often.
 SAMPLED = 17
 
 
 class Clock:
-    """Seconds of training so far, by the wall and of all processors, and of each of its parts."""
+    """Seconds of training so far: wall time, processor time, and the wall time of each part of a step."""
 
     def __init__(self, elapsed_s: float = 0.0, parts_s: dict[str, float] | None = None) -> None:
         self.elapsed_s = elapsed_s
@@ -55,21 +56,21 @@ class Clock:
             self.parts_s[name] = self.parts_s.get(name, 0.0) + time.perf_counter() - begin
 
     def settle(self) -> None:
-        """Wait for what was started but not finished; call it before the clock is stopped to be read."""
+        """Wait until all launched work is done; call it before stopping the clock to read it."""
 
     def settle_stopped(self) -> None:
-        """`settle` of a clock that has been stopped: what was started before counts."""
+        """Do as `settle` for a stopped clock; the time that launched work still takes is added."""
 
 
 class GpuClock(Clock):
-    """Parts by the GPU's own events: the host is done with a step long before the GPU is."""
+    """A clock that times parts with GPU events, because the host finishes a step long before the GPU."""
 
     def __init__(
         self,
         elapsed_s: float = 0.0,
         parts_s: dict[str, float] | None = None,
         *,
-        event: Callable[[], Any] | None = None,  # with record, synchronize, elapsed_time in ms
+        event: Callable[[], Any] | None = None,  # makes an event: record, synchronize, elapsed_time in ms
     ) -> None:
         super().__init__(elapsed_s, parts_s)
         self._event = event or (lambda: torch.cuda.Event(enable_timing=True))
@@ -109,33 +110,34 @@ class GpuClock(Clock):
 
 
 def clock_for(device: torch.device, elapsed_s: float = 0.0, parts_s: dict[str, float] | None = None) -> Clock:
-    """The clock of a run there."""
+    """Return the clock for a run on this device."""
     return (GpuClock if device.type == "cuda" else Clock)(elapsed_s, parts_s)
 
 
-ROWS = 100
+ROWS = 100  # rows of a timeline
+Row = dict[str, float | None]  # one row of a timeline, see `Timeline.add`
 
 
 class Timeline:
-    """Collects the loss between two rows; rows are plain dicts, see `add`."""
+    """The rows of timeline.csv; collects the loss between two rows."""
 
     def __init__(self) -> None:
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[Row] = []
         self.loss_sum: float | Tensor = 0.0  # since the last row
         self.loss_count = 0
         self.before_s = 0.0  # seconds of earlier trainings that belong to this one
 
     def loss(self, value: float | Tensor) -> None:
-        """Take the loss of one iteration; NaN (a photo left out) does not count.
+        """Add the loss of one iteration; NaN (of a photo that was left out) is ignored.
 
-        A tensor is added up where it is: nobody waits for it.
+        A tensor is added on its device, so that the host need not wait.
         """
         if isinstance(value, Tensor) or not math.isnan(value):
             self.loss_sum, self.loss_count = self.loss_sum + value, self.loss_count + 1
 
-    def add(self, iteration: int, gaussians: int, clock: Clock) -> dict[str, Any]:
-        """A new row; returns it, with room for the PSNR of the test views."""
-        row: dict[str, Any] = {
+    def add(self, iteration: int, gaussians: int, clock: Clock) -> Row:
+        """Append a row and return it; the caller may set its "psnr_probe", the PSNR of the test views."""
+        row: Row = {
             "wall_s": round(self.before_s + clock.now(), 3),
             "iteration": iteration,
             "loss": float(self.loss_sum) / max(self.loss_count, 1),
@@ -149,7 +151,7 @@ class Timeline:
         return row
 
     def write(self, path: Path) -> None:
-        """timeline.csv: one line a row; empty cells where nothing was measured."""
+        """Write timeline.csv, with empty cells where nothing was measured."""
         names = list(dict.fromkeys(name for row in self.rows for name in row))
         text = io.StringIO()
         writer = csv.DictWriter(text, names, lineterminator="\n", restval="")
@@ -158,19 +160,19 @@ class Timeline:
         write_text(path, text.getvalue())
 
 
-MOST = 20_000  # positions kept of a kind; more would tell a picture nothing and weigh on every checkpoint
+MOST = 20_000  # positions kept of each kind: enough for a picture, small in every checkpoint
 
 
 @dataclass
 class Places:
-    """Positions [n, 3] in the world, evenly thinned to `MOST` at most; draws no random numbers."""
+    """Positions [n, 3] in the world, thinned evenly to at most `MOST` without random numbers."""
 
     xyz: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
-    stride: int = 1  # every so many-th position is kept
-    passed: int = 0  # positions shown so far
+    stride: int = 1  # one in `stride` positions is kept
+    passed: int = 0  # number of positions added so far, kept or not
 
     def add(self, xyz: Tensor) -> None:
-        """Take in positions [n, 3] in their order."""
+        """Add positions [n, 3] in this order."""
         first = -self.passed % self.stride
         self.passed += len(xyz)
         self.xyz = torch.cat([self.xyz, xyz.detach()[first :: self.stride].cpu()])
@@ -181,46 +183,46 @@ class Places:
 
 @dataclass
 class Round:
-    """One round of growth, in Gaussians."""
+    """Numbers of Gaussians in one round of growth."""
 
     iteration: int
     cloned: int = 0
     split: int = 0
     pruned: int = 0
-    merged: int = 0  # that merging removed
-    count: int = 0  # afterwards
+    merged: int = 0  # removed by merging
+    count: int = 0  # after the round
 
 
 @dataclass
 class DensityLog:
-    """Rounds in order, and where Gaussians came to be."""
+    """Rounds of growth in order, and positions of the Gaussians that they made."""
 
     rounds: list[Round] = field(default_factory=list)
-    added: Places = field(default_factory=Places)  # by cloning and splitting
-    merged: Places = field(default_factory=Places)  # what merging put in the place of several
+    added: Places = field(default_factory=Places)  # Gaussians added by cloning and splitting
+    merged: Places = field(default_factory=Places)  # Gaussians that replaced merged ones
 
     def begin(self, iteration: int) -> None:
-        """A round starts."""
+        """Start a round."""
         self.rounds.append(Round(iteration))
 
     @property
     def now(self) -> Round:
-        """The round under way; one before the first where density is driven by hand."""
+        """The current round; one of iteration 0 if none was started."""
         if not self.rounds:
             self.begin(0)
         return self.rounds[-1]
 
     def grew(self, cloned: int, split: int, xyz: Tensor) -> None:
-        """Growth made Gaussians at `xyz` [n, 3]."""
+        """Note that growth made Gaussians at `xyz` [n, 3]."""
         self.now.cloned, self.now.split = cloned, split
         self.added.add(xyz)
 
     def merge(self, removed: int, xyz: Tensor) -> None:
-        """Merging removed so many and left one at each of `xyz` [n, 3]."""
+        """Note that merging removed this many Gaussians and left one at each of `xyz` [n, 3]."""
         self.now.merged += removed
         self.merged.add(xyz)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {
             "rounds": [[r.iteration, r.cloned, r.split, r.pruned, r.merged, r.count] for r in self.rounds],
             **{
@@ -229,6 +231,6 @@ class DensityLog:
             },
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self.rounds = [Round(*row) for row in state["rounds"]]
         self.added, self.merged = Places(**state["added"]), Places(**state["merged"])

@@ -1,6 +1,6 @@
 """The judge: renderer and loss in plain float64 torch, every pixel against every Gaussian, by autograd.
 
-Slow on purpose: nothing is tiled, sorted twice, approximated or written backwards. Same conventions as
+It is slow on purpose: nothing is tiled, approximated or differentiated by hand. It has the conventions of
 `render.render`; tests measure both back ends against it.
 """
 
@@ -27,27 +27,25 @@ _C3 = (
 )
 
 
-# Two layers at the alpha clamp leave (1 - 0.99)^2, which is 1e-4 to the digit and stops the pixel; float64
-# rounds it to just above, every float32 path to just below.
+# Two layers at the alpha clamp leave (1 - 0.99)^2, which is exactly 1e-4 and stops the pixel; float64 rounds
+# it to just above, every float32 renderer to just below.
 _STOP = 1e-4 * (1 + 1e-12)
 
 
 @dataclass
 class Reference:
-    """Pictures in float64, attached to the parameters' graph."""
+    """Pictures in float64, part of the graph of the parameters."""
 
     image: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
     depth: Tensor  # [H, W]
     visible: Tensor  # [N] bool
     conic: Tensor  # [N, 2, 2] inverse of the blurred covariance in the image
-    screen: (
-        Tensor  # [N, 2] projected means; a leaf of the graph's middle, so that its gradient can be asked for
-    )
+    screen: Tensor  # [N, 2] projected means, part of the graph, so that autograd can return their gradient
 
 
 def harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics 1 .. (degree + 1)^2 - 1 at unit directions [N, 3] -> [N, K]."""
+    """Return the real spherical harmonics 1 .. (degree + 1)^2 - 1 at unit directions [N, 3], [N, K]."""
     x, y, z = directions.unbind(1)
     terms: list[Tensor] = []
     if degree >= 1:
@@ -74,7 +72,7 @@ def harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any positive norm."""
+    """Return rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any positive norm."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -93,14 +91,16 @@ def render_reference(
     antialias: bool = False,
     max_alpha: float = 0.99,  # the clamp; 0.999 judges gsplat up to 1.5.3
     blur: float = 0.3,  # px^2
-    shade: Callable[[Tensor], Tensor] | None = None,  # colours [N, 3] of those of the harmonics, SH + 0.5
+    shade: Callable[[Tensor], Tensor] | None = None,  # SH + 0.5 [N, 3] -> colours
 ) -> Reference:
-    """Render with autograd. Memory is H * W * N doubles a tensor: tens of Gaussians, tens of pixels."""
+    """Render with autograd. A tensor has H * W * N doubles, so this suits tens of Gaussians and pixels."""
     pose = torch.tensor(camera.cam_from_world)
     means = parameters["means"]
     local = means @ pose[:3, :3].T + pose[:3, 3]
     front = local[:, 2] >= 0.01
-    z = torch.where(front, local[:, 2], torch.ones_like(local[:, 2]))  # keeps the culled out of the graph
+    z = torch.where(
+        front, local[:, 2], torch.ones_like(local[:, 2])
+    )  # keeps culled Gaussians out of the graph
     ray = local[:, :2] / z[:, None]
     focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
     centre = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
@@ -152,7 +152,7 @@ def render_reference(
         power = 0.5 * (conic[i, 0, 0] * d[..., 0] ** 2 + conic[i, 1, 1] * d[..., 1] ** 2)
         power = power + conic[i, 0, 1] * d[..., 0] * d[..., 1]
         e = opacity[i] * torch.exp(-power)
-        # detach where clamped: min() would already do so, written out because it is the convention.
+        # no gradient where alpha is clamped, a convention of all renderers
         alpha = torch.where(e > max_alpha, torch.full_like(e, max_alpha), e)
         alpha = torch.where(alpha < 1 / 255, torch.zeros_like(alpha), alpha)
         touched[i] = bool((alpha > 0).any())
@@ -167,7 +167,7 @@ def render_reference(
 
 
 def ssim_map_reference(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM of every pixel and channel as `losses.ssim_map`, differentiable, any device and float type."""
+    """Return what `losses.ssim_map` does, differentiable, for any device and float type."""
     taps = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5.0) ** 2) / (2 * 1.5**2))
     taps = (taps / taps.sum()).to(a)
 
@@ -189,7 +189,7 @@ def ssim_map_reference(a: Tensor, b: Tensor) -> Tensor:
 def photometric_reference(
     render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
 ) -> tuple[float, float, Tensor]:
-    """L1, 1 - SSIM and the gradient of their mix as `losses.photometric`, by autograd, any float type."""
+    """Return L1, 1 - SSIM and the gradient of their mix as `losses.photometric`, by autograd."""
     with torch.enable_grad():
         x = render.detach().requires_grad_(True)
         y = photo

@@ -1,9 +1,9 @@
 """One `render` call for every back end, with an explicit backward pass instead of autograd.
 
-The loss of a training step is a sum of parts that know their own gradient with respect to the image.
-They hand it over as a *cotangent* (dL/dimage), and one traversal turns cotangents into parameter
-gradients. A second cotangent rides along: its gradient is added to the parameters', and its
-screen-space statistic is kept apart, which is what entropy-aware density control needs.
+The loss of a training step is a sum of parts that compute their own gradient with respect to the image. They
+pass it as a *cotangent* (dL/dimage), and one backward traversal turns cotangents into gradients of the
+parameters. A second cotangent may go along: its gradients of the parameters are added, and its gradients in
+screen space are kept apart, for entropy-aware density control.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def render(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     antialias: bool = False,  # Mip-Splatting's 2D filter: opacity times sqrt(det ratio)
     blur: float = BLUR,  # px^2 added to both variances of a splat; Mip-Splatting's own code has 0.1
-    shade: Shade | None = None,  # colours by a function of the visible rows; None = harmonics
+    shade: Shade | None = None,  # function that colours the visible rows; None = harmonics
 ) -> Rendered:
     """Render the Gaussians for one camera on the device they live on.
 
@@ -33,7 +33,7 @@ def render(
     reaches 1e-4, colours max(SH + 0.5, 0).
 
     Raises:
-        AwError: the Gaussians are on a GPU and gsplat is not installed.
+        AwError: the Gaussians are on a GPU, and gsplat is not installed.
     """
     return backend_of(gaussians.device).render(
         gaussians,

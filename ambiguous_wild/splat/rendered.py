@@ -1,15 +1,15 @@
-"""What every back end of `render` returns, and the values that travel back through it.
+"""What every back end of `render` returns, and the values that its backward pass takes and gives.
 
-A *cotangent* is the gradient of the loss with respect to something that came out of a call; a *pull* is a
-function that turns it into the gradient with respect to what went in. Both are plain values: nothing is kept
-in an object between the forward and the backward pass, so that two pictures of one step cannot mix.
+A *cotangent* is the gradient of the loss with respect to an output of a call; a *pull* is a function that
+turns it into the gradient with respect to the inputs. Both are plain values: no object stores anything
+between the forward and the backward pass, so that two pictures of one step cannot be mixed up.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import torch
@@ -21,9 +21,9 @@ from ambiguous_wild.splat.gaussians import Gaussians
 
 # Gradients of an effect's own parameters, by the effect's name and the parameter's.
 Own = Mapping[str, Mapping[str, Tensor]]
-# What density control can ask of the backward pass beyond the signed sums, see `Gradients`.
+# Statistics that density control can ask for beyond the signed sums, see `Gradients`.
 NEEDS = ("absolute", "squared", "count")
-GSPLAT_SUMS = ("absolute",)  # of these, what gsplat can sum
+GSPLAT_SUMS = ("absolute",)  # those that gsplat offers
 NOTHING: frozenset[str] = frozenset()
 
 
@@ -32,10 +32,11 @@ class Cotangents:
     """dL/d(picture) of one render; None is zero."""
 
     image: Tensor | None = None  # [H, W, 3]
-    extra: Tensor | None = None  # [H, W, 3] a second one of the image, added; its statistic is kept apart
+    extra: Tensor | None = None  # [H, W, 3] second cotangent of the image, see `Gradients.screen_extra`
     alpha: Tensor | None = None  # [H, W]
     depth: Tensor | None = None  # [H, W]
-    own: Own = field(default_factory=dict)  # collected on the way by effects that act on pictures
+    _: KW_ONLY
+    own: Own = field(default_factory=dict)  # collected by effects that act on pictures
 
     def __add__(self, other: Cotangents) -> Cotangents:
         sums = {name: sum_where(getattr(self, name), getattr(other, name)) for name in _PICTURES}
@@ -46,7 +47,7 @@ _PICTURES = ("image", "extra", "alpha", "depth")
 
 
 def as_cotangents(value: Cotangents | Tensor, extra: Cotangents | Tensor | None = None) -> Cotangents:
-    """A tensor [H, W, 3] alone is dL/dimage; one given as `extra` is the second cotangent."""
+    """Add two cotangents. A tensor [H, W, 3] as `value` is that of the image, as `extra` the second one."""
     main = value if isinstance(value, Cotangents) else Cotangents(image=value)
     if extra is None:
         return main
@@ -57,8 +58,8 @@ def as_cotangents(value: Cotangents | Tensor, extra: Cotangents | Tensor | None 
 class Gradients:
     """dL/dparameter of every Gaussian, and the screen-space statistics that density control reads.
 
-    `screen` is dL/d(u, v) in 1/px of `Cotangents.image` (with alpha and depth) alone; `screen_extra` that of
-    `Cotangents.extra` alone. What a method does not ask for is None.
+    `screen` is dL/d(u, v) in 1/px from `Cotangents.image`, alpha and depth; `screen_extra` is that from
+    `Cotangents.extra`, the second cotangent. Statistics that a method does not need are None.
     """
 
     means: Tensor  # [N, 3]
@@ -67,37 +68,38 @@ class Gradients:
     opacity_logits: Tensor  # [N]
     sh0: Tensor  # [N, 3]
     sh_rest: Tensor  # [N, K, 3]
+    _: KW_ONLY
     screen: Tensor  # [N, 2]
     screen_extra: Tensor | None = None  # [N, 2]
     screen_abs: Tensor | None = None  # [N, 2] "absolute": |.| of every pixel before the sum (AbsGS)
     squared: Tensor | None = None  # [N] "squared": sum over pixels of |d/d(u, v)|^2, 1/px^2
     count: Tensor | None = None  # [N] "count": pixels in which the Gaussian was drawn
     visible: Tensor | None = None  # [N] bool, rows that were drawn; the others' gradients are zero
-    extra: Mapping[str, Tensor] = field(default_factory=dict)  # [N, ...] of `Gaussians.extra`
-    own: Own = field(default_factory=dict)  # of the effects' own parameters
-    fields: Mapping[str, Gradients] = field(default_factory=dict)  # of other fields in the same picture
+    attributes: Mapping[str, Tensor] = field(default_factory=dict)  # [N, ...] of `Gaussians.attributes`
+    own: Own = field(default_factory=dict)  # gradients of the effects' own parameters
+    fields: Mapping[str, Gradients] = field(default_factory=dict)  # those of other fields in the picture
 
     def __add__(self, other: Gradients) -> Gradients:
-        """The gradients of the sum of two losses, for the same Gaussians and camera."""
-        plain = {f.name for f in fields(self)} - {"visible", "extra", "own", "fields"}
+        """Return the gradients of the sum of two losses, for the same Gaussians and camera."""
+        plain = {f.name for f in fields(self)} - {"visible", "attributes", "own", "fields"}
         sums: dict[str, Any] = {name: sum_where(getattr(self, name), getattr(other, name)) for name in plain}
         seen = [g.visible for g in (self, other) if g.visible is not None]
         shared = self.fields.keys() & other.fields.keys()
         return Gradients(
             **sums,
             visible=torch.stack(seen).any(dim=0) if seen else None,
-            extra=sum_named(self.extra, other.extra),
+            attributes=sum_named(self.attributes, other.attributes),
             own=sum_own(self.own, other.own),
             fields={**self.fields, **other.fields, **{k: self.fields[k] + other.fields[k] for k in shared}},
         )
 
     def with_own(self, effect: str, own: Mapping[str, Tensor]) -> Gradients:
-        """The same, with gradients of that effect's own parameters added."""
+        """Return these gradients with those of an effect's own parameters added."""
         return replace(self, own=sum_own(self.own, {effect: own}))
 
 
-Pull = Callable[[Gradients], Gradients]  # of what changes Gaussians
-FramePull = Callable[[Cotangents], Cotangents]  # of what changes pictures
+Pull = Callable[[Gradients], Gradients]  # through a change of Gaussians
+FramePull = Callable[[Cotangents], Cotangents]  # through a change of pictures
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Frame:
 
     image: Tensor  # [H, W, 3] float32, not clamped
     alpha: Tensor  # [H, W] float32 in [0, 1]
-    depth_of: Callable[[], Tensor]  # blended when it is asked for
+    depth_of: Callable[[], Tensor]  # blends the depth, on demand
 
     @property
     def depth(self) -> Tensor:
@@ -119,7 +121,7 @@ class Rendered(Protocol):
 
     image: Tensor  # [H, W, 3] float32, background included, not clamped
     alpha: Tensor  # [H, W] float32 in [0, 1]
-    visible: Tensor  # [N] bool, passed every cull
+    visible: Tensor  # [N] bool, rows that passed every cull
 
     @property
     def radii(self) -> Tensor:
@@ -132,31 +134,31 @@ class Rendered(Protocol):
         ...
 
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
-        """Gradients of sum(cotangent * picture) with respect to every raw parameter.
+        """Return the gradients of sum(cotangent * picture) with respect to every raw parameter.
 
         Args:
-            cotangents: of the pictures; a tensor is that of the image.
-            needs: statistics beyond the signed sums, of `NEEDS`.
+            cotangents: cotangents of the pictures; a tensor is that of the image.
+            needs: names from `NEEDS` of statistics beyond the signed sums.
         """
         ...
 
 
 def with_visible(rendered: Rendered, visible: Tensor) -> Rendered:
-    """The same render, but these rows [N] bool count as drawn; the one given does not change."""
-    found = copy.copy(rendered)
-    found.visible = visible
-    return found
+    """Return a copy of a render in which these rows [N] bool count as drawn."""
+    changed = copy.copy(rendered)
+    changed.visible = visible
+    return changed
 
 
 def frame_of(rendered: Rendered) -> Frame:
-    """The pictures alone."""
+    """Return the pictures of a render."""
     return Frame(rendered.image, rendered.alpha, lambda: rendered.depth)
 
 
 class Shade(Protocol):
-    """Colours by a function of the visible rows instead of harmonics alone.
+    """A function that colours the visible rows instead of harmonics alone.
 
-    Called between projection and blending.
+    It is called between projection and blending.
     """
 
     def __call__(
@@ -164,39 +166,39 @@ class Shade(Protocol):
         base: Tensor,  # [M, 3] SH(direction) + 0.5 of the rows, not clamped
         rows: Tensor | slice,  # [M] int64, visible Gaussians; on an accelerator all of them, a slice
     ) -> tuple[Tensor, ShadePull]:
-        """Colours [M, 3], which the renderer clamps below at 0, and the pull."""
+        """Return colours [M, 3], which the renderer clamps at 0, and their pull."""
         ...
 
 
 @dataclass(frozen=True)
 class ShadeGradients:
-    """Where the gradient of shaded colours goes."""
+    """The gradients that the pull of shaded colours returns."""
 
-    base: Tensor  # [M, 3] dL/d(base), on to harmonics and means
-    extra: Mapping[str, Tensor] = field(default_factory=dict)  # [M, ...] of `Gaussians.extra`
-    means: Tensor | None = None  # [M, 3] of the positions that the function read
+    base: Tensor  # [M, 3] dL/d(base), which goes on to harmonics and means
+    attributes: Mapping[str, Tensor] = field(default_factory=dict)  # [M, ...] of `Gaussians.attributes`
+    means: Tensor | None = None  # [M, 3] dL/d(positions), if the function read them
     own: Own = field(default_factory=dict)
 
 
-ShadePull = Callable[[Tensor], ShadeGradients]  # of dL/dcolours [M, 3]
+ShadePull = Callable[[Tensor], ShadeGradients]  # from dL/dcolours [M, 3]
 
 
-def spread(gradients: Gradients, found: ShadeGradients, rows: Tensor | slice, g: Gaussians) -> Gradients:
-    """Add what a shading function found for its rows to the gradients of all rows; changes them in place."""
-    if found.means is not None:
-        gradients.means[rows] += found.means
-    gradients.extra = {name: torch.zeros_like(g.extra[name]) for name in found.extra}
-    for name, value in found.extra.items():
-        gradients.extra[name][rows] = value
-    gradients.own = sum_own(gradients.own, found.own)
+def spread(gradients: Gradients, shading: ShadeGradients, rows: Tensor | slice, g: Gaussians) -> Gradients:
+    """Add the gradients of a shading function's rows to those of all rows, in place."""
+    if shading.means is not None:
+        gradients.means[rows] += shading.means
+    gradients.attributes = {name: torch.zeros_like(g.attributes[name]) for name in shading.attributes}
+    for name, value in shading.attributes.items():
+        gradients.attributes[name][rows] = value
+    gradients.own = sum_own(gradients.own, shading.own)
     return gradients
 
 
 def check_needs(needs: frozenset[str], offered: Sequence[str] = NEEDS) -> None:
-    """Raise AwError where no back end knows a statistic, or this one does not offer it.
+    """Raise AwError if a statistic is unknown, or this back end does not offer it.
 
     Args:
-        needs: asked for.
+        needs: names of the statistics.
         offered: `Backend.statistics`.
     """
     for name in needs:
@@ -209,21 +211,21 @@ def check_needs(needs: frozenset[str], offered: Sequence[str] = NEEDS) -> None:
 
 
 def sum_own(a: Own, b: Own) -> Own:
-    """Both, summed where both have one."""
+    """Merge gradients of effects' parameters; entries in both are summed."""
     if not a or not b:
         return a or b
     return {name: sum_named(a.get(name, {}), b.get(name, {})) for name in {**a, **b}}
 
 
 def sum_named(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Both, summed under the names that both have."""
+    """Merge tensors by name; tensors under the same name are summed."""
     if not a or not b:
         return a or b
     return {name: a[name] + b[name] if name in a and name in b else {**a, **b}[name] for name in {**a, **b}}
 
 
 def sum_where(a: Tensor | None, b: Tensor | None) -> Tensor | None:
-    """The sum; None is zero."""
+    """Return the sum, where None is zero."""
     if a is None or b is None:
         return a if b is None else b
     return a + b

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.config import State
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
@@ -35,9 +36,10 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def deferred() -> Iterator[Callable[[], bool]]:
-    """Meanwhile Ctrl-C is only noted; yields whether it was. A second Ctrl-C interrupts at once.
+    """Defer Ctrl-C inside of the context; yields a function that tells whether it was pressed.
 
-    Nothing is changed outside of the main thread, or where somebody else answers the signal.
+    A second Ctrl-C interrupts at once. Outside of the main thread, or if another handler is installed for the
+    signal, nothing changes.
     """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
@@ -48,7 +50,7 @@ def deferred() -> Iterator[Callable[[], bool]]:
     def note(number: int, frame: Any) -> None:
         noted.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        with suppress(RuntimeError):  # the signal came while a line was written to the same place
+        with suppress(RuntimeError):  # the signal may interrupt a write to the same stream
             LOG.info("stopping: the model is measured and saved, Ctrl-C again to quit")
 
     signal.signal(signal.SIGINT, note)
@@ -59,7 +61,7 @@ def deferred() -> Iterator[Callable[[], bool]]:
 
 
 class Meter(Protocol):
-    """Watches the machine while a run trains; called with the run's clock stopped."""
+    """Watches the machine while a run trains; it is called with the run's clock stopped."""
 
     def begin(self, trained_s: float) -> None: ...
 
@@ -69,9 +71,9 @@ class Meter(Protocol):
 
     def end(self, trained_s: float) -> None: ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> State: ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: State) -> None: ...
 
 
 class Run(ABC):
@@ -85,48 +87,48 @@ class Run(ABC):
         Args:
             data: the training side.
             config: length and bookkeeping.
-            folder: where checkpoint and timeline go.
-            probe: gets a function that renders a camera, returns PSNR in dB of the test views.
+            folder: folder for checkpoint and timeline.
+            probe: takes a function that renders a camera; returns PSNR in dB of the test views.
         """
         self.data, self.config, self.folder, self.probe = data, config, folder, probe
         names = [view.name for view in data.scene.train]
         self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
         self.clock: Clock = clock_for(data.device)
         self.meter: Meter | None = None
-        self._marks: tuple[int, int] | None = None  # probes and rows that were due after the last step
-        self.setup_s = 0.0  # seconds before the first step, of the process that began the run
-        # "hash" of the run's configuration and "about", its name; empty = not known
+        self._marks: tuple[int, int] | None = None  # probes and timeline rows due after the last step
+        self.setup_s = 0.0  # seconds before the first step, in the process that began the run
+        # "hash" of the run's configuration and "about", its name; empty = unknown
         self.whose: dict[str, str] = {}
         self.iteration = 0
         self.timeline = Timeline()
-        self._skipped: set[int] = set()  # views that were all masked at some step
+        self._skipped: set[int] = set()  # views that were fully masked at some step
 
     @property
     @abstractmethod
     def gaussians(self) -> Gaussians:
-        """The model."""
+        """The static Gaussians: the model."""
 
     @property
     @abstractmethod
     def optimiser(self) -> SplatAdam:
-        """The model's."""
+        """The optimiser of the static Gaussians."""
 
     @abstractmethod
     def step(self) -> float | Tensor:
-        """One iteration; returns its loss."""
+        """Run one iteration; returns its loss."""
 
     @abstractmethod
     def render(self, camera: Camera) -> Rendered:
-        """The model as it stands."""
+        """Draw the model in its present state."""
 
     @abstractmethod
     def check_parameters(self) -> None:
-        """Raise NonFinite, as of the last step, where a parameter is not finite."""
+        """Raise NonFinite for the last step if a parameter is not finite."""
 
-    def state(self) -> dict[str, Any]:
-        """Everything that decides how the run goes on; what is not there leaves no key.
+    def state(self) -> State:
+        """Return everything that decides how the run goes on; parts that are absent have no key.
 
-        Whoever inherits adds the model's.
+        Subclasses add the state of the model.
         """
         rollbacks = self.watchdog.state_dict()
         return {
@@ -143,8 +145,8 @@ class Run(ABC):
             **({"rollbacks": rollbacks} if rollbacks else {}),
         }
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave; exact, so that a resumed run gives the same bits.
+    def load_state(self, state: State) -> None:
+        """Restore what `state` returned; exact, so that a resumed run gives the same bits.
 
         Raises:
             KeyError: a key is missing.
@@ -155,14 +157,14 @@ class Run(ABC):
         self.clock.cpu_s = state.get("cpu_s", 0.0)
         if self.meter is not None and "meter" in state:
             self.meter.load_state_dict(state["meter"])
-        self._marks = None  # they are those of the new state
+        self._marks = None  # computed again from the new state
         self.timeline.rows = list(state["timeline"])
         self.timeline.loss_sum, self.timeline.loss_count = state["loss"]
         self._skipped = set(state["skipped"])
         self.watchdog.load_state_dict(state.get("rollbacks", []))
 
     def progress(self, iteration: int) -> float:
-        """Share of the run that lies behind after `iteration` steps, in [0, 1]."""
+        """Return the share of the run done after `iteration` steps, in [0, 1]."""
         return self.pace.progress(iteration, self.clock.now())
 
     @property
@@ -170,17 +172,17 @@ class Run(ABC):
         return self.progress(self.iteration) >= 1.0
 
     def train(self, *, tick: Callable[[Any], None] | None = None) -> None:
-        """Run to the end; saves as it goes, probes on schedule.
+        """Train to the end, with checkpoints and probes on schedule.
 
         Args:
             tick: called after every iteration with the clock stopped (progress bars).
 
         Raises:
-            NonFinite: names view, iteration and parameters.
-            Stopped: Ctrl-C, after the iteration was ended and saved.
+            NonFinite: a value is not finite; the message names view, iteration and parameters.
+            Stopped: Ctrl-C was pressed; the iteration was completed and saved.
         """
         if self.config.on_nonfinite == "rollback" and not self.checkpoint_path.exists():
-            self.save()  # something to go back to, from the first iteration on
+            self.save()  # so that even the first iteration can be rolled back
         LOG.info("training")
         meter = None if self.done else self.meter
         if meter is not None:
@@ -198,7 +200,7 @@ class Run(ABC):
             if self.done:
                 if self._save_if_sound():
                     return
-                continue  # rolled back: there is more to do
+                continue  # the run was rolled back: train on
             self._advance(tick)
             if interrupted():
                 self._save_if_sound()
@@ -208,9 +210,9 @@ class Run(ABC):
                 last_save = time.monotonic()
 
     def _advance(self, tick: Callable[[Any], None] | None) -> None:
-        """One iteration with its bookkeeping, or one step back."""
+        """Run one iteration with its bookkeeping, or roll back if a value is not finite."""
         if self._marks is None:
-            self._marks = self._passed()
+            self._marks = self._marks_due()
         self.clock.start()
         try:
             loss = self.step()
@@ -222,12 +224,12 @@ class Run(ABC):
         self.timeline.loss(loss)
         # Marks are compared with those of the last step, not with the clock before this one: under a budget
         # the clock may pass a mark between two steps.
-        before, passed = self._marks, self._passed()
+        before, passed = self._marks, self._marks_due()
         done, meter = self.progress(self.iteration), self.meter
         calibrating = meter is not None and meter.due(self.clock.now(), done)
         if passed != before or calibrating:
             self.clock.settle_stopped()
-            passed = self._passed()
+            passed = self._marks_due()
         self._marks = passed
         if passed != before:
             self._log(passed[0] > before[0])
@@ -236,13 +238,13 @@ class Run(ABC):
         if meter is not None and calibrating:
             meter.look(self.clock.now())
 
-    def _passed(self) -> tuple[int, int]:
-        """Probes and rows of the timeline that are due by now, since the start of the run."""
-        done = (self.iteration, self.clock.now())
-        return self.pace.marks(self.config.probes, *done), self.pace.marks(ROWS, *done)
+    def _marks_due(self) -> tuple[int, int]:
+        """Return how many probes and timeline rows are due since the start of the run."""
+        now = (self.iteration, self.clock.now())
+        return self.pace.marks(self.config.probes, *now), self.pace.marks(ROWS, *now)
 
     def _save_if_sound(self) -> bool:
-        """Save, unless a parameter is not finite: then it is as if the last step had found that."""
+        """Save, unless a parameter is not finite: that is handled as a finding of the last step."""
         try:
             self.check_parameters()
         except NonFinite as error:
@@ -252,10 +254,10 @@ class Run(ABC):
         return True
 
     def _undo(self, error: NonFinite) -> None:
-        """Keep what reproduces a finding of the watchdog; then roll back, or raise it with where that lies.
+        """Store what reproduces a finding of the watchdog; then roll back, or raise the finding.
 
-        Rolling back restores the last checkpoint and leaves the photo out for the rest of its epoch. The
-        seconds spent stay spent.
+        A rollback restores the last checkpoint and leaves the photo out for the rest of its epoch. The clock
+        is not set back.
         """
         where = self.watchdog.keep(self.checkpoint_path, error)
         if not self.watchdog.undoes:
@@ -280,15 +282,14 @@ class Run(ABC):
 
     @torch.no_grad()
     def picture(self, camera: Camera) -> Tensor:
-        """What a camera sees, [H, W, 3], between two steps; the run ends with the same bits as without it.
+        """Draw a picture [H, W, 3] between two steps; the run has the same bits as without it.
 
-        Rows that the optimiser has put off are brought up to date: it computes what a later step would have
-        computed.
+        Rows that the optimiser has put off are brought up to date, as a later step would have done.
         """
         return self.render(camera).image
 
     def check_taught(self) -> None:
-        """Raise AwError if the loss was 0 in every row of the timeline: nothing was learnt."""
+        """Raise AwError if nothing was learnt: the loss was 0 in every row of the timeline."""
         rows = self.timeline.rows
         if rows and all(row["loss"] == 0.0 for row in rows):
             masked = len(self.skipped)
@@ -306,12 +307,12 @@ class Run(ABC):
 
     @property
     def skipped_views(self) -> list[str]:
-        """Train photos that were all masked at some step and taught nothing then."""
+        """Names of train photos that were fully masked at some step, which was then skipped."""
         return sorted(self.data.scene.train[i].name for i in self.skipped)
 
     @property
     def skipped(self) -> set[int]:
-        """Those photos' indices."""
+        """Indices of train photos that were fully masked at some step."""
         return self._skipped | (self.sentinel.empty_views() if self.sentinel is not None else set())
 
     @property
@@ -319,21 +320,21 @@ class Run(ABC):
         return self.folder / "checkpoint" / "last.safetensors"
 
     def save(self) -> None:
-        """Write the whole state and the timeline, each atomically."""
+        """Write the state and the timeline, each atomically."""
         checkpoint.save(self.checkpoint_path, self.state())
         self.timeline.write(self.folder / "timeline.csv")
 
     def resume(self) -> bool:
-        """Go on from the last checkpoint, if there is one; returns whether there was.
+        """Load the last checkpoint, if there is one; returns whether there was.
 
         Raises:
-            AwError: the checkpoint lacks something, or is of another run; names the file.
+            AwError: the checkpoint is incomplete, or belongs to another run; the message names the file.
         """
         path = self.checkpoint_path
         if not path.exists():
             return False
         state = checkpoint.load(path)
-        other = state.get("run", self.whose)  # of earlier versions: not known
+        other = state.get("run", self.whose)  # checkpoints of earlier versions do not hold it
         if self.whose and other != self.whose:
             raise AwError(
                 f"checkpoint {path} is of another run ({other.get('about')}, configuration "

@@ -1,4 +1,4 @@
-"""What a part of the training loop is shown: the training side of the scene, a shot, and one step."""
+"""What a part of the training loop is given: the training side of the scene, a shot, and one step."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from ambiguous_wild.splat.backend import Backend, backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Rendered
 
-NOMINAL_ITERATIONS = 30_000  # every schedule is written for this length and scales with the run
+NOMINAL_ITERATIONS = 30_000  # schedules are written for this length and scale with that of the run
 
 
 @dataclass(frozen=True)
 class TrainData:
-    """What every part may look at: the training side of the scene, never the test side."""
+    """The training side of the scene; parts of a method never get the test side."""
 
     scene: Scene
-    photos: Sequence[Tensor]  # of the train views: [H, W, 3] float32 in [0, 1], sRGB, on `device`
-    cameras: list[Camera]  # of the train views, matching the photos
+    photos: Sequence[Tensor]  # one for each train view: [H, W, 3] float32 in [0, 1], sRGB, on `device`
+    cameras: list[Camera]  # one for each train view, of the size of its photo
     user_keep: list[Tensor | None]  # [H, W] float32, 1 = static; the capture's own masks
     device: torch.device
     seed: int
@@ -33,28 +33,28 @@ class TrainData:
 
     @property
     def backend(self) -> Backend:
-        """What computes there."""
+        """The back end that computes on `device`."""
         return backend_of(self.device)
 
     @property
     def sfm_points(self) -> Tensor:
-        """[M, 3] float32 on `device`: where the scene is, whatever else training starts from."""
+        """Points of the sparse model, [M, 3] float32 on `device`; training may start from more."""
         return torch.from_numpy(self.scene.points.xyz.astype(np.float32)).to(self.device)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """For whom and when a picture is drawn; every hook gets one."""
+    """View, camera, photo and time of one picture; every hook gets a shot."""
 
     iteration: int  # counts from 1; 0 while a test photo is fitted
-    nominal: float  # progress of the run times NOMINAL_ITERATIONS: the unit schedules are written in
+    nominal: float  # progress of the run times NOMINAL_ITERATIONS, the unit of schedules
     view: int | None  # index into TrainData.photos; None for any other camera
     camera: Camera  # at the resolution of the picture
-    photo: Tensor | None = None  # [H, W, 3] at that resolution; None where there is none
-    divisor: int = 1  # image side is the photo's divided by this (resolution schedule)
-    fitting: bool = False  # a test photo is fitted: `photo` is black outside of the part that may be read
-    other_gaussians: bool = False  # not the model is drawn, but Gaussians that a method gave
-    progress: float = -1.0  # of the run, in [0, 1]
+    photo: Tensor | None = None  # [H, W, 3] at that resolution; None if the picture has no photo
+    divisor: int = 1  # the picture has 1/divisor of the photo's width and height (resolution schedule)
+    fitting: bool = False  # a test photo is fitted; `photo` is black outside of the part to fit to
+    other_gaussians: bool = False  # Gaussians of a method are drawn instead of the model
+    progress: float = -1.0  # share of the run that is done, in [0, 1]
 
     def __post_init__(self) -> None:
         if self.progress < 0:
@@ -62,15 +62,15 @@ class Shot:
 
     @property
     def neutral(self) -> bool:
-        """Whether no photo's own light or exposure belongs to the picture."""
+        """Whether the picture is drawn without the light and exposure of a photo."""
         return self.view is None and not self.fitting
 
     def row(self, photos: int) -> int | None:
-        """Row of a table with one row a train photo and a last one for a test photo; None if neutral."""
+        """Return the row in a table of train photos, with a last one for a test photo; None if neutral."""
         return photos if self.fitting else self.view
 
 
-# draws Gaussians for a shot; the last argument names effects that are left out
+# draws Gaussians for a shot, without the effects that the last argument names
 Drawer = Callable[[Gaussians, Shot, Collection[str]], Rendered]
 
 
@@ -92,15 +92,15 @@ class Step(Shot):
         *,
         without: Collection[str] = (),
     ) -> Rendered:
-        """Another picture of this step, as the host draws: its effects, SH degree, background and filter.
+        """Draw another picture of this step, with the run's effects, SH degree, background and filter.
 
         Args:
-            camera: taken as it is; None = the step's.
-            gaussians: None = the model's, with the other fields of the view; others are drawn alone.
+            camera: camera, which effects do not change; None = the step's.
+            gaussians: Gaussians to draw alone; None = the model, with the other fields of the view.
             without: names of effects that are left out.
 
         Raises:
-            RuntimeError: the step was made by hand, without a trainer.
+            RuntimeError: the step was made without a trainer.
         """
         if self.drawer is None:
             raise RuntimeError("this step belongs to no trainer: it cannot draw")

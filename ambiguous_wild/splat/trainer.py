@@ -1,16 +1,16 @@
-"""The one training loop. Methods fill its places (`parts.py`); nothing here knows a method by name."""
+"""The training loop. Methods fill its places (`parts.py`); nothing here knows a method by name."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.config import State
 from ambiguous_wild.splat.data import Pyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import SceneRenderer
@@ -33,7 +33,7 @@ from ambiguous_wild.splat.run import Probe, Run
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 from ambiguous_wild.splat.watchdog import Sentinel
 
-MOST_KEEP = 1e4  # methods weigh sure pixels by more than 1, none by so much
+MOST_KEEP = 1e4  # largest weight of a pixel: methods use more than 1, but never this much
 
 
 class Trainer(Run):
@@ -53,8 +53,8 @@ class Trainer(Run):
             data: the training side.
             parts: the method.
             config: length and bookkeeping.
-            folder: where checkpoint and timeline go.
-            probe: gets a function that renders a camera, returns PSNR in dB of the test views.
+            folder: folder for checkpoint and timeline.
+            probe: takes a function that renders a camera; returns PSNR in dB of the test views.
         """
         data.backend.use_threads(config.torch_threads)
         if parts.train_data is not None:
@@ -62,8 +62,8 @@ class Trainer(Run):
         super().__init__(data, config, folder, probe)
         self.parts = parts
         self.pyramid = Pyramid(data)
-        self._divisors: dict[int, int] = {}  # of the steps since the sentinel's last look
-        # where the host must not wait, what would make it wait is written down there and looked at later
+        self._divisors: dict[int, int] = {}  # divisors of the steps since the sentinel was last read
+        # where reading a value makes the host wait, checks stay on the device and are read later
         views = len(data.photos)
         self.sentinel = None if data.backend.reads_at_once else Sentinel(data.device, views)
         check_needs(parts.density.needs, data.backend.statistics)
@@ -74,17 +74,17 @@ class Trainer(Run):
         sizes = self.pyramid.sizes(self.pace.divisors)
         data.backend.prepare_loss(data.device, sizes, parts.lambda_dssim, parts.weighting)
         self.effects = Chain(parts.effects, data) if parts.effects else None
-        rows = {} if self.effects is None else self.effects.rows(gaussians)
-        if rows:
-            gaussians = gaussians.carrying({name: row.values for name, row in rows.items()})
+        attributes = {} if self.effects is None else self.effects.rows(gaussians)
+        if attributes:
+            gaussians = gaussians.carrying({name: a.values for name, a in attributes.items()})
         density = parts.density(parts.density_config, data.scene.extent, config.seed)
         density.setup(data)
         density.protected = None if self.effects is None else self.effects.protected()
-        self.field = Field(gaussians, rates_with(rows, self.pace.learning_rates), density)
+        self.field = Field(gaussians, rates_with(attributes, self.pace.learning_rates), density)
         self.drawing = SceneRenderer(data, parts, self.field, self.effects)
         parts.mask.setup(data)
 
-    # The first field, the one that is the result.
+    # The static field is the result of the run.
     @property
     def gaussians(self) -> Gaussians:
         return self.field.gaussians
@@ -98,7 +98,7 @@ class Trainer(Run):
         assert self.field.density is not None
         return self.field.density
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         others = self.drawing.state_dict()
         return {
             **super().state(),
@@ -108,7 +108,7 @@ class Trainer(Run):
             **({} if self.effects is None else {"effects": self.effects.state_dict()}),
         }
 
-    def load_state(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: State) -> None:
         self.field.load_state_dict(state, self.data.device)
         if self.drawing.others:
             self.drawing.load_state_dict(state["fields"], self.data.device)
@@ -118,7 +118,7 @@ class Trainer(Run):
         super().load_state(state)
 
     def shot(self, camera: Camera, *, fitting: bool = False) -> Shot:
-        """A picture of the model as it stands, of a camera that is no train photo's."""
+        """Return the shot of a camera that belongs to no train photo, at the present time of the run."""
         progress = self.progress(self.iteration)
         nominal = progress * NOMINAL_ITERATIONS
         return Shot(
@@ -131,27 +131,27 @@ class Trainer(Run):
         )
 
     def render(self, camera: Camera) -> Rendered:
-        """The model as it stands, for any camera: no photo's own light, the static field alone."""
+        """Draw the static field for any camera, in its present state, without the light of a photo."""
         return self.drawing(self.gaussians, self.shot(camera))
 
     def neutral_model(self) -> Gaussians:
-        """The Gaussians for any viewer: what effects do to them for every camera is part of them."""
+        """Return the Gaussians for viewers, changed as the effects change them for every camera."""
         return self.drawing.neutral_model(self.gaussians, self.iteration)
 
     def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
-        """A test view [H, W, 3] after its colour effects were fitted to a part of its photo.
+        """Draw a test view [H, W, 3] after fitting the colour effects to a part of its photo.
 
         Args:
-            camera: of the test view.
+            camera: camera of the test view.
             photo: [H, W, 3] in [0, 1], on any device.
-            keep: [H, W], 1 where the fit may look, on any device.
+            keep: [H, W], 1 where the fit may read the photo, on any device.
         """
         self.optimiser.flush()
         photo, keep = photo.to(self.data.device), keep.to(self.data.device)
         return self.drawing.fit(self.gaussians, self.shot(camera, fitting=True), photo, keep)
 
     def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
-        """Render a train view as the loop does; also used to predict masks afterwards."""
+        """Draw a train view as the loop does; also used to predict masks after the training."""
         progress = self.progress(iteration)
         divisor = self.pace.divisor(progress) if divisor is None else divisor
         shot = Shot(
@@ -167,9 +167,9 @@ class Trainer(Run):
             shot = replace(shot, camera=self.effects.camera(shot))
         with self.clock.part("render"):
             rendered = self.drawing(self.gaussians, shot)
-        known = {f.name: getattr(shot, f.name) for f in fields(Shot)}
+        of_shot = {f.name: getattr(shot, f.name) for f in fields(Shot)}
         return Step(
-            **known,
+            **of_shot,
             ceiling=self.pace.ceiling(divisor, progress),
             rendered=rendered,
             gaussians=self.gaussians,
@@ -186,10 +186,10 @@ class Trainer(Run):
         )
 
     def combine_user_keep(self, step: Step, keep: Tensor | None) -> Tensor | None:
-        """The policy's keep map times the capture's own mask, where there is one.
+        """Multiply the policy's keep map by the capture's own mask, if there is one.
 
         Raises:
-            AwError: the policy's is no tensor.
+            AwError: the policy's map is no tensor, or its values are out of range.
         """
         if keep is not None and not isinstance(keep, Tensor):
             raise AwError(
@@ -210,12 +210,12 @@ class Trainer(Run):
         return user if keep is None else keep * user
 
     def step(self) -> float | Tensor:
-        """One iteration; returns the photometric loss, NaN where the photo is left out after a rollback.
+        """Run one iteration; returns the photometric loss, NaN if a rollback left the photo out.
 
-        On an accelerator the loss is a tensor there, and nothing is waited for but the number of tiles.
+        On an accelerator the loss is a tensor, and the host waits only for the number of tiles.
 
         Raises:
-            NonFinite: names view, iteration and parameters.
+            NonFinite: a value is not finite; the message names view, iteration and parameters.
         """
         iteration = self.iteration + 1
         part = self.clock.part
@@ -231,21 +231,21 @@ class Trainer(Run):
         if self.sentinel is None:
             self.watchdog.look_at_loss(step, keep, loss)
         with part("mask loss"):
-            extra = self.parts.mask.cotangent(step, keep)
+            method_cotangents = self.parts.mask.cotangent(step, keep)
         if self.sentinel is None and keep is not None and not bool(keep.any()):
-            # Nothing to learn from: moving on Adam's momentum alone would drift away from the scene.
+            # Nothing to learn: steps by Adam's momentum alone would drift away from the scene.
             self._skipped.add(step.view)
             self.iteration = iteration
             return loss.value
         with part("backward"):
-            gradients = self._gradients(step, keep, as_cotangents(loss.d_image, extra))
+            gradients = self._gradients(step, keep, as_cotangents(loss.d_image, method_cotangents))
         called_off = None
         with part("watchdog"):
             if self.sentinel is None:
                 self.watchdog.look_at_gradients(step, keep, loss, gradients)
             else:
-                called_off = self._watch(step, keep, extra, loss, gradients)
-                step, gradients = _counted(step, gradients, called_off)
+                called_off = self._watch(step, keep, method_cotangents, loss, gradients)
+                step, gradients = _for_statistics(step, gradients, called_off)
         events = self._learn(step, keep, gradients, called_off)
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
@@ -259,7 +259,7 @@ class Trainer(Run):
         return loss.value
 
     def _gradients(self, step: Step, keep: Tensor | None, cotangents: Cotangents) -> Gradients:
-        """Of the step's own render, and of those that the method drew beside it."""
+        """Backpropagate the step's render and the further pictures that the method drew."""
         gradients = step.rendered.backward(cotangents, self.density.needs)
         more = self.parts.mask.gradients(step, keep)
         if more is not None:
@@ -271,38 +271,38 @@ class Trainer(Run):
         self,
         step: Step,
         keep: Tensor | None,
-        extra: Cotangents | Tensor | None,
+        method_cotangents: Cotangents | Tensor | None,
         loss: PhotometricLoss,
         gradients: Gradients,
     ) -> Tensor:
-        """Whether the optimiser is not to move, [1] on the device; nobody waits for it."""
+        """Let the sentinel check the step; returns [1] on the device, 1 = skip the optimiser's step."""
         assert self.sentinel is not None
-        looked_at = list(self.watchdog.looked_at(gradients).values())
+        checked = list(self.watchdog.looked_at(gradients).values())
         value = torch.as_tensor(loss.value)
         self._divisors[step.iteration] = step.divisor
-        return self.sentinel.watch(step.iteration, step.view, value, looked_at, keep, extra)
+        return self.sentinel.watch(step.iteration, step.view, value, checked, keep, method_cotangents)
 
     def _learn(
         self, step: Step, keep: Tensor | None, gradients: Gradients, called_off: Tensor | None
     ) -> list[str]:
-        """The optimiser, density control and effects; returns what density control did."""
+        """Run the optimiser, density control and effects; returns the events of density control."""
         part, progress = self.clock.part, self.progress(step.iteration)
         events: list[str] = []
-        weighed = keep
+        density_keep = keep
         if self.density.reads_keep and (composed := self.parts.mask.composed_keep(step)) is not None:
-            weighed = self.combine_user_keep(step, composed)
-        # as on the CPU, a photo that is all masked changes nothing; a round of growth waits for the device
+            density_keep = self.combine_user_keep(step, composed)
+        # as on the CPU, a fully masked photo changes nothing; only before growth does the host read the flag
         if called_off is not None and keep is not None and self.density.due(step) and bool(called_off):
             return events
         if self.density.before_optimiser:
             with part("density"):
-                events = self.field.refine(step, gradients, weighed)
-        if not events:  # rows that have just changed have no gradients yet
+                events = self.field.refine(step, gradients, density_keep)
+        if not events:  # rows that have just changed have no gradients
             with part("optimiser"):
                 self.field.learn(gradients, progress, called_off)
         if not self.density.before_optimiser:
             with part("density"):
-                events = self.field.refine(step, gradients, weighed)
+                events = self.field.refine(step, gradients, density_keep)
         if gradients.fields:
             with part("fields"):
                 self.drawing.learn(step, gradients.fields, progress, called_off)
@@ -315,34 +315,34 @@ class Trainer(Run):
         return events
 
     def _look_back(self) -> None:
-        """What the sentinel wrote down since the last look: the step is made again, to show what was wrong.
+        """Read the sentinel; if a step since the last look was not finite, repeat it to find the values.
 
         Raises:
-            NonFinite: as the step would have raised it, had anybody waited for it.
+            NonFinite: the finding that the step itself would have raised on the CPU.
         """
         broken = None if self.sentinel is None else self.sentinel.first_broken()
         divisors, self._divisors = self._divisors, {}
         if broken is None:
             return
-        # at the size of that step: under a budget the schedule has gone on with the clock
+        # repeat at the step's own size: under a budget the schedule has moved on with the clock
         view, divisor = self.pace.view(broken.iteration), divisors.get(broken.iteration)
         step = self.make_step(broken.iteration, view, divisor)
         keep = broken.keep
         loss = self._photometric(step, keep)
         self.watchdog.look_at_loss(step, keep, loss)
-        gradients = step.rendered.backward(as_cotangents(loss.d_image, broken.extra))
+        gradients = step.rendered.backward(as_cotangents(loss.d_image, broken.method_cotangents))
         self.watchdog.look_at_gradients(step, keep, loss, gradients)
         raise self.watchdog.not_seen_again(step, keep, loss)
 
     def check_parameters(self) -> None:
-        """Raise NonFinite, as of the last step, where a parameter is not finite."""
+        """Raise NonFinite for the last step if a parameter is not finite."""
         self._look_back()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
 
 
-def _counted(step: Step, gradients: Gradients, called_off: Tensor) -> tuple[Step, Gradients]:
-    """Both as statistics of growth count them: where the step was called off, no Gaussian was drawn.
+def _for_statistics(step: Step, gradients: Gradients, called_off: Tensor) -> tuple[Step, Gradients]:
+    """Return step and gradients for statistics of growth: in a step called off no Gaussian was drawn.
 
     So neither its zeros nor its NaN are added.
     """

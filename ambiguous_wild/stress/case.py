@@ -3,11 +3,11 @@
 Changing every parameter by one unit of float32 rounding changes the float64 result by `condition` units. No
 float32 renderer can be more accurate. A stable one adds a constant times the number of its operations
 (Higham, Accuracy and Stability of Numerical Algorithms, ch. 1): about 16 from parameters to a pixel's
-exponent, three for each Gaussian over it, as many again for gradients, plus the sums over a tile.
+exponent, three for each Gaussian that covers it, as many again for gradients, and the sums over a tile.
 
 On a GPU gsplat is compiled with `-use_fast_math`: an exponential is accurate to 2 + |1.2 x| units, 8 down to
 the cut at 1/255, a quotient to 2. It also inverts the blurred covariance by its determinant, a difference
-that keeps only (a c - b^2) / (a c) of the digits. Its bound is wider by both factors. The reference then
+that keeps only (a c - b^2) / (a c) of the digits. Both factors widen its bound. The reference then
 uses gsplat's alpha clamp (`Backend.max_alpha`).
 """
 
@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
@@ -52,7 +53,7 @@ class Case:
     row: int  # number of a group of cases and tests
     name: str
     measure: Callable[[str], Measured]  # argument: the device
-    devices: tuple[str, ...]  # that the case applies to
+    devices: tuple[str, ...]  # devices that the case applies to
 
     @property
     def key(self) -> str:
@@ -76,8 +77,8 @@ class Outcome:
     passed: bool
     failure: str = ""  # the error, if the case raised one
 
-    def plain(self) -> dict[str, Any]:
-        """Plain data for JSON: NaN and infinity become null."""
+    def plain(self) -> Facts:
+        """Return plain data for JSON, with None for NaN and infinity."""
         missing = {k: None for k, v in asdict(self).items() if isinstance(v, float) and not math.isfinite(v)}
         return asdict(self) | missing
 
@@ -85,7 +86,7 @@ class Outcome:
 def case(
     row: int, name: str, *, devices: tuple[str, ...] = ("cpu",)
 ) -> Callable[[Callable[[str], Measured]], Case]:
-    """Decorator that makes a case of a measuring function and registers it."""
+    """Decorate a measuring function: makes a case of it and registers it."""
 
     def register(measure: Callable[[str], Measured]) -> Case:
         REGISTERED.append(Case(row, name, measure, devices))
@@ -127,11 +128,6 @@ _DRAWS = 2  # number of random roundings; the largest change is used
 FAST_MATH = 8  # largest error of a GPU's exponential, in units
 
 
-def alpha_clamp(device: str) -> dict[str, Any]:
-    """The alpha clamp of the device's renderer, as an argument of `float64_result`."""
-    return {"max_alpha": backend_of(device).max_alpha(device)}
-
-
 def device_result(
     g: Gaussians,
     camera: Camera,
@@ -143,15 +139,15 @@ def device_result(
 ) -> dict[str, Tensor]:
     """Images and gradients of all parameters from the renderer of `device`, as float64 on the CPU."""
     rendered = render(g.to(device), camera, **options)
-    given = Cotangents(
+    cotangents = Cotangents(
         d_image.to(device),
         alpha=None if d_alpha is None else d_alpha.to(device),
         depth=None if d_depth is None else d_depth.to(device),
     )
-    grads = rendered.backward(given)
-    found = {f"d_{name}": getattr(grads, name) for name, _ in g.items()}
-    found |= {"image": rendered.image, "alpha": rendered.alpha, "depth": rendered.depth}
-    return {name: tensor.detach().cpu().double() for name, tensor in found.items()}
+    grads = rendered.backward(cotangents)
+    results = {f"d_{name}": getattr(grads, name) for name, _ in g.items()}
+    results |= {"image": rendered.image, "alpha": rendered.alpha, "depth": rendered.depth}
+    return {name: tensor.detach().cpu().double() for name, tensor in results.items()}
 
 
 def float64_result(
@@ -162,17 +158,17 @@ def float64_result(
     d_depth: Tensor | None = None,
     **options: Any,
 ) -> dict[str, Tensor]:
-    """The same as `device_result`, by the float64 reference and autograd."""
+    """Return what `device_result` does, from the float64 reference and autograd."""
     leaves = {name: tensor.clone().requires_grad_(True) for name, tensor in parameters.items()}
     truth = render_reference(leaves, camera, **options)
     loss = (truth.image * d_image.double()).sum() + 0.0 * truth.screen.sum()
     for picture, cotangent in ((truth.alpha, d_alpha), (truth.depth, d_depth)):
         if cotangent is not None:
             loss = loss + (picture * cotangent.double()).sum()
-    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+    derivatives = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
     gradients = {
         f"d_{name}": torch.zeros_like(leaf) if gradient is None else gradient
-        for (name, leaf), gradient in zip(leaves.items(), found)
+        for (name, leaf), gradient in zip(leaves.items(), derivatives)
     }
     pictures = {"image": truth.image, "alpha": truth.alpha, "depth": truth.depth}
     return gradients | {name: picture.detach() for name, picture in pictures.items()}
@@ -185,24 +181,24 @@ def agree(
     comes_out: str,
     *,
     layers: int | None = None,  # most Gaussians over one pixel; None = all
-    **options: Any,  # of `render`
+    **options: Any,  # passed to `render`
 ) -> Measured:
-    """Worst error of images and gradients relative to their largest values, and its bound."""
+    """Return the worst error of images and gradients, relative to their largest values, and its bound."""
     rng = np.random.default_rng(0)
     shapes = [(camera.height, camera.width, 3), (camera.height, camera.width), (camera.height, camera.width)]
     d_image, d_alpha, d_depth = (
         torch.from_numpy(rng.normal(size=shape).astype(np.float32)) for shape in shapes
     )
     parameters = {name: tensor.double() for name, tensor in g.items()}
-    clamp = alpha_clamp(device)
-    truth = float64_result(parameters, camera, d_image, d_alpha, d_depth, **options, **clamp)
+    clamp = backend_of(device).max_alpha(device)
+    truth = float64_result(parameters, camera, d_image, d_alpha, d_depth, max_alpha=clamp, **options)
     condition = 1.0
     for _ in range(_DRAWS):
         moved = {
             name: t * (1 + UNIT * torch.from_numpy(rng.choice([-1.0, 1.0], size=t.shape)))
             for name, t in parameters.items()
         }
-        again = float64_result(moved, camera, d_image, d_alpha, d_depth, **options, **clamp)
+        again = float64_result(moved, camera, d_image, d_alpha, d_depth, max_alpha=clamp, **options)
         condition = max(condition, _distance(again, truth) / UNIT)
     error = _distance(device_result(g, camera, device, d_image, d_alpha, d_depth, **options), truth)
     steps = 96 + 6 * (len(g) if layers is None else layers)

@@ -36,7 +36,7 @@ def _logits(n: int, channels: int, scale: float, seed: int = 0) -> torch.Tensor:
 
 
 def _flagged(values: np.ndarray, *settings: Any, **more: Any) -> np.ndarray:
-    """[K] bool, instances above T_ent."""
+    """Return which instances are above T_ent, [K] bool."""
     return values > float(t_ent(pool_of(torch.from_numpy(values)), *settings, **more).threshold)
 
 
@@ -48,11 +48,11 @@ def entropy_saturated(device: str) -> Measured:
         for channels in (1, 2, 255):
             extremes = torch.full((2, channels), 1e4) * torch.tensor([[1.0], [-1.0]])
             logits = torch.cat([_logits(40, channels, 8.0), extremes]).requires_grad_(True)
-            found = entropy(logits, variant)
-            (gradient,) = torch.autograd.grad(found.sum(), logits)
+            value = entropy(logits, variant)
+            (gradient,) = torch.autograd.grad(value.sum(), logits)
             exact = entropy(logits.detach().double(), variant)
-            error = float((found.detach() - exact).abs().max() / exact.abs().max().clamp(min=1e-30))
-            sound = bool(torch.isfinite(gradient).all()) and float(found.detach().min()) >= 0
+            error = float((value.detach() - exact).abs().max() / exact.abs().max().clamp(min=1e-30))
+            sound = bool(torch.isfinite(gradient).all()) and float(value.detach().min()) >= 0
             # x e^x changes by (1 + |x|) u if x = log p changes by u, and |x| e^x <= 1 / e
             tolerance = (8 + channels) * UNIT
             parts.append(Measured(error if sound else math.inf, tolerance, "8 + P roundings", ""))
@@ -117,15 +117,15 @@ def planted_region(device: str) -> Measured:
     h[:, :30] = 0.0
     cosine[10:16, 8:16], cosine[0, 0], cosine[1, 1] = -1.0, np.nan, 1.0
     ratios = ratio(uncertainty(torch.from_numpy(cosine)), torch.from_numpy(h))
-    r, found = ratios.numpy(), global_mask(ratios, spread="std", gate=6.0).numpy()
+    r, mask = ratios.numpy(), global_mask(ratios, spread="std", gate=6.0).numpy()
     extremes = torch.tensor([-1.0, 1.0, math.nan, math.inf])
-    grown = np.zeros_like(found)
+    grown = np.zeros_like(mask)
     grown[9:17, 7:17] = True
     checks = {
         "finite": bool(np.isfinite(r).all()),
         "H of 0 counts at most a hundred times": bool(r[20:, :30].max() < 100 * r[20:, 30:].max()),
-        "the region is found": bool(found[11:15, 9:15].all()),
-        "nothing else is": not bool((found & ~grown).any()),
+        "the region is found": bool(mask[11:15, 9:15].all()),
+        "nothing else is": not bool((mask & ~grown).any()),
         "U is at least 1": bool((uncertainty(extremes) >= 1).all()),
     }
     return failed_checks(checks, "U / H finite, the planted region found")
@@ -160,7 +160,7 @@ def literal(device: str) -> Measured:
 
 
 def _double_loop(logits: torch.Tensor) -> float:
-    """Mean over pairs of KL in float64, as printed."""
+    """Return the mean of KL over all pairs in float64, as the paper prints it."""
     log_s, log_r = F.logsigmoid(logits), F.logsigmoid(-logits)
     one = (log_s.exp()[:, None] * (log_s[:, None] - log_s[None])).sum(2)
     two = (log_r.exp()[:, None] * (log_r[:, None] - log_r[None])).sum(2)
@@ -173,15 +173,15 @@ def consistency(device: str) -> Measured:
     for n in (1, 2, 500):
         logits = _logits(n, 6, 3.0, n)
         exact = _double_loop(logits.double())
-        found = float(consistency_loss(logits.double(), torch.ones(1, n, dtype=torch.float64)))
-        parts.append(Measured(abs(found - exact) / max(exact, 1e-3), 1e-6, "the list's own", ""))
+        loss = float(consistency_loss(logits.double(), torch.ones(1, n, dtype=torch.float64)))
+        parts.append(Measured(abs(loss - exact) / max(exact, 1e-3), 1e-6, "the list's own", ""))
         # float32: sums of terms of size |s log s| cancel down to the loss
         size = float((torch.sigmoid(logits) * F.logsigmoid(logits)).abs().sum(1).mean()) * 2
         condition = max(size / max(exact, 1e-3), 1.0)
-        found = float(consistency_loss(logits, torch.ones(1, n)))
+        loss = float(consistency_loss(logits, torch.ones(1, n)))
         parts.append(
             Measured(
-                abs(found - exact) / max(exact, 1e-3),
+                abs(loss - exact) / max(exact, 1e-3),
                 32 * condition * UNIT,
                 "32 roundings x condition",
                 "",
@@ -272,16 +272,16 @@ def moments(device: str) -> Measured:
     cluster = np.array([7, 7, 2, 2, 2, 9, 9, 9, 9])
     merged = merge_members(g, torch.from_numpy(cluster))
     cov, alpha = covariances(g).numpy(), torch.sigmoid(g.opacity_logits.double()).numpy()
-    means, found, worst = g.means.double().numpy(), covariances(merged).numpy(), 0.0
+    means, merged_cov, worst = g.means.double().numpy(), covariances(merged).numpy(), 0.0
     for row, name in enumerate((2, 7, 9)):
         rows = cluster == name
         w = alpha[rows] / alpha[rows].sum()
         mu = w @ means[rows]
         second = np.einsum("n,nij->ij", w, cov[rows] + means[rows][:, :, None] * means[rows][:, None, :])
         expected = second - np.outer(mu, mu)
-        worst = max(worst, float(np.abs(found[row] - expected).max() / np.abs(expected).max()))
+        worst = max(worst, float(np.abs(merged_cov[row] - expected).max() / np.abs(expected).max()))
         worst = max(worst, float(np.abs(merged.means[row].double().numpy() - mu).max() / np.abs(mu).max()))
-        if np.linalg.eigvalsh(found[row]).min() <= 0:
+        if np.linalg.eigvalsh(merged_cov[row]).min() <= 0:
             worst = math.inf
     # rounding: |log s| u for log-scales, twice that for variances; u for quaternions, used twice in R S R^T
     bound = 2 * float(merged.log_scales.abs().max()) + 16
@@ -293,13 +293,13 @@ def moments(device: str) -> Measured:
 @case(21, "the scene in units a thousand times larger and smaller")
 def units(device: str) -> Measured:
     g = cloud(300, 3, rest=0)
-    here, checks = _pairs(g, colour=1.0), {}
+    pairs, checks = _pairs(g, colour=1.0), {}
     for factor in (1e-3, 1e3):
         other = g.clone()
         other.means *= factor
         other.log_scales += math.log(factor)
-        checks[f"times {factor:g}"] = _pairs(other, colour=1.0) == here
-    checks["there are clusters"] = len(here) > 20
+        checks[f"times {factor:g}"] = _pairs(other, colour=1.0) == pairs
+    checks["there are clusters"] = len(pairs) > 20
     return failed_checks(checks, "the same clusters")
 
 
@@ -367,8 +367,8 @@ def bootstrap(device: str) -> Measured:
 @case(24, "a mean of values of size 1e12 that differ by 1e-3")
 def large_means(device: str) -> Measured:
     values = 1e12 + 1e-3 * np.arange(1000)
-    found = bootstrap_interval(values, resamples=100)
+    interval = bootstrap_interval(values, resamples=100)
     # pairwise sums of n values: log2(n) roundings of float64
-    error = abs(found.mean - math.fsum(values) / 1000) / 1e12
-    error = error if found.low <= found.mean <= found.high else math.inf
+    error = abs(interval.mean - math.fsum(values) / 1000) / 1e12
+    error = error if interval.low <= interval.mean <= interval.high else math.inf
     return Measured(error, 12 * 2.0**-53, "log2(n) + 2 roundings of float64", "the exact mean", 1.0)

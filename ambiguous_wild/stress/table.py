@@ -14,14 +14,14 @@ CASES: tuple[Case, ...] = tuple(sorted(REGISTERED, key=lambda c: c.row))
 
 
 def chosen(only: Sequence[str]) -> list[Case]:
-    """The cases that match any of: a row ("4"), a key, a part of a key, or a pattern with * and ?.
+    """Return the cases that match an entry: a row ("4"), a part of a key, or a pattern with * and ?.
 
     Raises:
         AwError: an entry matches no case.
     """
     if not only:
         return list(CASES)
-    found: dict[str, Case] = {}
+    matching: dict[str, Case] = {}
     for wanted in only:
         if wanted.isdigit():
             hits = [c for c in CASES if c.row == int(wanted)]
@@ -29,8 +29,8 @@ def chosen(only: Sequence[str]) -> list[Case]:
             hits = [c for c in CASES if fnmatch.fnmatch(c.key, wanted) or wanted in c.key]
         if not hits:
             raise AwError(f"--only {wanted!r}: no such case; 'aw stress --list' shows them")
-        found |= {c.key: c for c in hits}
-    return [c for c in CASES if c.key in found]
+        matching |= {c.key: c for c in hits}
+    return [c for c in CASES if c.key in matching]
 
 
 def run_all(
@@ -48,11 +48,11 @@ def run_all(
 
 
 HEAD = ("case", "device", "correct result", "worst error", "tolerance", "reason", "condition", "verdict")
-WORDS = ("device", "correct result", "reason", "verdict")  # columns of words
+WORDS = ("device", "correct result", "reason", "verdict")  # columns that hold text
 
 
 def row(o: Outcome) -> tuple[str, ...]:
-    """The outcome under `HEAD`."""
+    """Return the cells of the outcome, in the columns of `HEAD`."""
     condition = "" if o.condition is None else f"{o.condition:.1e}"
     verdict = "passed" if o.passed else "FAILED"
     return (
@@ -61,7 +61,7 @@ def row(o: Outcome) -> tuple[str, ...]:
 
 
 def to_line(o: Outcome) -> str:
-    """One line for a terminal."""
+    """Return one line for a terminal."""
     condition = "" if o.condition is None else f"{o.condition:8.1e}"
     verdict = "passed" if o.passed else "FAILED"
     text = (

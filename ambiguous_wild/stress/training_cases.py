@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
-from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients
@@ -21,8 +21,14 @@ _RATES = {
 }  # fmt: skip
 
 
+def _gradients(g: Gaussians, value: float, screen: torch.Tensor | None = None) -> Gradients:
+    """Return gradients of one value everywhere."""
+    screen = torch.zeros(len(g), 2) if screen is None else screen
+    return Gradients(*(torch.full_like(t, value) for _, t in g.items()), screen=screen)
+
+
 def _digest(seed: int) -> str:
-    """Hash of random Gaussians after five training steps."""
+    """Return a hash of random Gaussians after five training steps."""
     from ambiguous_wild.splat.cpu.render import render_cpu
 
     g, cam = cloud(300, seed), camera(50, 37, 40.0)
@@ -62,14 +68,12 @@ def same_bits(device: str) -> Measured:
 
 @case(9, "Adam: one step, then thousands of zero gradients")
 def adam_at_rest(device: str) -> Measured:
-    """Against Adam's formula in float64; includes harmonics, whose steps the optimiser defers."""
+    """Compare with Adam's formula in float64; includes harmonics, whose steps the optimiser defers."""
     g, steps, rate = cloud(3, 1), 3000, 1e-2
     start = g.sh_rest.double().numpy().copy()
     optimiser = SplatAdam(g, dict.fromkeys(_RATES, rate))
-    gradient: dict[str, Any] = {name: torch.full_like(t, 0.3) for name, t in g.items()}
-    optimiser.step(Gradients(**gradient, screen=torch.zeros(3, 2)), torch.ones(3, dtype=torch.bool))
-    rest: dict[str, Any] = {name: torch.zeros_like(t) for name, t in g.items()}
-    zero = Gradients(**rest, screen=torch.zeros(3, 2))
+    optimiser.step(_gradients(g, 0.3), torch.ones(3, dtype=torch.bool))
+    zero = _gradients(g, 0.0)
     for _ in range(steps - 1):
         optimiser.step(zero, torch.zeros(3, dtype=torch.bool))
     optimiser.flush()
@@ -90,7 +94,7 @@ def adam_at_rest(device: str) -> Measured:
 
 
 def _one_round(g: Gaussians, screen: torch.Tensor, ceiling: int, **config: Any) -> tuple[Gaussians, bool]:
-    """One round of density control, and whether parameters, moments and statistics have the same rows."""
+    """Run one round of density control; also returns whether moments and statistics keep the rows."""
     density = DensityControl(DensityConfig(**config), extent=1000.0, seed=0)
     optimiser = SplatAdam(g, _RATES)
     step: Any = SimpleNamespace(
@@ -101,12 +105,10 @@ def _one_round(g: Gaussians, screen: torch.Tensor, ceiling: int, **config: Any) 
         camera=SimpleNamespace(width=2, height=2),
         rendered=SimpleNamespace(visible=torch.ones(len(g), dtype=torch.bool)),
     )
-    zeros: dict[str, Any] = {name: torch.zeros_like(t) for name, t in g.items()}
-    density.observe(step, Gradients(**zeros, screen=screen))
+    density.observe(step, _gradients(g, 0.0, screen))
     after, _ = density.refine(step, g, optimiser)
     optimiser.bind(after)  # raises if the moments have other rows
-    zeros = {name: torch.zeros_like(t) for name, t in after.items()}
-    optimiser.step(Gradients(**zeros, screen=screen), torch.zeros(len(after), dtype=torch.bool))
+    optimiser.step(_gradients(after, 0.0, screen), torch.zeros(len(after), dtype=torch.bool))
     moments = optimiser.state_dict()
     rows = {len(t) for kind in ("first", "second") for t in moments[kind].values()}
     return after, rows | {len(density.seen), len(density.grad_sum)} == {len(after)}
@@ -158,8 +160,8 @@ def saturated_sky(device: str) -> Measured:
     photo = torch.ones(24, 24, 3)
     render = 1.0 + 1e-3 * torch.randn(24, 24, 3, generator=generator)
     value, _, d_image = photometric_reference(render.double(), photo.double(), None, 0.2, "map")
-    found = photometric(render.to(device), photo.to(device))
-    worst = float((found.d_image.cpu() - d_image).abs().max() / d_image.abs().max())
+    loss = photometric(render.to(device), photo.to(device))
+    worst = float((loss.d_image.cpu() - d_image).abs().max() / d_image.abs().max())
     # the denominator is C2 = 9e-4: an error of 2 u E[x^2] in the variance is a relative error of 2 u / C2
     condition = 2.0 / 0.03**2
     return Measured(
@@ -177,10 +179,10 @@ def never_seen(device: str) -> Measured:
     before, optimiser = g.clone(), SplatAdam(g, _RATES)
     visible = torch.tensor([True, False])
     for _ in range(50):
-        gradient: dict[str, Any] = {name: torch.ones_like(t) for name, t in g.items()}
-        for t in gradient.values():
-            t[1] = 0.0
-        optimiser.step(Gradients(**gradient, screen=torch.zeros(2, 2)), visible)
+        still = _gradients(g, 1.0)
+        for name in PARAMETERS:
+            getattr(still, name)[1] = 0.0
+        optimiser.step(still, visible)
     optimiser.flush()
     checks = {name: torch.equal(t[1], getattr(before, name)[1]) for name, t in g.items()}
     return failed_checks(checks, "unchanged, bit for bit")

@@ -15,7 +15,7 @@ from ambiguous_wild.core.weight_files import expanded
 from ambiguous_wild.vision.protocols import Features, Instances
 from ambiguous_wild.vision.weights import find, named
 
-# name in a spec: name of the weights, see vision/weights.py
+# name in a spec -> name of the weights, see vision/weights.py
 DINO = {
     "dinov2-small": "dinov2-small",
     "dinov2-base": "dinov2-base",
@@ -41,7 +41,7 @@ SAM_VIDEO = {
     "sam2-base-plus-video": "sam2.1-hiera-base-plus",
     "sam2-large-video": "sam2.1-hiera-large",
 }
-CONV = ("efficientnet-lite0", "vgg16")  # of weights, features and instances alike
+CONV = ("efficientnet-lite0", "vgg16")  # the same names for weights, features and instances
 FEATURES = ("labhog", "sceneconv", *CONV, *DINO)
 INSTANCES = ("graph", *CONV, *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")
 _OPTION = re.compile(r",\s*([A-Za-z_][\w.]*)=([^,]*)$")
@@ -82,20 +82,24 @@ def check_features(spec: str) -> None:
     Raises:
         AwError: an unknown name (names the nearest), or an invalid spec.
     """
-    found = parse(spec)
-    if found.name not in FEATURES:
-        raise unknown("features", found.name, FEATURES)
+    parsed = parse(spec)
+    if parsed.name not in FEATURES:
+        raise unknown("features", parsed.name, FEATURES)
 
 
 def check_instances(spec: str) -> None:
-    """As `check_features`, for instances."""
-    found = parse(spec)
-    if found.name not in INSTANCES:
-        raise unknown("instances", found.name, INSTANCES)
+    """Check that the name of the instances is known; nothing is loaded.
+
+    Raises:
+        AwError: an unknown name (names the nearest), or an invalid spec.
+    """
+    parsed = parse(spec)
+    if parsed.name not in INSTANCES:
+        raise unknown("instances", parsed.name, INSTANCES)
 
 
 def make_features(spec: str) -> Features:
-    """Features by name.
+    """Make the back end of features that a spec names.
 
     ``labhog``; ``sceneconv``, trained on the scene; one of `CONV` with ``@px`` (longer side; 0 = the
     photo's), ``layer=``, ``fit_photos=`` and ``weights=FOLDER``; or one of `DINO`, with ``@px``, ``blocks=``,
@@ -105,38 +109,38 @@ def make_features(spec: str) -> Features:
         AwError: unknown name (names the nearest) or option; the weights are missing.
     """
     check_features(spec)
-    found = parse(spec)
-    if found.argument:
-        raise AwError(f"features {spec!r}: {found.name} takes nothing after a colon; remove it")
-    if found.name == "labhog":
+    parsed = parse(spec)
+    if parsed.argument:
+        raise AwError(f"features {spec!r}: {parsed.name} takes nothing after a colon; remove it")
+    if parsed.name == "labhog":
         from ambiguous_wild.vision.labhog import LabHog
 
-        _no_options(found, spec)
+        _no_options(parsed, spec)
         return LabHog()
-    if found.name == "sceneconv":
+    if parsed.name == "sceneconv":
         from ambiguous_wild.vision.sceneconv import SceneConv, SceneConvConfig
 
-        if found.size is not None:
+        if parsed.size is not None:
             raise AwError(f"features {spec!r}: sceneconv takes no size")
-        return SceneConv(with_options(SceneConvConfig(), found.options, "option of sceneconv"))
-    folder, options = _weights(found.options)
-    if found.name in CONV:
+        return SceneConv(with_options(SceneConvConfig(), parsed.options, "option of sceneconv"))
+    folder, options = _weights(parsed.options)
+    if parsed.name in CONV:
         from ambiguous_wild.vision.convnets import ConvConfig, ConvFeatures
 
-        conv = with_options(ConvConfig(), options, f"option of {found.name}")
-        if found.size is not None:
-            conv = dataclasses.replace(conv, size=found.size)
-        return ConvFeatures(found.name, conv, folder)
+        conv = with_options(ConvConfig(), options, f"option of {parsed.name}")
+        if parsed.size is not None:
+            conv = dataclasses.replace(conv, size=parsed.size)
+        return ConvFeatures(parsed.name, conv, folder)
     from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 
-    config = with_options(DinoConfig(), options, f"option of {found.name}")
-    if found.size is not None:
-        config = dataclasses.replace(config, size=found.size)
-    return DinoFeatures(DINO[found.name], config, folder)
+    config = with_options(DinoConfig(), options, f"option of {parsed.name}")
+    if parsed.size is not None:
+        config = dataclasses.replace(config, size=parsed.size)
+    return DinoFeatures(DINO[parsed.name], config, folder)
 
 
 def make_instances(spec: str) -> Instances:
-    """Instances by name; the result may also implement `NamedInstances` or `SceneInstances`.
+    """Make the back end of instances that a spec names; it may be `NamedInstances` or `SceneInstances`, too.
 
     ``graph``; one of `CONV`: graph segments grouped by its features; one of `SAM` (``@n`` = points along a
     side) or `SAM_VIDEO`; ``grounded:PROMPT`` and, tracked over a sequence, ``grounded-video:PROMPT``;
@@ -147,61 +151,61 @@ def make_instances(spec: str) -> Instances:
         AwError: unknown name (names the nearest) or option; the weights or the folder are missing.
     """
     check_instances(spec)
-    found = parse(spec)
-    if found.argument and found.name not in ("grounded", "grounded-video", "labels"):
-        raise AwError(f"instances {spec!r}: {found.name} takes nothing after a colon; remove it")
-    return _BUILDERS.get(found.name, _sam)(found, spec)
+    parsed = parse(spec)
+    if parsed.argument and parsed.name not in ("grounded", "grounded-video", "labels"):
+        raise AwError(f"instances {spec!r}: {parsed.name} takes nothing after a colon; remove it")
+    return _BUILDERS.get(parsed.name, _sam)(parsed, spec)
 
 
-def _graph(found: Spec, spec: str) -> Instances:
+def _graph(parsed: Spec, spec: str) -> Instances:
     from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 
-    if found.size is not None:
+    if parsed.size is not None:
         raise AwError(f"instances {spec!r}: graph takes no size")
-    return GraphSegments(with_options(SegmentConfig(), found.options, "option of graph"))
+    return GraphSegments(with_options(SegmentConfig(), parsed.options, "option of graph"))
 
 
-def _grouped(found: Spec, spec: str) -> Instances:
+def _grouped(parsed: Spec, spec: str) -> Instances:
     from ambiguous_wild.vision.convnets import ConvConfig, ConvFeatures
     from ambiguous_wild.vision.segments import GroupConfig, GroupedSegments
 
-    folder, options = _weights(found.options)
+    folder, options = _weights(parsed.options)
     network = {k: v for k, v in options.items() if k == "layer"}
     own = {k: v for k, v in options.items() if k not in network}
-    config = with_options(GroupConfig(), own, f"option of {found.name}")
+    config = with_options(GroupConfig(), own, f"option of {parsed.name}")
     features = with_options(ConvConfig(), network)
-    if found.size is not None:
-        features = dataclasses.replace(features, size=found.size)
-    return GroupedSegments(ConvFeatures(found.name, features, folder), config)
+    if parsed.size is not None:
+        features = dataclasses.replace(features, size=parsed.size)
+    return GroupedSegments(ConvFeatures(parsed.name, features, folder), config)
 
 
-def _labels(found: Spec, spec: str) -> Instances:
+def _labels(parsed: Spec, spec: str) -> Instances:
     from ambiguous_wild.vision.label_maps import LabelMaps, SceneLabelMaps
 
-    if found.size is not None or not found.argument:
+    if parsed.size is not None or not parsed.argument:
         raise AwError(f"instances {spec!r}: write labels:FOLDER")
-    flag = found.options.get("scene_wide", "false").lower()
-    if set(found.options) - {"scene_wide"}:
-        raise unknown("option of labels", next(iter(set(found.options) - {"scene_wide"})), ["scene_wide"])
+    flag = parsed.options.get("scene_wide", "false").lower()
+    if set(parsed.options) - {"scene_wide"}:
+        raise unknown("option of labels", next(iter(set(parsed.options) - {"scene_wide"})), ["scene_wide"])
     if flag not in ("true", "false"):
         raise AwError(f"instances {spec!r}: scene_wide is true or false, got {flag!r}")
-    return (SceneLabelMaps if flag == "true" else LabelMaps)(found.argument)
+    return (SceneLabelMaps if flag == "true" else LabelMaps)(parsed.argument)
 
 
-def _grounded(found: Spec, spec: str) -> Instances:
+def _grounded(parsed: Spec, spec: str) -> Instances:
     from ambiguous_wild.vision.grounded import GroundedConfig, GroundedInstances
 
-    folder, options = _weights(found.options)
+    folder, options = _weights(parsed.options)
     sam_folder, options = _weights(options, "sam_weights")
     tracking = {}
-    if found.name == "grounded-video":
+    if parsed.name == "grounded-video":
         tracking = {k: v for k, v in options.items() if k in ("every", "most", "known")}
         options = {k: v for k, v in options.items() if k not in tracking}
     config = with_options(GroundedConfig(), options, "option of grounded")
-    if found.size is not None:
-        config = dataclasses.replace(config, shorter=found.size)
-    instances = GroundedInstances(found.argument, config, folder=folder, sam_folder=sam_folder)
-    if found.name == "grounded":
+    if parsed.size is not None:
+        config = dataclasses.replace(config, shorter=parsed.size)
+    instances = GroundedInstances(parsed.argument, config, folder=folder, sam_folder=sam_folder)
+    if parsed.name == "grounded":
         return instances
     from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances
 
@@ -209,22 +213,22 @@ def _grounded(found: Spec, spec: str) -> Instances:
     return SamVideoInstances(SAM_VIDEO["sam2-video"], video, sam_folder, instances)
 
 
-def _sam(found: Spec, spec: str) -> Instances:
-    folder, options = _weights(found.options)
-    where = f"option of {found.name}"
-    if found.name in SAM:
+def _sam(parsed: Spec, spec: str) -> Instances:
+    folder, options = _weights(parsed.options)
+    where = f"option of {parsed.name}"
+    if parsed.name in SAM:
         from ambiguous_wild.vision.sam import SamConfig, SamInstances
 
         config = with_options(SamConfig(), options, where)
-        if found.size is not None:
-            config = dataclasses.replace(config, grid=found.size)
-        return SamInstances(SAM[found.name], config, folder)
+        if parsed.size is not None:
+            config = dataclasses.replace(config, grid=parsed.size)
+        return SamInstances(SAM[parsed.name], config, folder)
     from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances
 
     video = with_options(SamVideoConfig(), options, where)
-    if found.size is not None:
-        video = dataclasses.replace(video, sam=dataclasses.replace(video.sam, grid=found.size))
-    return SamVideoInstances(SAM_VIDEO[found.name], video, folder)
+    if parsed.size is not None:
+        video = dataclasses.replace(video, sam=dataclasses.replace(video.sam, grid=parsed.size))
+    return SamVideoInstances(SAM_VIDEO[parsed.name], video, folder)
 
 
 _BUILDERS: dict[str, Callable[[Spec, str], Instances]] = {
@@ -237,14 +241,14 @@ _BUILDERS: dict[str, Callable[[Spec, str], Instances]] = {
 
 
 def _weights(options: dict[str, str], key: str = "weights") -> tuple[Path | None, dict[str, str]]:
-    """The folder an option names, and the other options."""
+    """Return the folder that the option `key` names, if it is given, and the other options."""
     rest = {k: v for k, v in options.items() if k != key}
     return (expanded(options[key], key) if key in options else None), rest
 
 
-def _no_options(found: Spec, spec: str) -> None:
-    if found.options or found.size is not None:
-        raise AwError(f"features {spec!r}: {found.name} takes no options")
+def _no_options(parsed: Spec, spec: str) -> None:
+    if parsed.options or parsed.size is not None:
+        raise AwError(f"features {spec!r}: {parsed.name} takes no options")
 
 
 # Metadata of an option whose default depends on the machine: a command that repeats a run elsewhere names it.
@@ -252,12 +256,12 @@ BY_MACHINE = {"by_machine": True}
 
 
 def first_here(*specs: str) -> str:
-    """The first of these specs that can run here, the last without asking; nothing is loaded."""
+    """Return the first of these specs that can run on this machine, else the last; nothing is loaded."""
     return next((spec for spec in specs[:-1] if _can_run(parse(spec).name)), specs[-1])
 
 
 def _can_run(name: str) -> bool:
-    """Whether the weights are here, and the package that runs them."""
+    """Whether the weights are on this machine, and the package that runs them is installed."""
     if name in CONV:
         return find(named(name))[0] is not None
     weights = (DINO | SAM).get(name)

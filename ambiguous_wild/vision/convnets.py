@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.core.config import State, config_hash
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.weight_files import expanded, read_tensors
 from ambiguous_wild.io.files import sha256_file
@@ -41,7 +40,7 @@ LAYERS = {"stride4": (2, 4, 24), "stride8": (4, 8, 40), "stride16": (10, 16, 112
 
 
 class Block(nn.Module):
-    """Expansion, depthwise convolution, projection; with a shortcut where the shape stays."""
+    """Expansion, depthwise convolution and projection, with a shortcut if input and output have one shape."""
 
     def __init__(self, layers: Sequence[nn.Module], shortcut: bool) -> None:
         super().__init__()
@@ -57,7 +56,7 @@ class EfficientNetLite0(nn.Module):
     def __init__(self, tensors: Mapping[str, Tensor], layer: str) -> None:
         """
         Args:
-            tensors: of the published file.
+            tensors: those of the published file.
             layer: a key of `LAYERS`; later blocks are left out.
 
         Raises:
@@ -88,7 +87,7 @@ def _block(tensors: Mapping[str, Tensor], index: int) -> Block:
 def _folded(
     tensors: Mapping[str, Tensor], conv: str, norm: str, shape: tuple[int, ...], stride: int = 1
 ) -> nn.Module:
-    """The convolution with the batch norm that follows it; SAME padding, of even sides for a stride of 2."""
+    """Fold a batch norm into the convolution before it; SAME padding, for even sides if the stride is 2."""
     weight = tensors[f"{conv}.weight"]
     gain, shift, mean, variance = (tensors[f"{norm}.{part}"] for part in _BATCH_NORM)
     if tuple(weight.shape) != shape or any(
@@ -122,7 +121,7 @@ class ConvConfig:
     """Sizes and layers; "" and -1 are the network's defaults in `NETWORKS`."""
 
     size: int = -1  # px, longer side of the net's input, rounded to whole cells; 0 = the image's size
-    layer: str = ""  # whose output is used
+    layer: str = ""  # the layer whose output is used
     fit_photos: int = 8  # photos that `fit` uses
 
 
@@ -155,7 +154,7 @@ def _prepare_vgg(pixels: Tensor, stride: int) -> Tensor:
 
 
 def _prepare_efficientnet(pixels: Tensor, stride: int) -> Tensor:
-    """As the net was trained: (x - 127) / 128; moved by half a cell.
+    """Scale pixels as in training, (x - 127) / 128, and move them by half a cell.
 
     SAME padding puts the centre of cell k at pixel k * stride + stride - 1, not in the middle of the cell.
     """
@@ -172,7 +171,7 @@ NETWORKS = {
 
 
 class ConvFeatures:
-    """Output of one layer, [h, w, C]; the cells divide the image evenly."""
+    """Features that are the output of one layer, [h, w, C]; the cells divide the image evenly."""
 
     def __init__(self, name: str, config: ConvConfig | None = None, folder: str | Path | None = None) -> None:
         """Find the weights; they are loaded at the first call.
@@ -180,7 +179,7 @@ class ConvFeatures:
         Args:
             name: a key of `NETWORKS`.
             config: see `ConvConfig`.
-            folder: of the weights; nothing is searched.
+            folder: holds the weights; without it they are searched.
 
         Raises:
             AwError: no weights; an invalid setting.
@@ -203,7 +202,7 @@ class ConvFeatures:
         self._sha256 = sha256_file(self.path)
         settings = config_hash([self.size, layer, self.config.fit_photos])[:8]
         self.name = f"conv-1-{name}-{self._sha256[:12]}-{settings}"
-        self.unit = 0.1  # until `fit`
+        self.unit = 0.1  # until `fit` measures it
         self._what = name
         self._model: nn.Module | None = None
         self._device: torch.device | None = None
@@ -267,15 +266,15 @@ class ConvFeatures:
             maps = self.model(self._network.prepare(pixels, self.stride))
         return maps[0].permute(1, 2, 0).contiguous()
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {"unit": self.unit}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self.unit = float(state["unit"])
 
 
 def _file(name: str, folder: str | Path | None) -> Path:
-    """The file of the weights."""
+    """Find the file of the weights, in the folder if the user names one."""
     weight = weights.named(name)
     if folder is None:
         path = weights.where(weight)
@@ -283,7 +282,7 @@ def _file(name: str, folder: str | Path | None) -> Path:
             raise AwError(weights.missing(weight))
         return path
     place = expanded(folder, "the folder of weights")
-    found = [place / file for file in weight.files if (place / file).is_file()]
-    if not found:
+    files = [place / file for file in weight.files if (place / file).is_file()]
+    if not files:
         raise AwError(f"{place} has no {' or '.join(weight.files)}")
-    return found[0]
+    return files[0]

@@ -1,7 +1,7 @@
 """DINO features: DINOv2 with and without registers, DINOv1; frozen, differentiable in the image.
 
-The image is resized to whole patches, since the library silently drops rows and columns beyond the last whole
-patch. So the grid covers the whole image.
+The image is resized to whole patches, because the library silently drops rows and columns beyond the last
+whole patch; so the grid covers the whole image.
 
 On an NVIDIA GPU the net multiplies in bfloat16, for photos and renders alike (`precision`).
 """
@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.core.config import State, config_hash
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
 from ambiguous_wild.vision.protocols import cell_grid, check_image, degraded_distance, whole_cells
 
@@ -31,8 +31,8 @@ class _Family:
     class_name: str
     patch: int
     registers: int = 0
-    options: dict[str, Any] = field(default_factory=dict)  # of the class's constructor
-    call: dict[str, Any] = field(default_factory=dict)  # of each forward call
+    options: dict[str, bool] = field(default_factory=dict)  # arguments of the class's constructor
+    call: dict[str, bool] = field(default_factory=dict)  # arguments of each forward call
 
 
 _FAMILIES = {  # by model_type
@@ -65,7 +65,7 @@ class DinoFeatures:
         Args:
             name: of the weights, see `vision.weights`; any label if `folder` is given.
             config: see `DinoConfig`.
-            folder: of the weights; nothing is searched.
+            folder: holds the weights; without it they are searched.
 
         Raises:
             AwError: no weights, see `pretrained.locate`; an invalid setting.
@@ -85,10 +85,10 @@ class DinoFeatures:
                 f"got {self.config.size} and {self.config.fit_photos}"
             )
         self.name = f"dino-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
-        self.unit = 0.1  # until `fit`
+        self.unit = 0.1  # until `fit` measures it
         self._model: nn.Module | None = None
-        self._device: torch.device | None = None  # of the net
-        self._halved = False  # the weights are bfloat16
+        self._device: torch.device | None = None  # where the net is
+        self._halved = False  # whether the weights are bfloat16
 
     @property
     def model(self) -> nn.Module:
@@ -115,7 +115,7 @@ class DinoFeatures:
         self.unit = degraded_distance(self, photos, self.config.fit_photos)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of patches for an image of this size in px."""
+        """Return rows and columns of patches for an image of this size in px."""
         return cell_grid(height, width, self.config.size, self.patch)
 
     def precision(self, device: torch.device) -> str:
@@ -144,7 +144,7 @@ class DinoFeatures:
             return tokens.reshape(rows, columns, self.channels)
 
     def _model_on(self, device: torch.device) -> nn.Module:
-        """The net on the device; skips `Module.to`, which visits every layer, if nothing moves."""
+        """Return the net on the device; skips `Module.to`, which visits every layer, if nothing moves."""
         if self._device != device:
             if self._halved and not mixed(device):
                 self._model = None  # load again: the bfloat16 weights have lost digits
@@ -154,15 +154,15 @@ class DinoFeatures:
                 _halve(self.model)
         return self.model
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {"unit": self.unit}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self.unit = float(state["unit"])
 
 
 def normalised(pixels: Tensor) -> Tensor:
-    """Pixels [B, 3, H, W] in [0, 1] minus ImageNet's mean, divided by its standard deviation."""
+    """Subtract ImageNet's mean from pixels [B, 3, H, W] in [0, 1], and divide by its standard deviation."""
     mean, std = _imagenet(pixels.dtype, pixels.device)
     return (pixels - mean) / std
 

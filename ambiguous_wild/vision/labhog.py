@@ -11,12 +11,12 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.core.config import State
 from ambiguous_wild.vision.protocols import blurred_noisy_copy, check_image, spaced
 
 STRIDE = 4  # px of the image per cell of the grid
@@ -96,7 +96,7 @@ class LabHog:
         # the floor gives black cells a finite value and gradient
         return block * torch.rsqrt((block * block).sum(2, keepdim=True) + 1e-6)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {
             "hog_mean": self.hog_mean,
             "hog_std": self.hog_std,
@@ -104,7 +104,7 @@ class LabHog:
             "unit": self.unit,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self.hog_mean, self.hog_std = state["hog_mean"], state["hog_std"]
         self.weights, self.unit = state["weights"], float(state["unit"])
 
@@ -129,7 +129,7 @@ def _matrix(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _blocks(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Lab block [h, w, 9] and HOG block [h, w, 18], neither normalised."""
+    """Compute the Lab block [h, w, 9] and the HOG block [h, w, 18], neither of them normalised."""
     lab = lab_image(image)
     cells = _pool(lab, STRIDE)
     blocks = torch.cat([cells, _box(cells, 3), _box(cells, 5)])
@@ -160,10 +160,10 @@ def _hog(grey: Tensor, cell: int) -> Tensor:
 
 
 def _pool(maps: Tensor, size: int) -> Tensor:
-    """Means over size x size blocks; at the border over the pixels inside."""
+    """Means over size x size blocks; at the border, over the pixels of the image alone."""
     return F.avg_pool2d(maps[None], size, stride=size, ceil_mode=True)[0]
 
 
 def _box(maps: Tensor, size: int) -> Tensor:
-    """Running mean over size x size cells; at the border over the cells inside."""
+    """Running mean over size x size cells; at the border, over the cells of the image alone."""
     return F.avg_pool2d(maps[None], size, stride=1, padding=size // 2, count_include_pad=False)[0]

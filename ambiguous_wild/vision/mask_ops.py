@@ -1,4 +1,4 @@
-"""Label maps: from overlapping masks, with new instances, without those that are static."""
+"""Operations on label maps: paint overlapping masks, add new instances, remove static ones."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def paint(
     height: int,
     width: int,
 ) -> tuple[np.ndarray, np.ndarray]:  # [H, W] int32, 0 = none; [K] int64
-    """One label map, painted in order of decreasing area: a small mask lies on top of a large one.
+    """Paint one label map in order of decreasing area: a small mask lies on top of a large one.
 
     Returns:
         labels 1..K without gaps, by decreasing area, and the index of each label's mask. A mask that others
@@ -68,7 +68,7 @@ def paint(
 
 def add_new(
     tracked: np.ndarray,  # [H, W] int32, scene-wide ids, 0 = none
-    found: np.ndarray,  # [H, W] int32, this photo's instances
+    detected: np.ndarray,  # [H, W] int32, this photo's instances
     first_id: int,
     most: int,
     known: float = 0.5,
@@ -77,7 +77,7 @@ def add_new(
 
     Args:
         first_id: id of the first new instance.
-        most: most ids in the map; the largest new instances are added first.
+        most: limit of the number of ids in the map; the largest new instances are added first.
         known: an instance is not new if tracked ids cover at least this share of its pixels.
 
     Returns:
@@ -85,44 +85,44 @@ def add_new(
     """
     result = tracked.copy()
     free = tracked == 0
-    counts = np.bincount(np.maximum(found, 0).ravel())
-    uncovered = np.bincount(np.maximum(found, 0)[free], minlength=len(counts))
+    counts = np.bincount(np.maximum(detected, 0).ravel())
+    uncovered = np.bincount(np.maximum(detected, 0)[free], minlength=len(counts))
     fresh = [k for k in range(1, len(counts)) if uncovered[k] and uncovered[k] > (1.0 - known) * counts[k]]
     fresh.sort(key=lambda k: (-uncovered[k], k))
     room = max(most - int(np.count_nonzero(np.unique(tracked) > 0)), 0)
     for number, k in enumerate(fresh[:room]):
-        result[(found == k) & free] = first_id + number
+        result[(detected == k) & free] = first_id + number
     return result, first_id + min(len(fresh), room)
 
 
 def unsupported(labels: np.ndarray, scene: Scene, name: str, most: float, least_track: int = 3) -> np.ndarray:
-    """The label map without the instances that points say are static.
+    """Remove the instances that SfM points show to be static from a label map.
 
     Source: AsymGS (arXiv 2506.03538), the filter of its instance proposals.
 
     Args:
-        labels: [H, W] of the photo, 0 = none.
-        scene: whose points are asked.
-        name: of the photo.
-        most: an instance stays whose points a pixel are fewer than this share of the photo's.
+        labels: label map [H, W] of the photo, 0 = none.
+        scene: the scene, whose points are used.
+        name: name of the photo.
+        most: an instance stays if it has fewer points per pixel than this share of the photo's average.
         least_track: points with fewer observations are not counted.
 
     Returns:
-        [H, W] int64, the labels of those that stay, 0 elsewhere.
+        [H, W] int64, the labels of the instances that stay, 0 elsewhere.
     """
     labels, points = np.maximum(labels, 0).astype(np.int64), scene.points
     lengths = np.diff(points.track_offsets)
-    here = points.track_views == [view.name for view in scene.views].index(name)
-    x, y = np.floor(points.track_xy[here & np.repeat(lengths >= least_track, lengths)]).astype(np.int64).T
-    hit = labels[y.clip(0, labels.shape[0] - 1), x.clip(0, labels.shape[1] - 1)]
+    in_photo = points.track_views == [view.name for view in scene.views].index(name)
+    x, y = np.floor(points.track_xy[in_photo & np.repeat(lengths >= least_track, lengths)]).astype(np.int64).T
+    hit_labels = labels[y.clip(0, labels.shape[0] - 1), x.clip(0, labels.shape[1] - 1)]
     sizes = np.bincount(labels.ravel())
-    density = np.bincount(hit, minlength=len(sizes)) / np.maximum(sizes, 1)
-    static = density * labels.size >= most * max(len(hit), 1)
+    density = np.bincount(hit_labels, minlength=len(sizes)) / np.maximum(sizes, 1)
+    static = density * labels.size >= most * max(len(hit_labels), 1)
     return np.where(static[labels], 0, labels)
 
 
 def keep_unsuspicious(labels: Tensor, suspect: Tensor) -> Tensor:
-    """Keep map [H, W]: without the instances that are more suspect than the photo is on average.
+    """Make the keep map [H, W] that drops instances more suspect than the photo is on average.
 
     Args:
         labels: [H, W] int64, 0 = none.

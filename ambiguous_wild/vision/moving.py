@@ -1,8 +1,8 @@
-"""Where a photo moves: from the features that fit the place in other photos, and those that do not.
+"""Maps of what moves in a photo, from matches of its features with other photos.
 
-Structure from motion leaves matches out that fit another rigid motion than the place's. They lie on
-distractors, also on those that no colour and no structure can tell; matches that fit the place lie
-everywhere else. Between features their neighbours decide, and those in the same segment.
+Structure from motion keeps the matches that fit the motion of the cameras. Matches that fit another rigid
+motion lie on distractors, also on those that neither colour nor structure tells apart; the other matches lie
+everywhere else. Pixels between features are decided by the features near them and in their segment.
 """
 
 from __future__ import annotations
@@ -20,32 +20,33 @@ from ambiguous_wild.vision.precompute import cache_key, cached
 from ambiguous_wild.vision.protocols import Instances, PromptedInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
-MOVES = 0.6  # of `moving_map`: above, a pixel moves
+MOVES = 0.6  # a pixel moves if `moving_map` is above this
 POINTS = "features: green stay, red move"  # caption of `draw_points`
-# reach of a feature, standard deviation on a map of `PIXELS`: what stays must not speak for what hides it
+# Reach of a feature: standard deviation in px on a map of `PIXELS`. Static features reach less far, because
+# what hides them may move.
 MOVING_PX, STATIC_PX = 3.0, 2.0
-VOTES = 3  # photos of a feature count at most as much
-SEGMENT_VOTES = 1.0  # of a segment, at most
-LEAST_PROMPT = 3  # features of a motion that are a prompt
-UNSURE = 1.0  # votes on either side that leave the answer half open
+VOTES = 3  # votes of a feature at most: one for each photo that it is matched in
+SEGMENT_VOTES = 1.0  # votes of a segment at most
+LEAST_PROMPT = 3  # a motion of fewer features is no prompt
+UNSURE = 1.0  # votes that are added, half to each side: they pull the map towards 0.5
 
 
 def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """What moves, [h, w] float32 in [0, 1]: 1 = moves, 0 = stays, 0.5 where no feature says anything.
+    """Map [h, w] float32 in [0, 1] of what moves: 1 = moves, 0 = stays, 0.5 where no feature is near.
 
     Args:
-        points: of the photo.
+        points: the photo's features.
         labels: [H, W] int32 segments of the photo, 0 = none.
-        shape: of the map.
+        shape: (h, w) of the map.
     """
     h, w = shape
     segments = np.maximum(cv2.resize(labels, (w, h), interpolation=cv2.INTER_NEAREST), 0)
     column, row = np.clip(points.xy * [w, h], 0, [w - 1, h - 1]).astype(int).T
     near, of_segment = [], []
     of_kind = (points.moves, points.moving, MOVING_PX), (~points.moves, points.static, STATIC_PX)
-    for mine, votes, reach_px in of_kind:
+    for chosen, votes, reach_px in of_kind:
         reach = reach_px * math.sqrt(h * w / PIXELS)
-        weight = np.where(mine, np.minimum(votes, VOTES), 0).astype(np.float32)
+        weight = np.where(chosen, np.minimum(votes, VOTES), 0).astype(np.float32)
         at_feature = np.zeros(shape, np.float32)
         np.add.at(at_feature, (row, column), weight)
         near.append(cv2.GaussianBlur(at_feature, (0, 0), reach) * np.float32(2.0 * math.pi * reach**2))
@@ -64,15 +65,15 @@ def moving_labels(
 ) -> np.ndarray:
     """Segments for `moving_map`, [H, W] int32.
 
-    Features that move together are the prompt of a back end that takes points (SAM), those that stay its
-    negatives: each answer becomes a segment of its own. Other back ends keep their segments.
+    A back end that takes points (SAM) is prompted with features that move together, and with static features
+    as negatives; each mask it returns becomes a segment of its own. Other back ends keep their segments.
 
     Args:
-        instances: back end of the segments.
+        instances: back end that made the segments.
         photo: [H, W, 3] in [0, 1].
-        labels: [H, W] int32, its segments.
-        points: of the photo.
-        folder: of the cache.
+        labels: [H, W] int32, the photo's segments.
+        points: the photo's features.
+        folder: the cache.
     """
     motions = np.flatnonzero(np.bincount(points.motion)[1:] >= LEAST_PROMPT) + 1
     if not isinstance(instances, PromptedInstances) or not len(motions):
@@ -92,7 +93,7 @@ def moving_labels(
 
 
 def draw_points(photo: np.ndarray, points: MotionPoints) -> np.ndarray:
-    """The photo [H, W, 3] uint8 with dots: red where a feature moves, green where it stays."""
+    """Draw dots on a photo [H, W, 3] uint8: red where a feature moves, green where it stays."""
     h, w = photo.shape[:2]
     size = max(round(max(h, w) / 320), 1)
     shown = faded(photo)

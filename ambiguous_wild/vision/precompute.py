@@ -35,10 +35,10 @@ STALE_S = 24 * 3600.0  # older temporary files are leftovers of a killed process
 
 
 def cache_key(kind: str, backend: str, settings: Any, *arrays: np.ndarray) -> str:
-    """Key of an entry: hash of the pixels, the back end's name and version, and every setting.
+    """Make the key of an entry: a hash of the pixels, the back end's name and version, and every setting.
 
     Args:
-        kind: of the content, e.g. ``"segments"``; the first part of the file's name.
+        kind: kind of content, e.g. ``"segments"``; the first part of the file's name.
         backend: name of the back end, with its version.
         settings: dataclass or plain data; everything that changes the result.
         arrays: the inputs, hashed with shape and dtype.
@@ -56,16 +56,16 @@ def cached(
     """Load the arrays stored under `key`, else compute and store them.
 
     Args:
-        folder: of the cache; created if needed.
+        folder: the cache; created if needed.
         key: from `cache_key`.
         expected: name and dtype of every array. A damaged or different entry is computed again.
         compute: computes the arrays.
     """
     _tidy(folder)
     path = folder / f"{key}.npz"
-    found = _load(path, expected)
-    if found is not None:
-        return found
+    stored = _load(path, expected)
+    if stored is not None:
+        return stored
     arrays = compute()
     with atomic_path(path) as temporary, open(temporary, "wb") as f:
         np.savez_compressed(f, **arrays)  # type: ignore[arg-type]
@@ -155,8 +155,8 @@ def instance_labels(
     Args:
         instances: back end; `SceneInstances` and `NamedInstances` are used if implemented.
         photos: [H, W, 3] in [0, 1].
-        names: of the photos.
-        folder: of the cache; cached photos and chunks are not computed again.
+        names: names of the photos.
+        folder: the cache; photos and chunks in it are not computed again.
         bar: progress bar; by default one on a terminal.
     """
     shown = bar or terminal_bar(f"instances ({instances.name.partition('-')[0]})")

@@ -30,7 +30,7 @@ class Pretrained:
     name: str
     folder: Path
     config: dict[str, Any]  # config.json
-    digest: str  # of the tensors and config.json, 12 hex digits; part of cache keys
+    digest: str  # hash of the tensors and config.json, 12 hex digits; part of cache keys
     advice: str  # what to do if a file cannot be used
 
     @property
@@ -44,9 +44,9 @@ def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = 
     Uses the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it (`vision.fetch`).
 
     Args:
-        name: of the weights, e.g. ``"dinov2-small"``.
+        name: name of the weights, e.g. ``"dinov2-small"``.
         model_types: allowed values of model_type in config.json.
-        explicit: the user's folder; nothing is searched.
+        explicit: the user's folder; if given, no other is searched.
 
     Raises:
         AwError: transformers is not installed; the name is unknown; the weights are missing and cannot be
@@ -69,10 +69,10 @@ def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **op
     By default the library only logs a missing tensor and fills it with random values; here it is an error.
 
     Args:
-        source: from `locate`.
+        source: the result of `locate`.
         class_name: name of the library's class.
         harmless: prefixes of tensors in the file that the class may ignore.
-        options: of the class.
+        options: arguments of the class.
 
     Raises:
         AwError: a tensor is missing, unexpected, of another shape or not finite; a file is damaged.
@@ -118,7 +118,7 @@ def load(source: Pretrained, class_name: str, harmless: Sequence[str] = (), **op
 
 
 def model_class(name: str) -> Any:
-    """A class of transformers by name.
+    """Import a class of transformers by name.
 
     Raises:
         AwError: the import fails, most often because torchvision does not match torch.
@@ -162,10 +162,11 @@ def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
         ) from error
     except (OSError, ValueError) as error:
         raise AwError(f"cannot read {path}: {error}; {advice}") from error
-    found = config.get("model_type") if isinstance(config, dict) else None
-    if found not in model_types:
+    model_type = config.get("model_type") if isinstance(config, dict) else None
+    if model_type not in model_types:
         raise AwError(
-            f"{folder} holds a model of type {found!r}, {name} needs {' or '.join(model_types)}; {advice}"
+            f"{folder} holds a model of type {model_type!r}, {name} needs {' or '.join(model_types)}; "
+            f"{advice}"
         )
     if not (folder / TENSORS).is_file():
         pickle = (folder / "pytorch_model.bin").is_file()
@@ -175,9 +176,9 @@ def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
 
 
 def _advice(name: str, folder: Path) -> str:
-    """What to do about unusable files: the command replaces only those that are found without a folder."""
-    known = {weight.name: weight for weight in weights.KNOWN + weights.OTHER_SIZES}
-    if name in known and weights.where(known[name]) == folder:
+    """Say what to do about unusable files; the command replaces only a folder that it finds itself."""
+    registered = {weight.name: weight for weight in weights.KNOWN + weights.OTHER_SIZES}
+    if name in registered and weights.where(registered[name]) == folder:
         return f"run: {weights.get_command(name, again=True)}"
     return "replace this folder by a complete one"
 

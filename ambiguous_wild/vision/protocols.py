@@ -13,17 +13,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import State
 
 Bar: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]
 
 
 def no_bar(items: Sequence[Any]) -> Iterable[Any]:
-    """The items, without a bar."""
+    """Return the items unchanged: no progress bar is shown."""
     return items
 
 
 def terminal_bar(what: str, unit: str = "photo") -> Bar:
-    """A function that wraps a list so that a terminal shows a bar during iteration.
+    """Return a function that wraps a list, so that a terminal shows a bar during iteration.
 
     Args:
         what: name of the stage, e.g. ``"instance masks"``.
@@ -53,9 +54,9 @@ class Features(Protocol):
         """Features [h, w, C] float32 of an sRGB image [H, W, 3] float32 in [0, 1]."""
         ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> State: ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: State) -> None: ...
 
 
 @runtime_checkable
@@ -120,19 +121,19 @@ class SceneInstances(Protocol):
 
         Args:
             photos: [H, W, 3] float32 in [0, 1].
-            names: of the photos, with a suffix; their natural order is the order of a sequence.
-            folder: of the cache (`vision.precompute`), from which a stopped stage resumes.
+            names: names of the photos, with a suffix; their natural order is the order of a sequence.
+            folder: the cache (`vision.precompute`), from which a stopped stage resumes.
             bar: wraps the list of items, for a progress bar.
         """
         ...
 
 
 _LEAST_PX = 8
-_BLUR_PX, _NOISE = 1.5, 0.02  # of the degraded copies that set units and weights of features
+_BLUR_PX, _NOISE = 1.5, 0.02  # blur and noise of the copies that set units and weights of features
 
 
 def spaced(count: int, most: int) -> list[int]:
-    """Indices of `most` of `count` training photos, evenly spaced; of all where they are fewer.
+    """Return indices of `most` of `count` training photos, evenly spaced; of all if there are fewer.
 
     Raises:
         AwError: there is no photo.
@@ -143,7 +144,7 @@ def spaced(count: int, most: int) -> list[int]:
 
 
 def blurred_noisy_copy(photo: Tensor, seed: int) -> Tensor:
-    """The photo blurred and with noise, similar to a good render of it."""
+    """Blur the photo and add noise, so that it resembles a good render of it."""
     radius = math.ceil(3 * _BLUR_PX)
     taps = torch.arange(-radius, radius + 1, dtype=photo.dtype, device=photo.device)
     kernel = torch.exp(-0.5 * (taps / _BLUR_PX) ** 2)
@@ -161,9 +162,9 @@ def degraded_distance(features: Callable[[Tensor], Tensor], photos: Sequence[Ten
     """Mean cosine distance between photos [H, W, 3] and blurred, noisy copies of them.
 
     Args:
-        features: of an image, [h, w, C].
-        photos: of the scene.
-        most: photos to use, evenly spaced.
+        features: computes the features [h, w, C] of an image.
+        photos: the scene's photos.
+        most: number of photos to use, evenly spaced.
 
     Raises:
         AwError: there is no photo.
@@ -177,13 +178,13 @@ def degraded_distance(features: Callable[[Tensor], Tensor], photos: Sequence[Ten
 
 
 def check_image(image: Tensor) -> None:
-    """Raise AwError where the image is not [H, W, 3] or smaller than 8 px."""
+    """Raise AwError if the image is not [H, W, 3] or smaller than 8 px."""
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < _LEAST_PX:
         raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
 
 
 def whole_cells(image: Tensor, rows: int, columns: int, cell: int) -> Tensor:
-    """The image [H, W, 3] as [1, 3, rows * cell, columns * cell], resized if needed."""
+    """Convert an image [H, W, 3] to [1, 3, rows * cell, columns * cell], resized if needed."""
     pixels = image.permute(2, 0, 1)[None]
     size = (rows * cell, columns * cell)
     if size == tuple(image.shape[:2]):
@@ -192,6 +193,6 @@ def whole_cells(image: Tensor, rows: int, columns: int, cell: int) -> Tensor:
 
 
 def cell_grid(height: int, width: int, size: int, cell: int) -> tuple[int, int]:
-    """Rows and columns of cells for an image whose longer side is resized to `size` px; 0 = not resized."""
+    """Return rows and columns of cells of an image, its longer side resized to `size` px; 0 = not resized."""
     scale = size / max(height, width) if size else 1.0
     return max(round(height * scale / cell), 1), max(round(width * scale / cell), 1)

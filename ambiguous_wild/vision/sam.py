@@ -23,8 +23,8 @@ from ambiguous_wild.vision.dino import normalised
 from ambiguous_wild.vision.mask_ops import box_nms, mask_boxes, paint
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
 
-PROMPTS = 8  # points on an instance at most, and as many beside it
-# SAM 2 checkpoints are of the video model; the image model loads a part of them.
+PROMPTS = 8  # a prompt has at most this many points on an instance, and as many beside it
+# SAM 2 checkpoints hold the video model; the image model loads a part of them.
 _CLASSES = {"sam": "SamModel", "sam2": "Sam2Model", "sam2_video": "Sam2Model"}
 
 
@@ -56,13 +56,13 @@ class _Embedded:
         return self.inner[1] / self.width, self.inner[0] / self.height
 
     def without_padding(self, low: Tensor) -> Tensor:
-        """Logits [n, h, w] without padding."""
+        """Cut the padding off logits [n, h, w]."""
         rows = max(round(low.shape[1] * self.inner[0] / self.side), 1)
         columns = max(round(low.shape[2] * self.inner[1] / self.side), 1)
         return low[:, :rows, :columns]
 
     def enlarged(self, low: Tensor) -> np.ndarray:
-        """A mask [H, W] bool at the photo's size from logits [h, w]; crops padding at the input's size."""
+        """Make a mask [H, W] bool at the photo's size from logits [h, w]; padding is cut off."""
         full = low[None, None].float()
         if self.inner != (self.side, self.side):
             full = F.interpolate(full, size=(self.side, self.side), mode="bilinear", align_corners=False)
@@ -123,9 +123,9 @@ class SamInstances:
             good &= area >= config.least_area
             logits.append(low[good])
             scores.append(quality[good])
-        found, score = torch.cat(logits), torch.cat(scores).double().cpu().numpy()
-        keep = box_nms(mask_boxes((embedded.without_padding(found) > 0.0).cpu().numpy()), score, config.nms)
-        masks = [embedded.enlarged(found[k]) for k in keep]
+        kept, score = torch.cat(logits), torch.cat(scores).double().cpu().numpy()
+        keep = box_nms(mask_boxes((embedded.without_padding(kept) > 0.0).cpu().numpy()), score, config.nms)
+        masks = [embedded.enlarged(kept[k]) for k in keep]
         return paint(masks, embedded.height, embedded.width)[0]
 
     @torch.no_grad()
@@ -140,9 +140,9 @@ class SamInstances:
         )
         for start in range(0, len(boxes), self.config.batch):
             part = scaled[None, start : start + self.config.batch]
-            out = self.model(**self._prompt(embedded), input_boxes=part, multimask_output=False).pred_masks[
-                0, :, 0
-            ]
+            out = self.model(
+                image_embeddings=embedded.embeddings, input_boxes=part, multimask_output=False
+            ).pred_masks[0, :, 0]
             for offset, low in enumerate(out):
                 result[start + offset] = embedded.enlarged(low)
         return result
@@ -153,8 +153,8 @@ class SamInstances:
 
         Args:
             photo: [H, W, 3] in [0, 1].
-            groups: of each instance [k, 2] px; some of them, spread, are the prompt.
-            outside: [m, 2] px, points on none of them; the nearest are the prompt's negatives.
+            groups: points [k, 2] px of each instance; up to `PROMPTS` of them, spread evenly, are the prompt.
+            outside: points [m, 2] px on no instance; the nearest are the prompt's negatives.
         """
         embedded = self._embed(photo)
         masks = np.zeros((len(groups), embedded.height, embedded.width), dtype=bool)
@@ -166,7 +166,7 @@ class SamInstances:
             signs = torch.zeros(len(points), dtype=torch.int64, device=photo.device)
             signs[: len(inside)] = 1
             out = self.model(
-                **self._prompt(embedded),
+                image_embeddings=embedded.embeddings,
                 input_points=scaled[None, None],
                 input_labels=signs[None, None],
                 multimask_output=False,
@@ -175,16 +175,13 @@ class SamInstances:
         return masks
 
     def _decode_points(self, embedded: _Embedded, points: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """For each batch, logits [3 n, h, w] on the net's grid and predicted IoU [3 n]."""
+        """Yield logits [3 n, h, w] on the net's grid and predicted IoU [3 n] of each batch of n points."""
         scaled = points * points.new_tensor(embedded.scale)
         for start in range(0, len(scaled), self.config.batch):
             part = scaled[start : start + self.config.batch][None, :, None]
             ones = torch.ones(part.shape[:3], dtype=torch.int64, device=part.device)
-            out = self.model(**self._prompt(embedded), input_points=part, input_labels=ones)
+            out = self.model(image_embeddings=embedded.embeddings, input_points=part, input_labels=ones)
             yield out.pred_masks[0].flatten(0, 1), out.iou_scores[0].flatten()
-
-    def _prompt(self, embedded: _Embedded) -> dict[str, Any]:
-        return {"image_embeddings": embedded.embeddings}
 
     def _embed(self, photo: Tensor) -> _Embedded:
         """Encode a photo: SAM 1 keeps its aspect and pads right and below, SAM 2 stretches it to a square."""

@@ -1,8 +1,8 @@
 """Identities across an ordered sequence: SAM 2 tracks the instances of one photo through the next ones.
 
-Every few photos all instances are detected again; those that no tracked instance covers get new ids. The
-sequence is divided there into chunks, each with its own memory. A chunk is a cache entry, so that a stopped
-stage resumes. An object that is out of view for a whole chunk returns with a new id.
+Every few photos all instances are detected again; those that no tracked instance covers get new ids. At
+these photos the sequence is divided into chunks, each with its own memory. A chunk is a cache entry, so that
+a stopped stage resumes. An object that is out of view for a whole chunk returns with a new id.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class SamVideoConfig:
     """Cost grows with the number of objects: each has its own memory."""
 
     every: int = 8  # photos between two detections of new instances
-    most: int = 32  # most instances tracked at a time; the largest are kept
+    most: int = 32  # limit of instances tracked at a time; the largest are kept
     known: float = 0.5  # an instance is not new if tracked ones cover at least this share of it
     sam: SamConfig = field(default_factory=SamConfig)
 
@@ -50,9 +50,9 @@ class SamVideoInstances:
         """Find and check the weights; they are loaded at first use.
 
         Args:
-            name: of the weights, see `vision.weights`; any label if `folder` is given.
+            name: name of the weights, see `vision.weights`; any label if `folder` is given.
             config: see `SamVideoConfig`.
-            folder: of the weights; nothing is searched.
+            folder: holds the weights; without it they are searched.
             single: detects the instances to track; by default SAM 2, all instances.
 
         Raises:
@@ -87,8 +87,8 @@ class SamVideoInstances:
 
         Args:
             photos: [H, W, 3] in [0, 1].
-            names: of the photos; their natural order (a2 before a10) is the order of the sequence.
-            folder: of the cache; each photo's instances and each chunk are one entry.
+            names: names of the photos; their natural order (a2 before a10) is the order of the sequence.
+            folder: the cache; each photo's instances and each chunk are one entry.
             bar: wraps the chunks, for a progress bar.
         """
         order = sorted(range(len(photos)), key=lambda i: (natural(names[i]), i))
@@ -98,10 +98,10 @@ class SamVideoInstances:
         for start in bar(list(range(0, len(order), self.config.every))):
             chunk = order[start : start + self.config.every + 1]
             frames = [photos[i] for i in chunk]
-            found = self._detected(frames[0], folder)
-            empty = np.zeros_like(found)
+            detected = self._detected(frames[0], folder)
+            empty = np.zeros_like(detected)
             first, next_id = add_new(
-                empty if carried is None else carried, found, next_id, self.config.most, self.config.known
+                empty if carried is None else carried, detected, next_id, self.config.most, self.config.known
             )
             maps = self._tracked(frames, first, folder)
             for i, ids in zip(chunk[: self.config.every], maps):
@@ -124,12 +124,12 @@ class SamVideoInstances:
             return dict(zip(names, self.follow(frames, first)))
 
         if folder is None:
-            found = compute()
+            maps = compute()
         else:
             pixels = [frame.detach().cpu().numpy() for frame in frames]
             key = cache_key("followed", self.name, None, first, *pixels)
-            found = cached(folder, key, dict.fromkeys(names, np.int32), compute)
-        return [found[name] for name in names]
+            maps = cached(folder, key, dict.fromkeys(names, np.int32), compute)
+        return [maps[name] for name in names]
 
     @torch.no_grad()
     def follow(self, frames: Sequence[Tensor], first: np.ndarray) -> list[np.ndarray]:
@@ -163,7 +163,7 @@ class SamVideoInstances:
 
 
 def _painted(out: Any, size: tuple[int, int]) -> np.ndarray:
-    """Ids [H, W] of one frame: at every pixel the object of the highest logit above 0."""
+    """Return ids [H, W] of one frame: each pixel has the object of the highest logit above 0."""
     best = torch.zeros(size, device=out.pred_masks.device)
     ids = torch.zeros(size, dtype=torch.int32, device=best.device)
     present = out.object_score_logits

@@ -3,14 +3,11 @@
 Unlike `labhog`, it can separate a grey coat in front of a grey wall. It is trained on SfM tracks and degraded
 photos and needs no pretrained weights.
 
-Training is contrastive: a 3D point in two photos is a positive pair.
-
-InfoNCE (van den Oord et al. 2018) over the tracks that two photos share, one of them degraded like a render.
-The negatives are the other points of the same photos. Measured on renders of two simulated captures without
-masks at 600 and 3000 iterations: temperature 0.07 is better than 0.2; training on photos and their own
-degraded copies, without tracks, is worse than no training (3000: per-pixel AUC 0.965; tracks 0.974, no
-training 0.970).
-
+Training is contrastive, with InfoNCE (van den Oord et al. 2018): a 3D point in two photos is a positive pair,
+the other points of these photos are its negatives. One of the photos is degraded like a render. Measured on
+renders of two simulated captures without masks at 600 and 3000 iterations: temperature 0.07 is better than
+0.2; training on photos and their own degraded copies, without tracks, is worse than no training (3000:
+per-pixel AUC 0.965; tracks 0.974, no training 0.970).
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import scipy.sparse
@@ -29,6 +26,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import State
 from ambiguous_wild.vision.labhog import STRIDE, lab_image
 from ambiguous_wild.vision.precompute import cache_key, cached
 from ambiguous_wild.vision.protocols import blurred_noisy_copy, check_image, spaced
@@ -42,12 +40,12 @@ class SceneConvConfig:
     """The net and its training."""
 
     widths: tuple[int, int, int] = (16, 32, 48)  # channels at half size, at quarter size, of the wide layers
-    channels: int = 32  # of the features
+    channels: int = 32  # channels of the features
     steps: int = 600  # Adam steps, two photos each
     rate: float = 3e-3  # Adam's highest rate; one cycle, rising over a tenth of the steps
-    temperature: float = 0.07  # of the softmax over cosines
+    temperature: float = 0.07  # temperature of the softmax over cosines
     anchors: int = 256  # most points a step
-    fewest: int = 32  # shared points that make two photos a pair
+    fewest: int = 32  # two photos are a pair if they share at least this many points
     far_px: float = 10.0  # points closer than this are not negatives
     window: int = 240  # px, longest side used; larger photos are cropped around a shared point
     seed: int = 0
@@ -66,7 +64,7 @@ def train(make: Callable[[], Net], photos: Sequence[Tensor], tracks: Tracks, con
         make: builds the net, [B, 3, H, W] to unit features [B, C, h, w] on a grid of 4 px.
         photos: [H, W, 3] float32 in [0, 1], on the CPU.
         tracks: SfM observations; see `SceneConv.fit_scene`.
-        config: of the training.
+        config: settings of the training.
 
     Raises:
         AwError: no photos, tracks of other photos, or too few tracks.
@@ -138,7 +136,7 @@ class Pairs:
             )
 
     def draw(self, rng: np.random.Generator) -> tuple[int, int, np.ndarray, np.ndarray]:
-        """Two photos and the positions [n, 2] px of their shared points."""
+        """Draw two photos: their indices, and the positions [n, 2] px of their shared points in each."""
         i = int(rng.choice(self.usable))
         j = int(rng.choice(self.partners[i]))
         _, a, b = np.intersect1d(self.points[i], self.points[j], assume_unique=True, return_indices=True)
@@ -171,8 +169,8 @@ def sample(features: Tensor, xy: np.ndarray) -> Tensor:
     """Unit features [n, C] at positions [n, 2] px of a map [1, C, h, w] with cells of 4 px, bilinear."""
     size = 4.0 * np.array([features.shape[3], features.shape[2]])
     grid = torch.from_numpy((xy / size * 2.0 - 1.0).astype(np.float32))[None, None]
-    found = F.grid_sample(features, grid, mode="bilinear", padding_mode="border", align_corners=False)
-    return F.normalize(found[0, :, 0].T, dim=1, eps=1e-6)
+    sampled = F.grid_sample(features, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    return F.normalize(sampled[0, :, 0].T, dim=1, eps=1e-6)
 
 
 def imitated_render(image: Tensor, rng: np.random.Generator) -> Tensor:
@@ -220,7 +218,7 @@ def _blur(image: Tensor, sigma: float) -> Tensor:
 
 
 def _window(image: Tensor, xy: np.ndarray, most: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
-    """A crop of [3, H, W] around the first position, the positions in it, and which lie inside."""
+    """Crop [3, H, W] around the first position; also return the positions in it, and which lie inside."""
     extent = np.array([image.shape[2], image.shape[1]])
     size = np.minimum(extent, most)
     start = np.clip(np.floor(xy[0] - size / 2), 0, extent - size).astype(np.int64)
@@ -230,7 +228,7 @@ def _window(image: Tensor, xy: np.ndarray, most: int) -> tuple[Tensor, np.ndarra
 
 
 def _cycle(step: int, steps: int) -> float:
-    """Share of the highest rate: cosine rise over a tenth of the steps, then cosine decay to 0."""
+    """Return the share of the highest rate: a cosine rise over a tenth of the steps, then a decay to 0."""
     rise = max(0.1 * steps, 1.0)
     if step < rise:
         return 0.04 + 0.96 * 0.5 * (1.0 - math.cos(math.pi * step / rise))
@@ -289,7 +287,7 @@ class SceneConv:
             photos: training photos, [H, W, 3] in [0, 1].
             tracks: SfM observations in them: point [L] int, photo index [L] int, xy px [L, 2], where the
                 centre of the first pixel is (0.5, 0.5).
-            folder: of the cache (`vision.precompute`); None = always train.
+            folder: the cache (`vision.precompute`); None = always train.
 
         Raises:
             AwError: no photos, tracks of other photos, or too few tracks.
@@ -302,12 +300,12 @@ class SceneConv:
             return {name: tensor.numpy() for name, tensor in net.state_dict().items()}
 
         if folder is None:
-            found = compute()
+            trained = compute()
         else:
             key = cache_key("sceneconv", self.name, self.config, *arrays, *tracks)
-            found = cached(folder, key, dict.fromkeys(self._new_net().state_dict(), np.float32), compute)
+            trained = cached(folder, key, dict.fromkeys(self._new_net().state_dict(), np.float32), compute)
         device = photos[0].device
-        self._take({name: torch.from_numpy(array).to(device) for name, array in found.items()})
+        self._take({name: torch.from_numpy(array).to(device) for name, array in trained.items()})
         self.fit(photos)
 
     @torch.no_grad()
@@ -351,11 +349,11 @@ class SceneConv:
         net.load_state_dict(state)
         self.net = net.to(next(iter(state.values())).device).requires_grad_(False).eval()
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         weights = {} if self.net is None else dict(self.net.state_dict())
         return {**weights, "unit": self.unit}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         weights = {name: value for name, value in state.items() if name != "unit"}
         if weights:
             self._take(weights)

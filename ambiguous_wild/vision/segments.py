@@ -1,7 +1,7 @@
 """Segments of photos: graph segments in Lab, their groups by a network's features, Ward's clusters of a grid.
 
-Groups are a cheap stand-in for SAM that needs no hub: outlines from OpenCV's graph segmentation (Felzenszwalb
-and Huttenlocher 2004), what belongs together from the network.
+Groups are a cheap stand-in for SAM that needs no hub: OpenCV's graph segmentation (Felzenszwalb and
+Huttenlocher 2004) draws the outlines, and the network's features decide which segments belong together.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class SegmentConfig:
     sigma: float = 0.5  # px, smoothing before the graph is built
     k: float = 100.0  # initial scale, at 240x135
     min_size: int = 30  # px at 240x135; smaller segments are merged away
-    fewest: int = 70  # least wanted number of segments
-    most: int = 140  # most
+    fewest: int = 70  # wanted number of segments at least
+    most: int = 140  # wanted number at most
     tries: int = 3  # steps of the bisection on k; the closest result is kept
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ def segment(lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
 
 
 def _compact(labels: np.ndarray) -> np.ndarray:
-    """Labels 1..K without gaps."""
+    """Renumber labels to 1..K without gaps."""
     _, inverse = np.unique(labels, return_inverse=True)
     return (inverse.reshape(labels.shape) + 1).astype(np.int32)
 
@@ -133,18 +133,18 @@ def ward_clusters(grid: np.ndarray, count: int) -> np.ndarray:
         _, a, b = heapq.heappop(heap)
         if not (alive[a] and alive[b]):
             continue
-        made = len(means)
+        union = len(means)
         total = sizes[a] + sizes[b]
         means.append((means[a] * sizes[a] + means[b] * sizes[b]) / total)
         sizes.append(total)
         alive[a] = alive[b] = False
         alive.append(True)
-        parent.append(made)
-        parent[a] = parent[b] = made
+        parent.append(union)
+        parent[a] = parent[b] = union
         near.append({n for n in near[a] | near[b] if alive[n]})
-        for n in sorted(near[made]):
-            near[n].add(made)
-            heapq.heappush(heap, (cost(n, made), n, made))
+        for n in sorted(near[union]):
+            near[n].add(union)
+            heapq.heappush(heap, (cost(n, union), n, union))
         left -= 1
     roots = np.arange(len(parent))
     for i in range(len(parent) - 1, -1, -1):  # a parent's number is larger than its child's
@@ -154,11 +154,11 @@ def ward_clusters(grid: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class GroupConfig:
-    """How far segments are grouped."""
+    """When the grouping of segments stops."""
 
     alike: float = 0.5  # neighbours merge up to this quantile of the photo's distances between neighbours
-    fewest: int = 20  # groups that stay at least
-    segments: SegmentConfig = field(default_factory=SegmentConfig)  # that are grouped
+    fewest: int = 20  # at least this many groups stay
+    segments: SegmentConfig = field(default_factory=SegmentConfig)  # the segments that are grouped
 
     def __post_init__(self) -> None:
         check_limits(self, "grouped segments", alike=(0, 1), fewest=(1, np.inf))
@@ -224,7 +224,7 @@ def group(
 
 
 def neighbours(labels: np.ndarray) -> np.ndarray:  # [n, 2], the smaller label first, sorted
-    """Pairs of labels that share an edge of a pixel."""
+    """Return the pairs of labels that share an edge of a pixel."""
     across = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
     down = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
     pairs = np.concatenate([across, down])

@@ -20,12 +20,12 @@ BEHIND = 1.15  # a point deeper than this times the nearest static depth is behi
 PIXELS = 20_000  # most pixels of a map; results are enlarged to the photo's size
 _CELLS = 32  # cells along a side; within a cell, points far behind the nearest one are occluded
 _LEAST_POINTS = 8
-_FRAME_PIXELS = 1000  # of a map that counts the cameras that have a place in their frame
+_FRAME_PIXELS = 1000  # pixels of a map that says how many cameras have a place in their frame
 _MOST_POINTS = 4000  # a random subset; more points are slower and not better (see docs/metrics.md)
 
 
 def some_points(xyz: np.ndarray) -> np.ndarray:
-    """A fixed random subset of the points [M, 3], large enough for surfaces."""
+    """Return a fixed random subset of the points [M, 3], large enough for surfaces."""
     if len(xyz) <= _MOST_POINTS:
         return xyz
     return xyz[np.random.default_rng(0).permutation(len(xyz))[:_MOST_POINTS]]
@@ -34,7 +34,7 @@ def some_points(xyz: np.ndarray) -> np.ndarray:
 def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
     """Inverse depth 1/z of the static surface, [h, w] float32, from sparse points [M, 3]; NaN outside them.
 
-    The map covers the camera's frame with at most about 20 000 pixels. None: too few points in the frame.
+    The map covers the camera's frame with at most about 20 000 pixels. None if the frame has too few points.
     """
     h, w = map_size(camera)
     xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
@@ -55,12 +55,13 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
 def has_surface(camera: Camera, points: np.ndarray) -> np.ndarray | None:
     """Where `inverse_depth` finds a surface, [h, w] bool, from the sparse points [M, 3] around the frame.
 
-    `static_surfaces` chooses for the whole scene, which leaves a photo of a large scene few.
+    `static_surfaces` chooses its points from the whole scene, so that a photo of a large scene has few of
+    them.
     """
     xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     shape = map_size(camera)
-    found = inverse_depth(camera, some_points(points[_around(*in_map(camera, xyz, shape), shape)]))
-    return None if found is None else np.isfinite(found)
+    surface = inverse_depth(camera, some_points(points[_around(*in_map(camera, xyz, shape), shape)]))
+    return None if surface is None else np.isfinite(surface)
 
 
 def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarray | None]:
@@ -72,13 +73,13 @@ def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarr
 def seldom_seen(
     cameras: Sequence[Camera], surfaces: Sequence[np.ndarray | None], least: int
 ) -> list[np.ndarray | None]:
-    """Which places lie in the frame of fewer than `least` other cameras; occlusion is ignored.
+    """Find places that lie in the frame of fewer than `least` other cameras; occlusion is ignored.
 
     Outside the sparse points the nearest known depth is used, which is accurate enough for this.
 
     Args:
-        cameras: of one scene.
-        surfaces: their inverse depths [h, w], from `static_surfaces`.
+        cameras: the cameras of one scene.
+        surfaces: the cameras' inverse depths [h, w], from `static_surfaces`.
         least: number of cameras, limited to the number of other cameras.
 
     Returns:
@@ -101,24 +102,24 @@ def seldom_seen(
         missing = np.full(len(world), least)  # cameras still to find
         # nearest cameras first: most places are decided after a few
         for other in np.argsort(np.linalg.norm(centres - centres[view], axis=1), kind="stable"):
-            open_ = np.flatnonzero(missing > 0)
-            if not len(open_):
+            undecided = np.flatnonzero(missing > 0)
+            if not len(undecided):
                 break
             if other != view:
-                missing[open_[_in_frame(cameras[other], world[open_])]] -= 1
+                missing[undecided[_in_frame(cameras[other], world[undecided])]] -= 1
         maps.append((missing > 0).reshape(size[::-1]))
     return maps
 
 
 def _in_frame(camera: Camera, world: np.ndarray) -> np.ndarray:
-    """Which world points [N, 3] lie in the camera's frame, [N] bool."""
+    """Return which world points [N, 3] lie in the camera's frame, [N] bool."""
     local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     x, y = in_map(camera, local, (camera.height, camera.width))
     return inside(x, y, (camera.height, camera.width))
 
 
 def world_points(camera: Camera, inverse: np.ndarray) -> np.ndarray:
-    """World points [h, w, 3] of an inverse depth map."""
+    """Compute the world points [h, w, 3] of an inverse depth map."""
     h, w = inverse.shape
     u = (np.arange(w) + 0.5) * (camera.width / w)
     v = (np.arange(h) + 0.5) * (camera.height / h)
@@ -129,7 +130,7 @@ def world_points(camera: Camera, inverse: np.ndarray) -> np.ndarray:
 
 
 def in_map(camera: Camera, local: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows of camera points in a map of the frame; pixel centres are whole numbers."""
+    """Project camera points to columns and rows of a map of the frame; pixel centres are whole numbers."""
     z = np.where(local[..., 2] > 1e-9, local[..., 2], np.nan)
     x = (local[..., 0] / z * camera.fx + camera.cx) * (shape[1] / camera.width) - 0.5
     y = (local[..., 1] / z * camera.fy + camera.cy) * (shape[0] / camera.height) - 0.5
@@ -137,18 +138,18 @@ def in_map(camera: Camera, local: np.ndarray, shape: tuple[int, ...]) -> tuple[n
 
 
 def inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which positions from `in_map` lie inside the map, bool; NaN is outside."""
+    """Return which positions from `in_map` lie inside the map, bool; NaN is outside."""
     return (x >= -0.5) & (x < shape[1] - 0.5) & (y >= -0.5) & (y < shape[0] - 0.5)
 
 
 def _around(x: np.ndarray, y: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Which positions from `in_map` lie in the map or a little outside: those define its border's surface."""
+    """Return which positions lie in the map or a little outside: these shape the surface at its border."""
     h, w = shape
     return (x > -0.25 * w) & (x < 1.25 * w) & (y > -0.25 * h) & (y < 1.25 * h)
 
 
 def _in_front(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Which points no nearer surface occludes, [M] bool; x and y are shares of the frame."""
+    """Return which points no nearer surface occludes, [M] bool; x and y are shares of the frame."""
     column, row = ((np.floor(v * _CELLS).astype(np.intp) + _CELLS // 2) for v in (x, y))
     nearest = np.full((2 * _CELLS + 2, 2 * _CELLS + 2), np.inf)
     np.minimum.at(nearest, (row, column), z)

@@ -15,7 +15,7 @@ _SIDE = 64  # px of the picture that features are computed for
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found out about one of the weights."""
+    """The result of checking one of the weights."""
 
     name: str
     ok: bool
@@ -33,18 +33,18 @@ def verify(weight: Weight) -> Verdict:
             raise AwError(weights.missing(weight))
         advice = f"run: {weights.get_command(weight.name)}"
         if weight.kind == "file":
-            count, known = check_file(weight, place, advice), "sha256 as published"
+            count, hashes = check_file(weight, place, advice), "sha256 as published"
         else:
             recorded = check_folder(weight, place, advice)
-            count, known = _load(weight, place), "sha256 as downloaded"
-            known = known if recorded else "no record of their sha256"
-        return Verdict(weight.name, True, f"{count} tensors, {known}: {place}")
+            count, hashes = _load(weight, place), "sha256 as downloaded"
+            hashes = hashes if recorded else "no record of their sha256"
+        return Verdict(weight.name, True, f"{count} tensors, {hashes}: {place}")
     except AwError as error:
         return Verdict(weight.name, False, str(error))
 
 
 def _load(weight: Weight, folder: Path) -> int:
-    """Load the model; the number of its tensors."""
+    """Load the model and return the number of its tensors."""
     from ambiguous_wild.vision.pretrained import load, locate
 
     if weight.used_for == "features":
@@ -70,7 +70,7 @@ def _load(weight: Weight, folder: Path) -> int:
 
 
 def _try(features: object, name: str) -> None:
-    """Compute features of a picture; they must be finite and differ from place to place."""
+    """Compute features of a picture; raise if they are not finite, or equal everywhere."""
     import torch
 
     ramp = torch.linspace(0, 1, _SIDE)
@@ -78,8 +78,8 @@ def _try(features: object, name: str) -> None:
         [ramp.expand(_SIDE, -1), ramp[:, None].expand(-1, _SIDE), ramp.flip(0).expand(_SIDE, -1)]
     )
     with torch.no_grad():
-        found = features(image.permute(1, 2, 0))  # type: ignore[operator]
-    if not bool(torch.isfinite(found).all()) or not bool(found.std() > 0):
+        computed = features(image.permute(1, 2, 0))  # type: ignore[operator]
+    if not bool(torch.isfinite(computed).all()) or not bool(computed.std() > 0):
         raise AwError(
             f"the features of {name} are not finite or equal everywhere; "
             f"run: {weights.get_command(name, again=True)}"

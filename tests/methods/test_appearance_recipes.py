@@ -167,7 +167,7 @@ def test_colours_by_a_second_implementation(gsw):
 
     view = data.cameras[0]
     for i in range(5):
-        mean, places = visible.means[i].numpy(), visible.extra["gsw_places"][i].numpy()
+        mean, places = visible.means[i].numpy(), visible.attributes["gsw_places"][i].numpy()
         local = view.cam_from_world[:3, :3] @ mean + view.cam_from_world[:3, 3]
         u, v = view.fx * local[0] / local[2] + view.cx, view.fy * local[1] / local[2] + view.cy
         assert 0 < u < view.width and 0 < v < view.height
@@ -175,7 +175,7 @@ def test_colours_by_a_second_implementation(gsw):
         dynamic = np.concatenate([bilinear(maps[0], *places[:2]), bilinear(maps[1], *places[2:]), own])
         unit = (mean - effect.unit.centre.numpy()) / effect.unit.spread.numpy()
         code = [unit] + [f(2.0**k * unit) for k in range(10) for f in (np.sin, np.cos)]
-        intrinsic = visible.extra["gsw_intrinsic"][i].numpy()
+        intrinsic = visible.attributes["gsw_intrinsic"][i].numpy()
         hidden = net("encoder", np.concatenate([*code, dynamic, intrinsic]))
         hidden = net("decoder", np.concatenate([hidden, intrinsic]))
         towards = (mean - view.center) / np.linalg.norm(mean - view.center)
@@ -187,7 +187,7 @@ def test_colours_by_a_second_implementation(gsw):
 def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show_it(gsw):
     data, effect = gsw
     visible, shot = visible_of(effect), shot_of(data, view=None, photo=None)
-    leaf, box = effect._leaf(shot), visible.extra["gsw_box"]
+    leaf, box = effect._leaf(shot), visible.attributes["gsw_box"]
     found, total, count = effect._usual(shot, leaf, visible.means, box), torch.zeros(5, 16), torch.zeros(5, 1)
     for photo, view in zip(data.photos, data.cameras):
         pixels, z = projected(visible.means, view)
@@ -302,7 +302,7 @@ def test_colours_start_at_degree_zero(scene, tmp_path):
     shot = shot_of(trainer.data)
     leaf = {**effect._leaf(shot), "rest_bias0": torch.ones(45)}
     g = trainer.gaussians
-    visible = Visible(torch.zeros(len(g), 3), g.means, g.extra)
+    visible = Visible(torch.zeros(len(g), 3), g.means, g.attributes)
     early, late = (effect.forward(visible, leaf, replace(shot, nominal=n)) for n in (1000.0, 2000.0))
     # features are zero: every Gaussian has the photo's one colour, until directions count
     torch.testing.assert_close(early, early[:1].expand_as(early))

@@ -64,7 +64,7 @@ def test_the_dead_move_and_the_number_grows_by_a_share():
     new, events, adam = one_round(g)
     assert events == ["grow"]
     assert len(new) == 42  # 5 % of 40 more
-    tag = new.extra["tag"]
+    tag = new.attributes["tag"]
     assert bool((tag >= 5).all())  # nobody is a copy of a dead one
     for row in range(5):
         twin = int(tag[row])

@@ -304,7 +304,7 @@ def test_instances_that_are_not_tracked_are_judged_and_associated(scene, mode, i
     data = dataclasses.replace(scene.data, photos=[p[:, :120] for p in scene.data.photos])
     policy.setup(data)
     assert policy.inputs.counts == [instances] * VIEWS
-    found = policy.inputs.semantics.found
+    found = policy.inputs.semantics.association
     assert all(row[1] == 1 for row in found.of_instance)  # the tracked object is the first identity
     assert all(len(row) == instances + 1 for row in found.of_instance)
     if mode == "add":

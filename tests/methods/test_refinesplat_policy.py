@@ -332,7 +332,7 @@ def test_ids_of_a_whole_scene_are_identities(scene, tmp_path):
 
     policy = RefineSplatMask(FAST, instances=Follower())
     policy.setup(scene.data)
-    found = policy.inputs.semantics.found
+    found = policy.inputs.semantics.association
     assert found.count == 3
     assert found.photos_of.tolist() == [4, 3, 1]  # 7 in all photos, 30 in three, 31 in one
     assert [ids.tolist() for ids in found.of_instance] == [[0, 1, 3], [0, 1, 2], [0, 1, 2], [0, 1, 2]]

@@ -62,7 +62,7 @@ def test_uncertainty_is_blended_as_a_colour_without_a_background():
 def nexus(scene, tmp_path_factory):
     parts = parts_of("nexussplats", light_width="8", doubt_width="8", min_mask_start="1", mask_start="0")
     trainer = trainer_of(scene, tmp_path_factory.mktemp("nexus"), parts)
-    trainer.gaussians.extra["nexus_doubt"].copy_(random(len(trainer.gaussians), 32) - 0.5)
+    trainer.gaussians.attributes["nexus_doubt"].copy_(random(len(trainer.gaussians), 32) - 0.5)
     return trainer
 
 
@@ -70,7 +70,7 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
     policy, step = nexus.parts.mask, nexus.make_step(10, 0)
     keep, gradients = policy._weight(step, learn=True)
     distance = policy.distance(step)
-    codes, leaf = step.gaussians.extra["nexus_doubt"], policy.codes._leaf(step)
+    codes, leaf = step.gaussians.attributes["nexus_doubt"], policy.codes._leaf(step)
 
     def loss(doubts):
         drawn = step.draw(gaussians=as_colour(step.gaussians, slice(None), doubts), without=("nexussplats",))
@@ -78,7 +78,7 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
         sigma = 0.1 + raw.exp().log1p()
         return (distance / (2 * sigma**2)).mean() + 0.5 * sigma.log().mean()
 
-    found = gradients.extra["nexus_doubt"]
+    found = gradients.attributes["nexus_doubt"]
     row = int(found.abs().sum(dim=1).argmax())
     slope_of_doubt = slope(loss, policy.codes.doubts(codes, leaf), row, 0.05)
     with torch.enable_grad():
@@ -98,7 +98,7 @@ def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
     monkeypatch.setattr(policy, "config", replace(policy.config, through_geometry=True))
     _, whole = policy._weight(step, learn=True)
     assert all(getattr(whole, name).any() for name in GEOMETRY)
-    assert torch.equal(alone.extra["nexus_doubt"], whole.extra["nexus_doubt"])
+    assert torch.equal(alone.attributes["nexus_doubt"], whole.attributes["nexus_doubt"])
 
 
 def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
@@ -106,7 +106,7 @@ def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
     monkeypatch.setattr(policy.codes, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
     monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
     weight, gradients = policy._weight(step, learn=True)
-    pull = gradients.extra["nexus_doubt"][:, 0]
+    pull = gradients.attributes["nexus_doubt"][:, 0]
     assert weight.max() > 3.0 and pull.min() < 0.0 and pull.max() <= 1e-9  # a step against it raises sigma
 
 
@@ -116,7 +116,7 @@ def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch
     monkeypatch.setattr(policy, "config", replace(policy.config, boundary=True))
     wide, after = policy._weight(step, learn=True)
     torch.testing.assert_close(wide, plain / boundary(*plain.shape, plain))
-    assert torch.equal(before.extra["nexus_doubt"], after.extra["nexus_doubt"])
+    assert torch.equal(before.attributes["nexus_doubt"], after.attributes["nexus_doubt"])
 
 
 def test_boundaries_weigh_least_at_the_lower_middle():

@@ -62,9 +62,9 @@ def test_it_trains_and_carries_its_embeddings(tmp_path):
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
     config = TrainConfig(iterations=60, probes=0, max_gaussians=500)
     whole = Trainer(data, entry.build(entry.options()), config, folder=tmp_path / "run")
-    start = whole.gaussians.extra["wild_embedding"].clone()
+    start = whole.gaussians.attributes["wild_embedding"].clone()
     whole.train()
-    after = whole.gaussians.extra["wild_embedding"]
+    after = whole.gaussians.attributes["wild_embedding"]
     assert len(after) == len(whole.gaussians) and not torch.equal(after[: len(start)], start)
     assert whole.effects.facts()["wildgaussians"]["photo_std"] > 0
 

@@ -125,8 +125,9 @@ def test_what_weighed_the_broken_step_is_kept_whatever_the_sizes_after_it():
     sentinel.watch(3, 2, loss, broken, torch.full((4, 5), 0.3), torch.full((4, 5, 3), 0.4))
     found = sentinel.first_broken()
     assert found.iteration == 2 and torch.equal(found.keep, weights[0])
-    assert torch.equal(found.extra.image, weights[1].image) and found.extra.extra is None
-    assert torch.equal(found.extra.depth, weights[1].depth) and found.extra.alpha is None
+    own = found.method_cotangents
+    assert torch.equal(own.image, weights[1].image) and own.extra is None
+    assert torch.equal(own.depth, weights[1].depth) and own.alpha is None
     sentinel.reset()
     sentinel.watch(4, 0, loss, broken, None)
     assert sentinel.first_broken().keep is None

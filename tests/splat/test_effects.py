@@ -75,7 +75,7 @@ def test_an_effect_that_the_method_brings_is_applied_once():
 def test_two_effects_of_one_name_are_refused(scene, tmp_path):
     """A checkpoint holds effects by name: one would replace the other."""
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
-    with pytest.raises(AwError, match="effect exposure is there twice"):
+    with pytest.raises(AwError, match="effect exposure is listed twice"):
         Chain((AffineExposure(), AffineExposure()), data)
 
 

@@ -39,7 +39,7 @@ class Everything(Learnt):
         return {"code": GaussianAttribute(0.1 * torch.ones(len(gaussians), 3), rate=0.01)}
 
     def forward(self, visible: Visible, leaf: Mapping[str, torch.Tensor], shot: Shot):
-        inputs = torch.cat([visible.base, visible.extra["code"] * leaf["tint"]], dim=1)
+        inputs = torch.cat([visible.base, visible.attributes["code"] * leaf["tint"]], dim=1)
         return visible.base * (1 + leaf["tint"]) + 0.1 * mlp(inputs, leaf, "net") + 0.01 * visible.means
 
     def change(self, gaussians, leaf, shot):
@@ -57,8 +57,8 @@ def drawn_with(effect, g, values=None):
     for name, value in (values or {}).items():
         if name in effect._adam:
             effect._adam[name].values[1 if effect._leaves[name].per_photo else 0] = value
-        elif name in g.extra:
-            g = replace(g, extra={**g.extra, name: value})
+        elif name in g.attributes:
+            g = replace(g, attributes={**g.attributes, name: value})
         else:
             g = replace(g, **{name: value})
     shot = Shot(iteration=1, nominal=1e4, view=1, camera=camera())
@@ -87,7 +87,7 @@ def test_all_three_places_against_finite_differences(scene, tmp_path):
     rng = np.random.default_rng(3)
     shot = Shot(iteration=1, nominal=0, view=1, camera=camera())
     starts = {name: (effect._row(name, shot), own[name]) for name in own}
-    starts |= {"code": (g.extra["code"], found.extra["code"])}
+    starts |= {"code": (g.attributes["code"], found.attributes["code"])}
     starts |= {name: (getattr(g, name), getattr(found, name)) for name in ("means", "opacity_logits", "sh0")}
     for name, (start, gradient) in starts.items():
         direction = torch.tensor(rng.normal(size=tuple(start.shape)), dtype=torch.float32)

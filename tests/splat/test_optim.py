@@ -151,7 +151,7 @@ def test_copies_are_up_to_date_and_belong_to_no_optimiser(copied):
 
 def test_gaussians_that_were_left_behind_ask_for_no_more_updates():
     lazy, dense, a, _ = stepped()
-    shared = replace(lazy, extra={"more": torch.zeros(50)})
+    shared = replace(lazy, attributes={"more": torch.zeros(50)})
     stay = torch.arange(50) >= 10
     a.select(stay)
     assert equal(shared, dense)  # brought up to date before the rows went

@@ -43,7 +43,7 @@ def shade_of(g, weight):
     """Colours of harmonics, a feature of every Gaussian, its position, and a weight [3] of its own."""
 
     def shade(base, rows):
-        inputs = (base, g.extra["tint"][rows], g.means[rows], weight)
+        inputs = (base, g.attributes["tint"][rows], g.means[rows], weight)
         leaves = [t.detach().requires_grad_(True) for t in inputs]
         with torch.enable_grad():
             colours = leaves[0] * leaves[3] + leaves[1] + 0.3 * torch.sin(leaves[2]) - 0.4
@@ -75,7 +75,7 @@ class Tint(Effect):
 def tensors(gradients: Gradients) -> dict[str, torch.Tensor]:
     """Everything in it, by name."""
     found = {f.name: getattr(gradients, f.name) for f in fields(gradients)}
-    found |= dict(found.pop("extra"))
+    found |= dict(found.pop("attributes"))
     for name, own in found.pop("own").items():
         found |= {f"{name} {key}": value for key, value in own.items()}
     for name, other in found.pop("fields").items():
@@ -111,7 +111,9 @@ class Beside(Fields):
     def setup(self, data, static, rates):
         other = static.select(torch.arange(0, len(static), 3))
         return {
-            "other": FieldStart(replace(other, extra={}), lambda progress: of_parameters(rates(progress)))
+            "other": FieldStart(
+                replace(other, attributes={}), lambda progress: of_parameters(rates(progress))
+            )
         }
 
     def drawn(self, shot):
@@ -207,8 +209,8 @@ def test_shaded_colours_and_their_gradients_are_those_of_the_cpu(fake, degree):
     d = given(cotangents(cam.height, cam.width))
     found, expected = there.backward(d), cpu.backward(d)
     agree(found, expected)
-    assert found.own["tint"]["weight"].any() and found.extra["tint"].any()
-    assert (found.extra["tint"] == 0).any(dim=1)[there.visible].any()  # some were clamped at 0
+    assert found.own["tint"]["weight"].any() and found.attributes["tint"].any()
+    assert (found.attributes["tint"] == 0).any(dim=1)[there.visible].any()  # some were clamped at 0
 
 
 def test_a_net_sees_nothing_of_rows_that_gsplat_leaves_out(fake, monkeypatch):

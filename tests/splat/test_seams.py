@@ -96,9 +96,9 @@ def test_density_control_carries_what_a_gaussian_has(scene, tmp_path):
     while trainer.iteration < 45:
         trainer.step()
     after = trainer.gaussians
-    assert len(after) > len(start) and set(after.extra) == {"number", "weight"}
-    numbers = after.extra["number"][:, 0].long()
-    assert torch.equal(after.extra["number"][:, 0], after.extra["number"][:, 1])
+    assert len(after) > len(start) and set(after.attributes) == {"number", "weight"}
+    numbers = after.attributes["number"][:, 0].long()
+    assert torch.equal(after.attributes["number"][:, 0], after.attributes["number"][:, 1])
     assert len(numbers.unique()) > 10 and int(numbers.max()) < len(start)
     # a child lies near the point that its number names, nearer than near a random one
     near = (after.means - start.means[numbers]).norm(dim=1).median()
@@ -109,7 +109,7 @@ def test_density_control_carries_what_a_gaussian_has(scene, tmp_path):
         scene, tmp_path, parts=Parts(effects=(Number(),), density_config=EARLY), max_gaussians=900
     )
     assert again.resume()
-    assert torch.equal(again.gaussians.extra["number"], after.extra["number"])
+    assert torch.equal(again.gaussians.attributes["number"], after.attributes["number"])
 
 
 class Carried(Effect):
@@ -121,7 +121,7 @@ class Carried(Effect):
         return {"gain": GaussianAttribute(torch.zeros(len(gaussians), 1), rate=0.01)}
 
     def shade(self, gaussians, rows, base, shot):
-        gain = gaussians.extra["gain"][rows]
+        gain = gaussians.attributes["gain"][rows]
 
         def pull(d):
             return ShadeGradients((1 + gain) * d, {"gain": (d * base).sum(dim=1, keepdim=True)})
@@ -132,7 +132,7 @@ class Carried(Effect):
 def test_a_learnt_row_learns(scene, tmp_path):
     parts = Parts(effects=(Carried(),), density_config=EARLY)
     trainer = trained(scene, tmp_path, parts=parts, max_gaussians=700)
-    assert trainer.gaussians.extra["gain"].abs().max() > 0.01
+    assert trainer.gaussians.attributes["gain"].abs().max() > 0.01
 
 
 def test_rows_are_checked():
@@ -141,7 +141,7 @@ def test_rows_are_checked():
         g.carrying({"means": torch.zeros(4, 3)})
     with pytest.raises(AwError, match="must be \\[4"):
         g.carrying({"more": torch.zeros(3, 3)})
-    with pytest.raises(AwError, match="one side alone carries more"):
+    with pytest.raises(AwError, match=r"only one side has the attributes .*more"):
         g.carrying({"more": torch.zeros(4)}).cat(g)
 
 

@@ -82,7 +82,7 @@ ABLATIONS = (
             Variant("both", _NO_SUPPORT, "(d)"),
             Variant("support", ("density.decides=total",), "and Gaussians masked in every photo are removed"),
             *OTHER_DENSITY,
-            # without entropy terms their gradient is 0 and `decides` has no effect, so these rows have them
+            # these rows switch the entropy terms on, without which `decides` has no effect
             Variant(
                 "losses-total", (*_PRINTED_LOSSES, "density.decides=total"), "with L_id, L_cr: L decides"
             ),

@@ -1,10 +1,8 @@
-"""Entropy-aware density control (RefineSplat, section 4.2): what decides growth, where clones go, merging.
+"""Entropy-aware density control (RefineSplat, section 4.2): growth, places of clones, merging, support.
 
-Gaussians that no kept pixel supports.
-
-A Gaussian that is masked in every photo whose frame contains it is never corrected; a view between those
-photos shows it as a dark blotch in mid-air. Such Gaussians are removed. If one was right, the hole it leaves
-is no evidence for a mask (`least_alpha`) and is learnt again.
+Ours is support: a Gaussian that is masked in every photo whose frame contains it is never corrected, and a
+view between those photos shows it as a dark blotch in mid-air. Such Gaussians are removed. If one was right,
+the hole that it leaves is no evidence for a mask (`least_alpha`) and is learnt again.
 """
 
 from __future__ import annotations
@@ -12,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, merged
 from ambiguous_wild.splat.backend import backend_of
@@ -40,8 +38,8 @@ if TYPE_CHECKING:
 class SupportConfig:
     """When a Gaussian counts as unsupported."""
 
-    least_share: float = 0.1  # of the looks must reach a kept pixel; 0 = never removed (printed)
-    looks: int = 8  # with its centre in the frame, before it is judged
+    least_share: float = 0.1  # least share of looks that reach a kept pixel; 0 = never removed (printed)
+    looks: int = 8  # number of looks, with its centre in the frame, before it is judged
     every: int = 4  # iterations between looks
 
     def __post_init__(self) -> None:
@@ -50,7 +48,7 @@ class SupportConfig:
 
 
 class Support:
-    """Per Gaussian, how often its centre was in the frame and how often it reached a kept pixel."""
+    """Counts for each Gaussian how often its centre was in the frame, and how often on a kept pixel."""
 
     def __init__(self, config: SupportConfig) -> None:
         self.config = config
@@ -58,17 +56,17 @@ class Support:
         self.kept = torch.zeros(0)  # [N]
 
     def due(self, iteration: int) -> bool:
-        """Whether this iteration counts."""
+        """Whether this iteration is a look."""
         return self.config.least_share > 0 and iteration % self.config.every == 0
 
     def look(self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None) -> None:
         """Add one view.
 
         Args:
-            gaussians: N of them.
-            visible: [N] bool, passed every cull of the render.
-            camera: of the step.
-            keep: [H, W] float32 at the camera's size, 1 = static; None = all of it.
+            gaussians: the N Gaussians.
+            visible: [N] bool, rows that passed every cull of the render.
+            camera: camera of the step.
+            keep: [H, W] float32 at the camera's size, 1 = static; None = 1 everywhere.
         """
         backend = backend_of(gaussians.device)
         rows = backend.rows(lambda: visible)
@@ -76,7 +74,7 @@ class Support:
         inside, supported = _on_kept(means, camera, keep)
         if keep is not None:
             hidden = backend.rows(lambda: inside & ~supported)
-            # a large one is supported at its flanks too
+            # a large Gaussian may be supported at its flanks
             parts = means[hidden], gaussians.quats[rows][hidden], gaussians.log_scales[rows][hidden]
             supported[hidden] |= _flank_on_kept(*parts, camera, keep)
         inside &= visible[rows]
@@ -84,7 +82,7 @@ class Support:
         self.kept[rows] += (inside & supported).to(self.kept.dtype)
 
     def judge(self) -> Tensor:
-        """Gaussians to remove, [N] bool; counts of judged ones that stay are halved."""
+        """Return the Gaussians to remove, [N] bool; the counts of judged ones that stay are halved."""
         judged = self.looked >= self.config.looks
         drop = judged & (self.kept < self.config.least_share * self.looked)
         half = torch.where(judged, 0.5, 1.0)
@@ -101,10 +99,10 @@ class Support:
         self.looked = torch.cat([self.looked.to(device), pad])
         self.kept = torch.cat([self.kept.to(device), pad])
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {"looked": self.looked, "kept": self.kept}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self.looked, self.kept = state["looked"], state["kept"]
 
 
@@ -115,7 +113,7 @@ def _flank_on_kept(
     camera: Camera,
     keep: Tensor | None,
 ) -> Tensor:
-    """Gaussians whose flanks, one standard deviation along every axis, reach a kept pixel, [N] bool."""
+    """Return Gaussians whose flanks, a standard deviation along each axis, reach a kept pixel, [N] bool."""
     axes = rotation_matrices(quats) * log_scales.exp()[:, None, :]
     ends = means[:, None, :] + torch.cat([axes, -axes], dim=2).transpose(1, 2)
     _, flanks = _on_kept(ends.reshape(-1, 3), camera, keep)
@@ -123,7 +121,7 @@ def _flank_on_kept(
 
 
 def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Of world points [N, 3]: inside the frame, and on a kept pixel, [N] bool each."""
+    """Return which world points [N, 3] are inside the frame, and which on a kept pixel, [N] bool each."""
     pose = backend_of(points.device).pose(camera, points)
     local = points @ pose[:3, :3].T + pose[:3, 3]
     z = local[:, 2].clamp(min=1e-6)
@@ -141,18 +139,18 @@ Decides = Literal["total", "photometric", "entropy"]
 
 @dataclass(frozen=True)
 class EntropyDensityConfig(DensityConfig):
-    """RobustSplat's delayed growth: the static scene and the masks stand before anything is added."""
+    """Growth that starts late, as in RobustSplat, when the static scene and the masks are stable."""
 
     start: float = 10_000.0
     stop: float = 20_000.0
     resets: tuple[float, ...] = (15_000.0, 18_000.0)
     prune_scale: float = NO_SIZE_PRUNING  # as RobustSplat: sky and far walls are larger than any limit
-    decides: Decides = "total"  # the gradient that grows: of L, of L_GS alone, of the entropy terms alone
-    clone_shift: float = 0.5  # a clone lies this many of its standard deviations down the gradient; 0 = on it
+    decides: Decides = "total"  # gradient that decides growth: of L, of L_GS, or of the entropy terms
+    clone_shift: float = 0.5  # offset of a clone down the gradient, in its standard deviations
     merge_every: float = 1000.0  # nominal iterations between merges; 0 = never
     merge_grad: float = 5e-5  # tau_e: only Gaussians whose mean statistic is below it may merge
     merge: MergeConfig = field(default_factory=MergeConfig)
-    support: SupportConfig = field(default_factory=SupportConfig)  # what masks hide in every photo goes
+    support: SupportConfig = field(default_factory=SupportConfig)  # removal of always masked Gaussians
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,7 +160,7 @@ class EntropyDensityConfig(DensityConfig):
 
 
 class EntropyAwareDensity(DensityControl):
-    """Grows by the gradient of the whole loss, entropy terms included, and merges what overlaps."""
+    """Grows by the gradient of the whole loss, entropy terms included, and merges overlapping Gaussians."""
 
     config: EntropyDensityConfig
     # [N, 3] sum of -dL/dmean over views, world
@@ -176,18 +174,18 @@ class EntropyAwareDensity(DensityControl):
         if config.decides not in ("total", "photometric", "entropy"):
             raise unknown("gradient", config.decides, ("total", "photometric", "entropy"))
         super().__init__(config, extent, seed)
-        self.last_merge = 0.0  # nominal
-        self.merged = 0  # Gaussians that merging removed so far
+        self.last_merge = 0.0  # nominal iteration
+        self.merged = 0  # number of Gaussians that merging has removed
         self.support = Support(config.support)
         self.last_judged = 0  # iteration
 
     def statistic(self, gradients: Gradients) -> Tensor:
-        extra = gradients.screen_extra
-        if extra is None:  # a step without entropy terms
-            extra = torch.zeros_like(gradients.screen)
+        entropy = gradients.screen_extra
+        if entropy is None:  # a step without entropy terms
+            entropy = torch.zeros_like(gradients.screen)
         if self.config.decides == "total":
-            return gradients.screen + extra
-        return gradients.screen if self.config.decides == "photometric" else extra
+            return gradients.screen + entropy
+        return gradients.screen if self.config.decides == "photometric" else entropy
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
@@ -200,10 +198,10 @@ class EntropyAwareDensity(DensityControl):
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
-        """As 3DGS, and every `min_every` iterations to the end, what no kept pixel supports is removed."""
+        """Refine as 3DGS; every `min_every` iterations also remove Gaussians without support."""
         gaussians, events = super().refine(step, gaussians, optimiser)
         if events or not self._judgement_due(step):
-            return gaussians, events  # one change of rows an iteration
+            return gaussians, events  # rows change at most once in an iteration
         self.last_judged = step.iteration
         self._match(gaussians)
         drop = self.mutable_rows(self.support.judge(), gaussians)
@@ -223,7 +221,7 @@ class EntropyAwareDensity(DensityControl):
         return due and self.config.support.least_share > 0
 
     def clone_offset(self, gaussians: Gaussians, rows: Tensor) -> Tensor | None:
-        """Down the entropy-aware gradient (Fig. 3b), by a share of the standard deviation along it."""
+        """Shift clones down the entropy-aware gradient (Fig. 3b), by a share of their deviation along it."""
         if self.config.clone_shift <= 0 or not len(rows):
             return None
         direction = self.downhill[rows]
@@ -236,23 +234,23 @@ class EntropyAwareDensity(DensityControl):
         return self.config.clone_shift * sigma * direction
 
     def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
-        """Algorithm 1, every `merge_every` nominal iterations."""
+        """Merge by Algorithm 1, every `merge_every` nominal iterations."""
         config = self.config
         if config.merge_every <= 0 or step.nominal - self.last_merge < config.merge_every:
             return gaussians
         self.last_merge = step.nominal
-        # rows that no view has seen since the last round (fresh copies above all) have no statistic to judge
+        # rows that no view has seen since the last round, above all new copies, have no statistic
         score = self.grad_sum / self.seen.clamp(min=1)
         candidates = (self.seen > 0) & (score < config.merge_grad)
-        found = merged(gaussians, candidates, config.merge)
-        if found is None:
+        result = merged(gaussians, candidates, config.merge)
+        if result is None:
             return gaussians
-        rows, new = found
+        rows, new = result
         stay = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device)
         stay[rows] = False
         gaussians = self.keep_rows(gaussians, optimiser, stay)
         gaussians = gaussians.cat(new)
-        optimiser.append(len(new))  # their moments start at zero
+        optimiser.append(len(new))  # new Gaussians start with zero moments
         self._match(gaussians)
         self.merged += len(rows) - len(new)
         self.log.merge(len(rows) - len(new), new.means)
@@ -266,7 +264,7 @@ class EntropyAwareDensity(DensityControl):
         super()._match(gaussians)
         self.support.match(len(gaussians), gaussians.device)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return super().state_dict() | {
             "last_merge": self.last_merge,
             "merged": self.merged,
@@ -274,7 +272,7 @@ class EntropyAwareDensity(DensityControl):
             "last_judged": self.last_judged,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         super().load_state_dict(state)
         self.last_merge, self.merged = state["last_merge"], state["merged"]
         self.support.load_state_dict(state["support"])

@@ -1,4 +1,4 @@
-"""One photo compared with one render on features: the maps, and M_global of the paper (Eq. 6)."""
+"""Comparison of a photo with a render on features: the maps, and M_global of the paper (Eq. 6)."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 class Maps:
     """Maps of one photo compared with one render: on the feature grid [h, w], or on pixels [H, W]."""
 
-    statistic: Tensor  # what is judged, in its unit
-    distance: Tensor  # distance of photo and render, in units of the normal one
+    statistic: Tensor  # the judged statistic, in its unit
+    distance: Tensor  # distance of photo and render, in units of the normal distance
     entropy: Tensor | None = None  # H of the render, in [0, 1]
     cosine: Tensor | None = None  # cos(phi(I), phi(render))
 
 
 @torch.no_grad()
 def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float, config: MaskConfig) -> Maps:
-    """Entropy, statistic and distance maps in float64 of features [h, w, C] of photo and render.
+    """Compute entropy, statistic and distance maps in float64 of features [h, w, C] of photo and render.
 
     Without psi (no instance has an identity) the entropy is 0 and the distance alone is judged.
     """
@@ -58,9 +58,9 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
 
 
 def silence(maps: Maps, unseen: Tensor) -> Maps:
-    """The maps without evidence where the model is not learnt yet (bool [h, w]).
+    """Remove the evidence where the model is not learnt yet (bool [h, w]).
 
-    A sky without points differs from every photo until it is learnt; if masked, it would never be learnt.
+    A sky without points differs from every photo until it is learnt, and if masked it never would be.
     """
     cosine = None if maps.cosine is None else maps.cosine.masked_fill(unseen, 1.0)
     return Maps(
@@ -69,13 +69,13 @@ def silence(maps: Maps, unseen: Tensor) -> Maps:
 
 
 def scaled_by(structure: Tensor, evidence: Tensor, weight: float) -> Tensor:
-    """Pixel evidence [H, W], raised where identities disagree and lowered where they agree.
+    """Raise pixel evidence [H, W] where identities disagree, and lower it where they agree.
 
-    The factor 1 + weight (2 g - 1), g = evidence / (evidence + 4), lies in [1 - weight, 1 + weight]: the unit
-    of the scene stays what it is.
+    The factor 1 + weight (2 g - 1), g = evidence / (evidence + 4), lies in [1 - weight, 1 + weight], so that
+    the unit of the scene stays the same.
 
     Args:
-        structure: from `PixelEvidence`.
+        structure: evidence of `PixelEvidence`.
         evidence: [h, w] on the feature grid, in units; instances are suspect from 4 on.
         weight: 0 = identities are ignored.
     """
@@ -85,24 +85,24 @@ def scaled_by(structure: Tensor, evidence: Tensor, weight: float) -> Tensor:
 
 
 def uncertainty(cosine: Tensor) -> Tensor:
-    """U = 2 / (cos + 1) in [1, 2000] (Eq. 6); a cosine that is not finite counts as 1 (no evidence)."""
+    """Return U = 2 / (cos + 1) in [1, 2000] (Eq. 6); a cosine that is not finite counts as 1."""
     cosine = cosine.nan_to_num(nan=1.0, posinf=1.0, neginf=1.0)
     return 2.0 / (cosine.clamp(_COS_FLOOR, 1.0) + 1.0)
 
 
 def calibrated_cosine(distance: Tensor, normal: float) -> Tensor:
-    """A cosine that uses its whole range: 1 at distance 0, 0 at `normal` units, -1 at twice that and beyond.
+    """Return a cosine over the whole range: 1 at distance 0, 0 at `normal` units, -1 from twice that on.
 
-    Cosines of hand-made features stay above 0.99, where U is 1 everywhere; so the distance is taken in units
-    of what blur and noise alone make.
+    Cosines of hand-made features stay above 0.99, where U is 1 everywhere. So the distance is in units of
+    what blur and noise alone cause.
     """
     return 1.0 - (distance / normal).clamp(0.0, 2.0)
 
 
 def ratio(u: Tensor, h: Tensor, eps_share: float = 0.1, perturbation: float | None = None) -> Tensor:
-    """R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no H = 0 dominates var(R).
+    """Return R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no H = 0 dominates var(R).
 
-    With a `perturbation` (printed; its value is not) R = U / (H + perturbation).
+    With a `perturbation` (printed, but without its value) R = U / (H + perturbation).
     """
     if perturbation is not None:
         return u / (h + perturbation)
@@ -112,15 +112,15 @@ def ratio(u: Tensor, h: Tensor, eps_share: float = 0.1, perturbation: float | No
 def global_mask(
     r: Tensor, size: int = 3, spread: Spread = "var", gate: float = 0.0, hard: float = 0.0
 ) -> Tensor:
-    """M_global [h, w] bool: box-filtered R above its threshold (Eq. 6).
+    """Return M_global [h, w] bool: box-filtered R above its threshold (Eq. 6).
 
     Args:
         r: [h, w] float64.
         size: side of the box filter in cells.
-        spread: threshold mean + var (printed), mean + std, robust: median + gate * 1.4826 MAD, or hard: the
+        spread: threshold is mean + var (printed), mean + std, median + gate * 1.4826 MAD (`robust`), or the
             fixed value `hard` (T_hard, with which the paper compares T_glb).
-        gate: for every spread, also the least number of robust deviations above the median; 0 = none.
-        hard: of spread `hard`.
+        gate: for every spread also the least number of robust deviations above the median; 0 = none.
+        hard: threshold of spread `hard`.
     """
     if spread not in get_args(Spread):
         raise unknown("spread", spread, get_args(Spread))
@@ -137,7 +137,7 @@ def global_mask(
 
 
 def global_of(maps: Maps, config: MaskConfig) -> Tensor:
-    """M_global on the feature grid, [h, w] bool: Eq. 6's ratio of U and H above its threshold."""
+    """Return M_global on the feature grid, [h, w] bool: the ratio of U and H above its threshold (Eq. 6)."""
     assert maps.cosine is not None and maps.entropy is not None  # `compare` fills them
     cosine = maps.cosine
     if config.cosine == "calibrated":

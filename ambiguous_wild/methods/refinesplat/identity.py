@@ -1,9 +1,8 @@
-"""psi: the frozen identity classifier on features, trained once on the photos (RefineSplat, stage 0).
+"""Identities: instances of different photos that are one object, and psi, their frozen classifier (stage 0).
 
-One label space for the scene: instances of different photos that are the same object.
-
-The paper takes ids from a video tracker. Unordered photos have none, so instances are associated by the
-SfM tracks that run through them, then by their mean features. Two instances of one photo never merge.
+psi is trained once on the features of the photos. The paper takes ids from a video tracker. Unordered photos
+have none, so instances are associated by the SfM tracks that run through them, then by their mean features.
+Two instances of one photo never merge.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -33,7 +31,7 @@ class Identities:
 
     of_instance: list[np.ndarray]  # per photo [K + 1] int32, index = label; entry 0 is 0
     count: int  # P
-    photos_of: np.ndarray  # [P] int32, in how many photos each identity was found
+    photos_of: np.ndarray  # [P] int32, number of photos with each identity
 
 
 def associate(
@@ -53,9 +51,9 @@ def associate(
         means: mean feature of labels 1..K.
         tracks: (point [L] int64, photo [L] int32, xy [L, 2] px), observations of SfM points.
         min_shared: tracks that must run through both instances.
-        min_share: and their share of the tracks of the instance that has fewer.
-        min_similarity: cosine of mean features for those that tracks do not join.
-        most: identities at most; those in the most photos are kept, then the largest.
+        min_share: least share of these in the tracks of the instance that has fewer.
+        min_similarity: least cosine of mean features for instances that tracks do not join.
+        most: largest number of identities; those in most photos are kept, then large ones.
     """
     counts = [max(int(label.max(initial=0)), 0) for label in labels]
     offsets = np.r_[0, np.cumsum(counts)]
@@ -73,12 +71,12 @@ def associate(
         [np.bincount(np.maximum(x, 0).ravel(), minlength=k + 1)[1:] for x, k in zip(labels, counts)]
     )
     roots = np.array([groups.root(i) for i in range(total)])
-    found, inverse = np.unique(roots, return_inverse=True)
-    photos = np.bincount(inverse, weights=areas > 0).astype(np.int64)  # one instance a photo at most
+    unique, inverse = np.unique(roots, return_inverse=True)
+    photos = np.bincount(inverse, weights=areas > 0).astype(np.int64)  # at most one instance in a photo
     size = np.bincount(inverse, weights=areas)
-    order = np.lexsort((np.arange(len(found)), -size, -photos))[:most]
+    order = np.lexsort((np.arange(len(unique)), -size, -photos))[:most]
     order = order[photos[order] > 0]
-    rank = np.zeros(len(found), dtype=np.int32)
+    rank = np.zeros(len(unique), dtype=np.int32)
     rank[order] = np.arange(1, len(order) + 1)
     flat = np.where(areas > 0, rank[inverse], 0).astype(np.int32)
     per_photo = [np.r_[np.int32(0), flat[a:b]].astype(np.int32) for a, b in itertools.pairwise(offsets)]
@@ -92,16 +90,16 @@ def _track_pairs(
     min_shared: int,
     min_share: float,
 ) -> np.ndarray:
-    """Pairs of instances [n, 2] joined by tracks, the surest first."""
+    """Return pairs of instances [n, 2] that tracks join, the surest first."""
     point, photo, xy = tracks
     instance = np.full(len(point), -1, dtype=np.int64)
     for index, label in enumerate(labels):
-        here = np.flatnonzero(photo == index)
-        column = np.floor(xy[here, 0]).astype(np.int64)
-        row = np.floor(xy[here, 1]).astype(np.int64)
+        in_photo = np.flatnonzero(photo == index)
+        column = np.floor(xy[in_photo, 0]).astype(np.int64)
+        row = np.floor(xy[in_photo, 1]).astype(np.int64)
         inside = (column >= 0) & (row >= 0) & (column < label.shape[1]) & (row < label.shape[0])
-        found = label[row[inside], column[inside]]
-        instance[here[inside]] = np.where(found > 0, offsets[index] + found - 1, -1)
+        at_track = label[row[inside], column[inside]]
+        instance[in_photo[inside]] = np.where(at_track > 0, offsets[index] + at_track - 1, -1)
     used = instance >= 0
     if not used.any():
         return np.zeros((0, 2), dtype=np.int64)
@@ -167,7 +165,7 @@ class PsiConfig:
     hidden: int = 64  # units of the one hidden layer
     steps: int = 1000  # Adam steps
     batch: int = 1024  # cells a step
-    rate: float = 3e-3  # Adam's, decayed to a tenth by a cosine
+    rate: float = 3e-3  # learning rate, decayed to a tenth by a cosine
 
     def __post_init__(self) -> None:
         whole = (1, math.inf)
@@ -175,7 +173,7 @@ class PsiConfig:
 
 
 class Psi(nn.Module):
-    """Identity logits [..., P] of features [..., C]: standardise, Linear, ReLU, Linear."""
+    """Maps features [..., C] to identity logits [..., P]: standardise, Linear, ReLU, Linear."""
 
     mean: Tensor
     std: Tensor
@@ -206,11 +204,11 @@ def train_psi(
 ) -> Psi:
     """Train psi and freeze it.
 
-    sigmoid: binary cross-entropy one against rest, cells without identity are against all. softmax:
-    cross-entropy over cells with an identity.
+    With `sigmoid` the loss is binary cross-entropy, one against rest, and cells without identity count as
+    rest for all. With `softmax` it is cross-entropy over cells with an identity.
 
     Raises:
-        AwError: no cell has an identity, or count is outside 1..255.
+        AwError: no cell has an identity, or the count is not from 1 to 255.
     """
     if not 1 <= count <= 255 or not bool((identities > 0).any()):
         raise AwError(f"psi needs 1 to 255 identities with cells, got {count}: check the instance masks")
@@ -247,13 +245,13 @@ def _loss(logits: Tensor, identities: Tensor, variant: Variant) -> Tensor:
     return (F.softplus(logits).sum(1) - target * (identities > 0)).mean()
 
 
-def psi_arrays(psi: Psi) -> dict[str, Any]:
-    """psi's tensors as numpy arrays, for the cache."""
+def psi_arrays(psi: Psi) -> dict[str, np.ndarray]:
+    """Return psi's tensors as numpy arrays, for the cache."""
     return {name: tensor.cpu().numpy() for name, tensor in psi.state_dict().items()}
 
 
-def psi_from_arrays(arrays: dict[str, Any]) -> Psi:
-    """psi from `psi_arrays`, frozen."""
+def psi_from_arrays(arrays: dict[str, np.ndarray]) -> Psi:
+    """Restore psi from `psi_arrays`, frozen."""
     hidden, channels = arrays["first.weight"].shape
     psi = Psi(channels, hidden, arrays["last.weight"].shape[0])
     psi.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})

@@ -1,4 +1,4 @@
-"""Stage 0: what is frozen before the first step - features, instances, identities, psi - cached on disk."""
+"""Stage 0: the frozen inputs - features, instances, identities, psi - which are cached on disk."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Semantics:
     phi: list[Tensor]  # [h, w, C] of each photo
     identities: list[Tensor]  # [h, w] int64, 0 = none: L_id's target
     grid: list[Tensor]  # [h, w] int64, instance labels on the feature grid
-    psi: Psi | None  # None where no instance has an identity
-    found: Identities
+    psi: Psi | None  # None if no instance has an identity
+    association: Identities
 
 
 class FrozenInputs:
@@ -45,22 +45,22 @@ class FrozenInputs:
     ) -> None:
         self._data, self.features, self._config = data, features, config
         names = [view.name for view in data.scene.train]
-        found = instance_labels(instances, data.photos, names, data.cache_dir)
-        self._scene_wide = found.scene_wide
-        own = found.labels
-        # ids of a whole scene have gaps in a photo: labels there count from 1, the ids are kept beside them
-        compact = [_compact(label) for label in own] if found.scene_wide else []
+        segmented = instance_labels(instances, data.photos, names, data.cache_dir)
+        self._scene_wide = segmented.scene_wide
+        own = segmented.labels
+        # ids of a whole scene have gaps in a photo: labels count from 1, and `_ids` holds their ids
+        compact = [_compact(label) for label in own] if segmented.scene_wide else []
         self.labels = [label for label, _ in compact] if compact else own  # [H, W] int32, 0 = none
         self._ids = [ids for _, ids in compact]
-        # [H, W] int32 of each photo: instances that a tracker left out, with labels above those that it has
+        # [H, W] int32 of each photo: instances that a tracker left out, with labels above its own
         self._added: list[np.ndarray] = []
-        single: Instances | None = getattr(instances, "single", None)  # of a tracker: of one photo
-        if found.scene_wide and single is not None and config.untracked == "add":
+        single: Instances | None = getattr(instances, "single", None)  # a tracker's back end for one photo
+        if segmented.scene_wide and single is not None and config.untracked == "add":
             everything = instance_labels(single, data.photos, names, data.cache_dir).labels
             self._added = [untracked(label, all_found) for label, all_found in zip(self.labels, everything)]
             self.labels = [np.maximum(label, added) for label, added in zip(self.labels, self._added)]
         self.counts = [max(int(label.max(initial=0)), 0) for label in self.labels]  # K of each photo
-        # [K] bool of each photo: instances that are static by structure from motion
+        # [K] bool of each photo: instances that structure from motion shows to be static
         self.static = static_instances(
             self.labels, self.counts, train_tracks(data.scene), config.mask.static_tracks
         )
@@ -78,19 +78,19 @@ class FrozenInputs:
         else:
             self.features.fit(data.photos)
         phi = photo_features(self.features, data.photos, data.cache_dir)
-        found = self._identities(phi)
+        association = self._identities(phi)
         grid, identities = [], []
         for index, label in enumerate(self.labels):
             cells = grid_labels(np.maximum(label, 0), *phi[index].shape[:2])
             grid.append(torch.from_numpy(cells.astype(np.int64)).to(data.device))
-            ids = found.of_instance[index][cells].astype(np.int64)
+            ids = association.of_instance[index][cells].astype(np.int64)
             identities.append(torch.from_numpy(ids).to(data.device))
-        with torch.enable_grad():  # the first use may be inside of no_grad
-            psi = _psi(data, phi, identities, found.count, config)
-        return Semantics(phi, identities, grid, psi, found)
+        with torch.enable_grad():  # the first access may be inside of no_grad
+            psi = _psi(data, phi, identities, association.count, config)
+        return Semantics(phi, identities, grid, psi, association)
 
     def _identities(self, phi: list[Tensor]) -> Identities:
-        """The back end's own ids, else by SfM tracks, then by features."""
+        """Take identities from the back end's ids, else associate by SfM tracks, then by features."""
         config = self._config
         if not self._scene_wide:
             return self._associated(phi, self.labels, config.identities)
@@ -114,16 +114,16 @@ class FrozenInputs:
 
 
 def grid_labels(labels: np.ndarray, h: int, w: int) -> np.ndarray:
-    """Labels [h, w] at the centre of each cell of labels [H, W]."""
+    """Return the labels [h, w] at the centres of cells of labels [H, W]."""
     rows = ((np.arange(h) * 2 + 1) * labels.shape[0]) // (2 * h)
     columns = ((np.arange(w) * 2 + 1) * labels.shape[1]) // (2 * w)
     return labels[rows[:, None], columns[None, :]]
 
 
 def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Labels [H, W] int32 of the instances of a photo that a tracker leaves out, above its own labels.
+    """Return labels [H, W] int32, above the tracker's own, of the instances that a tracker leaves out.
 
-    Trackers follow so many of the largest instances and drop the others (`SamVideoConfig.most`).
+    Trackers follow only the largest instances (`SamVideoConfig.most`).
 
     Args:
         tracked: [H, W] int32, the tracker's labels of the photo, 1..K; 0 = none.
@@ -136,17 +136,17 @@ def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
     return np.where(tracked > 0, 0, both).astype(np.int32)
 
 
-def _with_unknown(known: Identities, counts: list[int]) -> Identities:
-    """The identities with 0, none, for further labels up to `counts`."""
+def _with_unknown(identities: Identities, counts: list[int]) -> Identities:
+    """Extend identities by 0 (none) for further labels up to `counts`."""
     rows = [
         np.r_[row, np.zeros(count + 1 - len(row), np.int32)].astype(np.int32)
-        for row, count in zip(known.of_instance, counts)
+        for row, count in zip(identities.of_instance, counts)
     ]
-    return Identities(rows, known.count, known.photos_of)
+    return Identities(rows, identities.count, identities.photos_of)
 
 
 def _joined(first: Identities, second: Identities, counts: list[int]) -> Identities:
-    """Identities of tracked labels, then those of the labels that were added above them."""
+    """Join the identities of tracked labels and those of labels that were added above them."""
     rows = []
     for a, b in zip(_with_unknown(first, counts).of_instance, _with_unknown(second, counts).of_instance):
         rows.append(np.where(b > 0, b + first.count, a).astype(np.int32))
@@ -156,24 +156,24 @@ def _joined(first: Identities, second: Identities, counts: list[int]) -> Identit
 
 
 def _compact(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels counted from 1 [H, W], and the id each had [K]."""
+    """Return labels counted from 1 [H, W], and the id of each [K]."""
     ids = np.unique(label[label > 0])
     return np.where(label > 0, np.searchsorted(ids, label) + 1, 0).astype(np.int32), ids
 
 
 def most_seen(ids: list[np.ndarray], most: int) -> Identities:
-    """Identities 1..P from scene-wide ids of each photo's instances; those in the most photos are kept."""
+    """Return identities 1..P from scene-wide ids of each photo; those in most photos are kept."""
     every = np.concatenate([np.zeros(0, np.int64), *ids])
-    found, photos = np.unique(every, return_counts=True)
-    order = np.lexsort((found, -photos))[:most]
-    rank = np.zeros(len(found), dtype=np.int32)
+    unique, photos = np.unique(every, return_counts=True)
+    order = np.lexsort((unique, -photos))[:most]
+    rank = np.zeros(len(unique), dtype=np.int32)
     rank[order] = np.arange(1, len(order) + 1)
-    of_instance = [np.r_[np.int32(0), rank[np.searchsorted(found, i)]].astype(np.int32) for i in ids]
+    of_instance = [np.r_[np.int32(0), rank[np.searchsorted(unique, i)]].astype(np.int32) for i in ids]
     return Identities(of_instance, len(order), photos[order].astype(np.int32))
 
 
 def train_tracks(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """SfM observations in train views: (point [L], train index [L], xy px [L, 2])."""
+    """Return SfM observations in train views: point [L], train index [L], xy in px [L, 2]."""
     points = scene.points
     index_of = {view.name: i for i, view in enumerate(scene.train)}
     # the last entry is for view -1: observations in views outside the split
@@ -192,39 +192,39 @@ def static_instances(
     shortest: int = 3,
     fewest: int = 100,
 ) -> list[np.ndarray]:
-    """Per photo [K] bool: instances with so many triangulated tracks that they cannot have moved.
+    """Return for each photo the instances [K] bool with too many triangulated tracks to have moved.
 
-    A track of three or more views that triangulates was at the same place each time. On 30 simulated photos,
-    0.6 % of all observations fell on distractors that cover 19 % of the area; instances above a third of the
-    photo's mean density hold 87 % of the static area and 8 % of the distractors'.
+    A track of three or more views that triangulates was at the same place in all of them. On 30 simulated
+    photos, 0.6 % of all observations fell on distractors that cover 19 % of the area; instances above a third
+    of the photo's mean density hold 87 % of the static area and 8 % of the distractors'.
 
     Args:
         labels: [H, W] int32 of each photo.
         counts: K of each photo.
         tracks: from `train_tracks`.
-        share: of the photo's mean density from which an instance is static; 0 = none is.
-        shortest: views a track has at least.
+        share: share of the photo's mean density from which an instance is static; 0 = none is.
+        shortest: least number of views of a track.
         fewest: observations that a photo needs to be judged.
     """
     point, photo, xy = tracks
     long = np.bincount(point)[point] >= shortest if len(point) else np.zeros(0, bool)
     result = []
     for index, (label, count) in enumerate(zip(labels, counts)):
-        here = np.floor(xy[(photo == index) & long]).astype(np.int64)
-        inside = (here >= 0).all(1) & (here[:, 0] < label.shape[1]) & (here[:, 1] < label.shape[0])
-        here = here[inside]
-        if share <= 0 or len(here) < fewest:
+        at = np.floor(xy[(photo == index) & long]).astype(np.int64)
+        inside = (at >= 0).all(1) & (at[:, 0] < label.shape[1]) & (at[:, 1] < label.shape[0])
+        at = at[inside]
+        if share <= 0 or len(at) < fewest:
             result.append(np.zeros(count, dtype=bool))
             continue
-        found = np.clip(label[here[:, 1], here[:, 0]], 0, None)
-        runs = np.bincount(found, minlength=count + 1)[1:]
+        hit = np.clip(label[at[:, 1], at[:, 0]], 0, None)
+        runs = np.bincount(hit, minlength=count + 1)[1:]
         areas = np.bincount(np.clip(label, 0, None).ravel(), minlength=count + 1)[1:]
-        result.append(runs > share * len(here) / label.size * np.maximum(areas, 1))
+        result.append(runs > share * len(at) / label.size * np.maximum(areas, 1))
     return result
 
 
 def _mean_features(phi: list[Tensor], labels: list[np.ndarray], counts: list[int]) -> list[np.ndarray]:
-    """Mean standardised feature [K, C] of every instance, unit length; zeros for labels without pixels."""
+    """Return the mean standardised feature [K, C] of every instance, unit length; zeros without pixels."""
     stack = torch.cat([p.reshape(-1, p.shape[2]) for p in phi]).double()
     mean, std = stack.mean(0), stack.std(0, correction=0).clamp(min=1e-6)
     result = []

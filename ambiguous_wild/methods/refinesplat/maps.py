@@ -1,4 +1,4 @@
-"""A stack of maps of all views, sampled at positions in other views' frames."""
+"""A stack of maps of all views, to sample at positions in the frames of other views."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from torch import Tensor
 
 
 def sized(array: np.ndarray, device: torch.device | str) -> Tensor:
-    """An array as float32 on the device."""
+    """Copy an array to the device as float32."""
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
 
 
 class MapStack:
-    """[views, channels, h, w] float32; smaller maps lie at the upper left, the rest is padding."""
+    """Maps [views, channels, h, w] float32; smaller maps lie at the upper left, the rest is padding."""
 
     def __init__(self, maps: Sequence[np.ndarray], device: torch.device | str, pad: str = "zero") -> None:
         """
         Args:
-            maps: [channels, h, w] of each view.
-            device: of the stack.
-            pad: padding of a smaller map: `zero`, or its own `edge`.
+            maps: map of each view, [channels, h, w].
+            device: device of the stack.
+            pad: padding of smaller maps: `zero`, or their own `edge`.
         """
         self.edge = pad == "edge"
         self.sizes = [m.shape[1:] for m in maps]
@@ -41,7 +41,7 @@ class MapStack:
                     self.put(view, sized(plane, device), channel)
 
     def put(self, view: int, plane: Tensor, channel: int = 0) -> None:
-        """One channel [h, w] of a view's map."""
+        """Set one channel [h, w] of a view's map."""
         h, w = self.sizes[view]
         target = self.stack[view, channel]
         if self.edge and target.shape != plane.shape:
@@ -51,29 +51,29 @@ class MapStack:
         target[:h, :w].copy_(plane)
 
     def of(self, view: int) -> Tensor:
-        """A view's own map [channels, h, w], without padding."""
+        """Return a view's map [channels, h, w] without padding."""
         h, w = self.sizes[view]
         return self.stack[view, :, :h, :w]
 
     def select(self, views: Tensor) -> Selected:
-        """Copies of n views' maps, views [n] int64."""
+        """Copy the maps of views [n] int64."""
         shares = None if self.shares is None else self.shares.index_select(0, views)
         return Selected(self.stack.index_select(0, views), shares)
 
 
 @dataclass(frozen=True)
 class Selected:
-    """Maps of n views, read at places [n, rows, columns, 2], x and y from -1 to 1 (`grid_sample`)."""
+    """Maps of n views, to read at places [n, rows, columns, 2], x and y from -1 to 1 (`grid_sample`)."""
 
     maps: Tensor  # [n, channels, h, w]
     shares: Tensor | None  # [n, 1, 1, 2], see `MapStack`
 
     def nearest(self, places: Tensor) -> Tensor:
-        """The nearest pixel [n, channels, rows, columns] of each view; 0 outside (cv2.INTER_NEAREST)."""
+        """Read the nearest pixels [n, channels, rows, columns]; 0 outside (cv2.INTER_NEAREST)."""
         return self._read(places, "nearest", "zeros")
 
     def linear(self, places: Tensor) -> Tensor:
-        """Bilinear between pixels, the border replicated (cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)."""
+        """Read bilinearly, with the border replicated (cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)."""
         return self._read(places, "bilinear", "border")
 
     def _read(self, places: Tensor, mode: str, outside: str) -> Tensor:

@@ -1,15 +1,15 @@
 """Local, global and final masks of one photo (RefineSplat, Eqs. 3-7), and the masks of all photos.
 
-Masks are bool, True = transient; keep = 1 - M_final. Statistics are in float64. What `renew` calls reads no
-value on the host, so its shapes and the number of its launches depend on sizes alone; set-up, checkpoints and
-pictures do read.
+Masks are bool, True = transient; keep = 1 - M_final. Statistics are in float64. Code that `renew` calls reads
+no value on the host, so shapes and the number of launches depend on sizes alone; set-up, checkpoints and
+pictures read values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_by
 from ambiguous_wild.methods.refinesplat.first_look import FirstLook
@@ -29,30 +30,30 @@ from ambiguous_wild.splat.backend import backend_of
 if TYPE_CHECKING:
     from ambiguous_wild.splat.step import Step
 
-PRICE = 3.0  # of a masked pixel, robust deviations above the median distance, if `disagree` is off
+PRICE = 3.0  # price of a masked pixel in robust deviations above the median distance, if `disagree` is off
 
 
 @dataclass(frozen=True)
 class Masks:
-    """Masks of one photo, and what they were made from."""
+    """Masks of one photo, and the statistics that they were made from."""
 
     local: Tensor  # [H, W] bool
     global_: Tensor  # [H, W] bool
     keep: Tensor  # [H, W] float32, 1 - M_final, bounded
-    means: Tensor  # [K] float64, mean statistic of every instance, NaN where there is none
+    means: Tensor  # [K] float64, mean statistic of every instance, NaN for missing ones
     distances: Tensor  # [K] float64, mean distance in units
     cut: Cut
-    pool: Pool  # what the threshold cut
+    pool: Pool  # instances that the threshold divided
 
     def shares(self) -> Tensor:
-        """Masked in all, locally and globally, and T_ent: [4] float64."""
+        """Return the shares masked in all, locally and globally, and T_ent, [4] float64."""
         masked = torch.stack([self.keep < 0.5, self.local, self.global_]).double().mean((1, 2))
         return torch.cat([masked, self.cut.threshold[None]])
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Statistics of the instances of one photo when its mask was last made, for pictures."""
+    """Statistics of a photo's instances when its mask was last made, for pictures."""
 
     values: np.ndarray  # [K] float64, mean statistic (Hbar)
     distances: np.ndarray  # [K] float64, mean distance in units
@@ -60,7 +61,7 @@ class Judged:
 
 
 def enlarge(grid: Tensor, height: int, width: int) -> Tensor:
-    """A map [h, w] on the image's pixels [H, W], each taking its cell's value."""
+    """Enlarge a map [h, w] to pixels [H, W], each with the value of its cell."""
     if grid.shape == (height, width):
         return grid
     rows = (torch.arange(height, device=grid.device) * grid.shape[0]) // height
@@ -69,12 +70,12 @@ def enlarge(grid: Tensor, height: int, width: int) -> Tensor:
 
 
 def instance_means(grid: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Hbar of labels 1..count (Eq. 3), each cell weighted by the instance's area in it.
+    """Return Hbar of labels 1..count (Eq. 3), each cell weighted by the instance's area in it.
 
     Args:
         grid: [h, w], e.g. the entropy map.
         labels: [H, W] int32, instances from 1; 0 and negative labels are none.
-        count: of the labels.
+        count: number of labels.
 
     Returns:
         means [count] float64 (NaN for a label without pixels), areas [count] px, float64.
@@ -87,13 +88,13 @@ def instance_means(grid: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Te
 
 
 class Labels:
-    """The instances of every photo; K is the largest number of them."""
+    """The instances of every photo; K is the largest number in a photo."""
 
     def __init__(
         self,
         labels: Sequence[np.ndarray],  # [H, W] int32, 0 = none
-        static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
-        unseen: Sequence[np.ndarray | None],  # [H, W] bool, not to be judged
+        static: Sequence[np.ndarray],  # [K of the photo] bool, must not be masked
+        unseen: Sequence[np.ndarray | None],  # [H, W] bool, must not be judged
         device: torch.device | str,
     ) -> None:
         self.shapes = [label.shape for label in labels]
@@ -111,9 +112,9 @@ class Labels:
             flags[view, :count] = static[view]
         areas[areas == 0] = np.nan
         self.known = np.isfinite(areas)  # [views, K]
-        self.areas = torch.from_numpy(areas).to(device)  # [views, K] float64 px, NaN where there is none
+        self.areas = torch.from_numpy(areas).to(device)  # [views, K] float64 px, NaN for missing ones
         self.static_flags = torch.from_numpy(flags).to(device)  # [views, K]
-        # view: [H, W] bool, its static instances by structure from motion; only views that have some
+        # view -> its instances that structure from motion shows to be static, [H, W] bool; absent if none
         self.static = {
             view: torch.from_numpy(np.r_[False, flags[view]][label]).to(device)
             for view, label in enumerate(clean)
@@ -121,13 +122,13 @@ class Labels:
         }
 
     def means(self, view: int, pixels: Tensor) -> Tensor:
-        """Mean of a map [H, W] over every instance, [K] float64; NaN where there is none."""
+        """Return the mean of a map [H, W] over every instance, [K] float64; NaN for missing ones."""
         backend = backend_of(pixels.device)
         sums = backend.label_sums(self.of_pixel[view], self.most + 1, pixels.double().flatten())
         return sums[1:] / self.areas[view]
 
     def on_pixels(self, view: int, values: Tensor, shape: tuple[int, ...]) -> Tensor:
-        """A value of each instance [K] at its pixels [H, W]; 0 where there is none."""
+        """Return the value of each instance [K] at its pixels [H, W]; 0 outside of instances."""
         return F.pad(values, (1, 0)).index_select(0, self.of_pixel[view]).view(shape)
 
 
@@ -141,18 +142,18 @@ def make_masks(
     ceiling: Tensor | None = None,
     seen: Tensor | None = None,
 ) -> Masks:
-    """M_local, M_global and the keep map of one photo (Eqs. 3-7).
+    """Make M_local, M_global and the keep map of one photo (Eqs. 3-7).
 
     Args:
-        view: of the photo.
-        maps: of the photo, on its pixels or on the feature grid.
+        view: index of the photo.
+        maps: maps of the photo, on its pixels or on the feature grid.
         labels: instances of all photos.
-        others: [views, K] float64 each: means and distances of all photos' instances when they were last
-            judged (`scope` = scene), NaN = none; the row of this view is not read.
+        others: means and distances of all photos' instances when they were last judged (`scope` = scene),
+            [views, K] float64 each, NaN = none; the row of this view is not read.
         w2: weight of T_ent's lower subset.
         config: thresholds.
-        ceiling: 0-d, upper limit of the threshold; None: no limit.
-        seen: [H, W] bool, pixels that may be masked; None: all.
+        ceiling: upper limit of the threshold, 0-d; None: no limit.
+        seen: pixels that may be masked, [H, W] bool; None: all.
     """
     height, width = shape = labels.shapes[view]
     pixels = enlarge(maps.statistic, height, width)
@@ -183,14 +184,15 @@ def make_masks(
         inside = labels.of_pixel[view].view(shape) > 0
         judging = torch.where(inside, (pixels * of_instance).sqrt_(), pixels)
         regions.append(judging)
-    # the default asks for two sets of regions at once
-    found = list(hysteresis(torch.stack([r.double() for r in regions]), weak, strong)) if regions else []
+    # the default settings compute two sets of regions at once
+    connected = list(hysteresis(torch.stack([r.double() for r in regions]), weak, strong)) if regions else []
     global_ = nothing
     if config.use_global:
-        global_ = found[0] if config.statistic == "structure" else enlarge(global_of(maps, config), *shape)
-    final = found[-1] if fused else local | global_
+        by_pixel = config.statistic == "structure"
+        global_ = connected[0] if by_pixel else enlarge(global_of(maps, config), *shape)
+    final = connected[-1] if fused else local | global_
     if static is not None:
-        # the union contains none of them
+        # no mask contains static instances
         final, global_ = final & ~static, global_ & ~static
     if seen is not None:
         final = final & seen
@@ -207,7 +209,7 @@ def _with_row(rows: Tensor, view: int, row: Tensor) -> Tensor:
 
 
 class MaskStore:
-    """Masks of all views, with what they are computed from beside the render, and the learnt w2."""
+    """Masks of all views, their inputs beside the render, and the learnt w2."""
 
     def __init__(
         self,
@@ -228,16 +230,16 @@ class MaskStore:
         # features are judged on their whole grid
         unseen = self.pixels.unseen_on_host if structure else [None] * len(photos)
         self.labels = Labels(labels, static, unseen, device)
-        # view: [H, W], factor of its evidence; absent if that is 1
+        # view -> factor of its evidence, [H, W]; absent if it is 1
         self.factors = {
             view: sized(look.factor(photos[view].shape[:2]), device)
             for view, look in looks.items()
             if look.weight != 1
         }
         self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
-        self.keeps: dict[int, Tensor] = {}  # view: [H, W] float32; of the views that have a mask
+        self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] float32, if it has one
         wide, views = torch.float64, len(photos)
-        # [views, K] mean of every instance when its mask was last made, NaN where there is none
+        # [views, K] mean of every instance when its mask was last made, NaN for missing ones
         self.means = torch.full((views, self.labels.most), torch.nan, dtype=wide, device=device)
         self.distances = self.means if structure else self.means.clone()
         self._shares = torch.zeros((views, 4), dtype=wide, device=device)
@@ -247,36 +249,36 @@ class MaskStore:
     def renew(self, step: Step) -> None:
         """Compute the mask of the step's view, store its evidence for other views, and learn w2."""
         view, config = step.view, self.config.mask
-        _, made = self.examine(step, remember=True)
-        self.means[view].copy_(made.means)
-        self.distances[view].copy_(made.distances)
+        _, masks = self.examine(step, remember=True)
+        self.means[view].copy_(masks.means)
+        self.distances[view].copy_(masks.distances)
         if config.w2 is None:
-            self._learn(view, made)
-        self.keeps[view] = made.keep
-        self._shares[view].copy_(made.shares())
+            self._learn(view, masks)
+        self.keeps[view] = masks.keep
+        self._shares[view].copy_(masks.shares())
 
-    def _learn(self, view: int, made: Masks) -> None:
-        """w2 from all instances; the price of a masked pixel is a robustly high distance."""
+    def _learn(self, view: int, masks: Masks) -> None:
+        """Learn w2 from all instances; the price of a masked pixel is a robustly high distance."""
         config = self.config.mask
         rows = slice(None) if config.scope == "scene" else slice(view, view + 1)
-        # instances of photos without a mask yet have no value: they teach nothing
+        # instances of photos without a mask have no value yet
         judged = ~self.means[rows].isnan()
         areas = self.labels.areas[rows].masked_fill(~judged, torch.nan).reshape(-1)
         distances = self.distances[rows].reshape(-1)
         middle, spread = (
-            (made.pool.middle, made.pool.spread) if self.distances is self.means else spread_of(distances)
+            (masks.pool.middle, masks.pool.spread) if self.distances is self.means else spread_of(distances)
         )
         price = middle + (max(config.disagree, 1.0) if config.disagree > 0 else PRICE) * spread
         costs = distances / price.clamp(min=1e-12)
-        self.theta = learnt(self.theta, made.pool, costs, areas, made.cut.floor, config.threshold)
+        self.theta = learnt(self.theta, masks.pool, costs, areas, masks.cut.floor, config.threshold)
 
     @torch.no_grad()
     def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
-        """The maps of the step's view and its masks at the photo's own size.
+        """Return the maps of the step's view and its masks at the photo's own size.
 
         Args:
-            step: of any train view.
-            remember: whether the evidence is stored for other views; else nothing is kept.
+            step: step of any train view.
+            remember: whether to store the evidence for other views.
         """
         view, rendered = step.view, step.rendered
         mask = self.limited.get(view, self.config.mask)
@@ -303,18 +305,18 @@ class MaskStore:
 
     @property
     def judged(self) -> dict[int, Judged]:
-        """View: its instances when its mask was last made."""
+        """Each view's instances when its mask was last made."""
         means, distances, areas = (t.cpu().numpy() for t in (self.means, self.distances, self.labels.areas))
         known = self.labels.known
         return {v: Judged(*(rows[v, known[v]] for rows in (means, distances, areas))) for v in self.keeps}
 
     @property
     def shares(self) -> dict[int, tuple[float, float, float, float]]:
-        """View: masked in all, locally, globally, and T_ent."""
+        """Each view's shares masked in all, locally and globally, and T_ent."""
         rows = self._shares.tolist()
         return {view: tuple(rows[view]) for view in self.keeps}
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {
             "keeps": {str(view): (keep > 0.5).to(torch.uint8) for view, keep in self.keeps.items()},
             # stored as text: T_ent is inf if no instance is an outlier, and JSON has no inf
@@ -327,14 +329,14 @@ class MaskStore:
             "pixels": self.pixels.state_dict(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         device = self.theta.device
         shares = np.zeros(self._shares.shape)
         for view, row in state["shares"].items():
             shares[int(view)] = [float(x) for x in row]
         rows = np.full((2, *self.means.shape), np.nan)
-        for view, found in state["judged"].items():
-            rows[:, int(view), self.labels.known[int(view)]] = found[:2].cpu().numpy()
+        for view, statistics in state["judged"].items():
+            rows[:, int(view), self.labels.known[int(view)]] = statistics[:2].cpu().numpy()
         self.keeps = {int(v): keep.float().to(device) for v, keep in state["keeps"].items()}
         self._shares = torch.from_numpy(shares).to(device)
         same = self.distances is self.means

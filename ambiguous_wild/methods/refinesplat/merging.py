@@ -26,19 +26,19 @@ from ambiguous_wild.splat.density import rotation_matrices
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 
 Overlap = Literal["normalised", "literal"]
-EIGEN_FLOOR = 1e-14  # of the largest eigenvalue: condition numbers up to needles of 1e7 to 1
-_PAIRS = 2**20  # of which overlaps are computed at a time
+EIGEN_FLOOR = 1e-14  # least eigenvalue, as a share of the largest: needles up to 1e7 to 1
+_PAIRS = 2**20  # pairs whose overlaps are computed at a time
 
 
 @dataclass(frozen=True)
 class MergeConfig:
     """When two Gaussians merge. Colour and overlap are the paper's."""
 
-    neighbours: int = 8  # k of Algorithm 1; not stated
+    neighbours: int = 8  # k of Algorithm 1, which the paper does not state
     colour: float = 0.15  # largest L2 distance of the constant colours in [0, 1] RGB; 0.10 to 0.20 tried
     overlap: float = 0.3  # smallest overlap
     form: Overlap = "normalised"  # `literal` is the printed density
-    most: int = 2  # members of a cluster, the most overlapping pairs first; 0 = whole connected components
+    most: int = 2  # largest cluster, the most overlapping pairs first; 0 = whole connected components
 
     def __post_init__(self) -> None:
         positive = (0, math.inf)
@@ -52,15 +52,15 @@ class MergeConfig:
 
 @torch.no_grad()
 def merged(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> tuple[Tensor, Gaussians] | None:
-    """What merges, the most overlapping pairs first.
+    """Merge Gaussians, the most overlapping pairs first.
 
     Args:
-        gaussians: N of them.
+        gaussians: the N Gaussians.
         candidates: [N] bool, rows that may merge (accumulated gradient below tau_e).
         config: thresholds.
 
     Returns:
-        Rows [n] that merge and the Gaussians that they become, or None where nothing merges.
+        Rows [n] that merge and the Gaussians that replace them; None if nothing merges.
     """
     pairs = merge_pairs(gaussians, candidates, config)
     if config.most == 2:
@@ -75,7 +75,7 @@ def merged(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> tup
 
 
 def merge_pairs(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> Tensor:
-    """Pairs of rows [n, 2] int64 to merge, the most overlapping first; arguments as `merged`."""
+    """Return pairs of rows [n, 2] int64 to merge, the most overlapping first; arguments as of `merged`."""
     rows = torch.nonzero(candidates).squeeze(1)
     if len(rows) < 2:
         return rows.new_zeros((0, 2))
@@ -84,7 +84,7 @@ def merge_pairs(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -
     near = backend_of(rows.device).neighbours(chosen.means, min(config.neighbours + 1, len(rows)))
     i = torch.arange(len(rows), device=rows.device)[:, None].expand_as(near)
     keys = torch.minimum(i, near) * len(rows) + torch.maximum(i, near)
-    keys = torch.unique(keys[i != near])  # as one number a pair: rows take forty times as long to sort
+    keys = torch.unique(keys[i != near])  # one number for each pair: rows take forty times as long to sort
     pairs = torch.stack([keys // len(rows), keys % len(rows)], 1)
     colours = chosen.sh0.double() * SH_C0 + 0.5
     alike = torch.linalg.vector_norm(colours[pairs[:, 0]] - colours[pairs[:, 1]], dim=1) < config.colour
@@ -97,19 +97,19 @@ def merge_pairs(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -
 
 
 def covariances(gaussians: Gaussians) -> Tensor:
-    """[N, 3, 3] float64, R diag(exp(log_scales))^2 R^T."""
+    """Return R diag(exp(log_scales))^2 R^T, [N, 3, 3] float64."""
     half = rotation_matrices(gaussians.quats.double()) * gaussians.log_scales.double().exp()[:, None, :]
     return half @ half.mT
 
 
 def overlap_of_rows(gaussians: Gaussians, pairs: Tensor, form: Overlap) -> Tensor:
-    """`overlap` of rows [n, 2], [n] float64."""
+    """Return `overlap` of pairs of rows [n, 2], [n] float64."""
     a, b = (gaussians.select(pairs[:, side]) for side in range(2))
     return overlap(a.means.double() - b.means.double(), covariances(a), covariances(b), form)
 
 
 def overlap(delta: Tensor, cov_i: Tensor, cov_j: Tensor, form: Overlap = "normalised") -> Tensor:
-    """Overlap ratio of pairs (Eq. 11), [n] float64.
+    """Return the overlap ratio of pairs (Eq. 11), [n] float64.
 
     normalised: exp(-d^T (Si + Sj)^-1 d / 2) (|2 Si| |2 Sj|)^(1/4) / |Si + Sj|^(1/2), in [0, 1], 1 for
     identical Gaussians and the same at every scale of the scene (Bhattacharyya's form with Si + Sj).
@@ -141,7 +141,7 @@ def overlap(delta: Tensor, cov_i: Tensor, cov_j: Tensor, form: Overlap = "normal
 
 
 def _factors(normed: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """L (1,0), (2,0), (2,1) and the last two pivots, floored, of L D L^T; the diagonal [n, 3, 3] is 1."""
+    """Return L (1,0), (2,0), (2,1) and the last two pivots, floored, of L D L^T; the diagonal is 1."""
     l10, l20 = normed[:, 1, 0], normed[:, 2, 0]
     second = (1.0 - l10 * l10).clamp(min=EIGEN_FLOOR)
     l21 = (normed[:, 2, 1] - l20 * l10) / second
@@ -150,14 +150,14 @@ def _factors(normed: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tenso
 
 
 def matching(count: int, pairs: Tensor) -> Tensor:
-    """[n] bool: the pairs that are taken if each is tried in turn and a row is taken once.
+    """Choose pairs greedily in this order, each row at most once, [n] bool.
 
-    A pair that is the first of both its rows is taken whatever comes later; so all of these are taken at
-    once, and the rows that are left are asked again.
+    A pair that is the first of both its rows is always chosen. So all of these are chosen at once, and then
+    again among the rows that are left.
 
     Args:
-        count: rows.
-        pairs: [n, 2] in the order they are tried.
+        count: number of rows.
+        pairs: [n, 2] in the order in which they are tried.
     """
     place = torch.arange(len(pairs), device=pairs.device)
     taken = torch.zeros(len(pairs), dtype=torch.bool, device=pairs.device)
@@ -175,21 +175,21 @@ def matching(count: int, pairs: Tensor) -> Tensor:
 
 
 def clusters(count: int, pairs: Tensor, most: int = 0) -> Tensor:
-    """Cluster of every row [count] int64: rows joined by pairs share a number; on the host.
+    """Return the cluster of every row [count] int64; rows that pairs join share a number. Runs on the host.
 
     Without a limit a chain of pairs becomes one cluster, and a plain wall, whose neighbours all overlap,
     one Gaussian; with `most`, a pair whose cluster would exceed it is skipped.
 
     Args:
-        count: rows.
-        pairs: [n, 2], in the order they are tried.
-        most: members of a cluster at most; 0 = no limit (union-find over all pairs).
+        count: number of rows.
+        pairs: [n, 2], in the order in which they are tried.
+        most: largest cluster; 0 = no limit (union-find over all pairs).
     """
     if most <= 0:
         i, j = pairs.T.cpu().numpy()
         graph = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
-        found = connected_components(graph, directed=False)[1].astype(np.int64)
-        return torch.from_numpy(found).to(pairs.device)
+        labels = connected_components(graph, directed=False)[1].astype(np.int64)
+        return torch.from_numpy(labels).to(pairs.device)
     parent = list(range(count))
     size = [1] * count
 
@@ -208,11 +208,11 @@ def clusters(count: int, pairs: Tensor, most: int = 0) -> Tensor:
 
 
 def merge_members(members: Gaussians, cluster: Tensor) -> Gaussians:
-    """One Gaussian a cluster with the first two moments of the opacity-weighted mixture (Eq. 12).
+    """Replace each cluster by a Gaussian with the moments of the opacity-weighted mixture (Eq. 12).
 
     Args:
         members: the rows that merge.
-        cluster: [len(members)] int64, any numbers; the result is in their order.
+        cluster: [len(members)] int64, any numbers; the result is in the order of these numbers.
 
     Returns:
         Gaussians, float32: mu*, c* and SH weighted by opacity, alpha* the mean opacity, Sigma* the mixture's.
@@ -241,12 +241,12 @@ def merge_members(members: Gaussians, cluster: Tensor) -> Gaussians:
         opacity_logits=(mean_alpha.log() - (-mean_alpha).log1p()).float(),
         sh0=mixed(members.sh0).float(),
         sh_rest=mixed(members.sh_rest).float(),
-        extra={name: mixed(values).float() for name, values in members.extra.items()},
+        attributes={name: mixed(values).float() for name, values in members.attributes.items()},
     )
 
 
 def scale_rotation(cov: Tensor) -> tuple[Tensor, Tensor]:
-    """log_scales [n, 3] and quats [n, 4] (w, x, y, z) of covariances [n, 3, 3], rotation right-handed."""
+    """Return log_scales [n, 3] and quats [n, 4] (w, x, y, z) of covariances [n, 3, 3]."""
     values, vectors = torch.linalg.eigh(cov)
     values = torch.maximum(values, values[:, 2:].clamp(min=1e-300) * EIGEN_FLOOR)
     flip = torch.where(torch.linalg.det(vectors) < 0, -1.0, 1.0).to(vectors)
@@ -255,7 +255,7 @@ def scale_rotation(cov: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _quaternions(r: Tensor) -> Tensor:
-    """[n, 4] (w, x, y, z) of rotations [n, 3, 3], by the largest of the four components (Shepperd)."""
+    """Return quaternions [n, 4] (w, x, y, z) of rotations [n, 3, 3], by the largest component (Shepperd)."""
     xx, yy, zz = r.diagonal(dim1=1, dim2=2).unbind(1)
     four = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], 1)
     x, y, z = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]

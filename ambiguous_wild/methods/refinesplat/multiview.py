@@ -6,18 +6,18 @@ through the render's depth. Without the discount, masked pixels are never learnt
 courtyard, seeds 21 (distractors) and 37 (none), 3000 iterations: 30.2 dB and 33.3 dB without, 32.4 and 36.5
 with it; plain 3DGS 27.2 and 36.4, exact masks 32.6 and 36.4.
 
-Their evidence is used only where their photos show the same colour as this one: with a crowd in front of the
-scene every view has evidence everywhere, and would discount distractors of the others.
+Other views' evidence is used only where their photos show the same colour as this one: with a crowd in front
+of the scene every view has evidence everywhere, and would discount distractors of the others.
 
 A surface that is not learnt yet has a wrong depth. So where fewer than `known_by` views see the render's
 surface, the sparse points' surface is used. Where fewer than `seen_by` other views see either, as at the rim
 of a capture or on a lawn without sparse points, evidence does not count: the model has not learnt the
-surface, and no other photo would teach it. Sceaux with cut-outs, nine photos, 800 iterations: 16.1 dB
+surface, and no other photo would correct it. Sceaux with cut-outs, nine photos, 800 iterations: 16.1 dB
 without, 18.9 with it.
 
-All neighbours of a view are looked up at once. A map covers the whole frame of its camera. A position is
-given in shares of the frame, from -1 to 1, and is the same in maps of any size. A view without stored
-evidence has depths of 0, so it matches no surface.
+All neighbours of a view are looked up at once. A map covers the whole frame of its camera. A position is in
+shares of the frame, from -1 to 1, and is the same in maps of any size. A view without stored evidence has
+depths of 0, so it matches no surface.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ from ambiguous_wild.splat.backend import backend_of
 
 SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
-_SHRINK = 2  # maps are kept at half the photo's size
+_SHRINK = 2  # maps are stored at half the photo's size
 
 
 @dataclass(frozen=True)
 class MultiViewConfig:
     """Which views are compared, and the weight of their evidence."""
 
-    strength: float = 1.5  # of the discount; 0 = no other view is used
+    strength: float = 1.5  # strength of the discount; 0 = no other view is used
     views: int = 8  # nearest train views used
-    quantile: float = 0.5  # of their evidence: low = a few views that explain the surface are enough
+    quantile: float = 0.5  # quantile of their evidence; if low, a few views without evidence are enough
     depth: float = 0.15  # relative difference of depth up to which two views see the same surface
-    free: float = 2.0  # units of evidence in other views that are normal and discount nothing
+    free: float = 2.0  # normal evidence in other views, in units, which discounts nothing
     agree: float = 0.06  # difference of colour in [0, 1] up to which two photos show the same; 0 = not tested
     agreeing: float = 0.35  # share of the views used that must show the same colour for full weight
-    # with fewer seeing views the colours are not tested, and the sparse points' surface is looked up too
+    # if fewer views see the surface, colours are not tested, and that of the sparse points is looked up too
     known_by: int = 3
-    sparse: bool = True  # where fewer see the render's surface, look up that of the sparse points
-    # other views (all with stored evidence, if fewer) that must see a surface; else its evidence does not
-    # count, and where as many do not even have the place in their frame, nothing is masked
+    sparse: bool = True  # whether the sparse points' surface is looked up there
+    # number of other views (at most those with stored evidence) that must see a surface, or its evidence does
+    # not count; where fewer have the place in their frame at all, nothing is masked
     seen_by: int = 2
 
     def __post_init__(self) -> None:
@@ -74,8 +74,8 @@ class MultiViewEvidence:
     """Evidence of other views about the surfaces of one view, maps [h, w] float32."""
 
     evidence: Tensor  # at the quantile of the config; NaN where no other view sees the surface
-    weight: Tensor  # in [0, 1]: how far their photos agree with this one
-    taught: Tensor  # in [0, 1]: views that see the surface, 1 = `seen_by` or more
+    weight: Tensor  # in [0, 1]: how well their photos agree with this one
+    taught: Tensor  # in [0, 1]: share of `seen_by` views that see the surface
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,14 @@ class _Query:
     """The constants of one view's queries to its n neighbours."""
 
     neighbours: Tensor  # [n] int64
-    right: Tensor  # [n, 3, 1, 1] a step along its own x axis, y axis and z axis in the others' frames
-    down: Tensor
-    ahead: Tensor
+    right: Tensor  # [n, 3, 1, 1] a step along the view's x axis, in the neighbours' frames
+    down: Tensor  # along its y axis
+    ahead: Tensor  # along its z axis
     origin: Tensor  # [n, 3, 1]
-    x: Tensor  # [w] of its rays at depth 1
+    x: Tensor  # [w] coordinates of its rays at depth 1
     y: Tensor  # [h, 1]
-    sparse_depth: Tensor | None  # [h, w] of the sparse points' surface, NaN where there is none
-    shrink: tuple[Tensor, Tensor]  # of its evidence, [h, H] and [W, w], see `blur_and_shrink`
+    sparse_depth: Tensor | None  # [h, w], depth of the sparse points' surface, NaN if none
+    shrink: tuple[Tensor, Tensor]  # matrices that shrink its evidence, [h, H], [W, w], see `blur_and_shrink`
 
 
 @dataclass(frozen=True)
@@ -100,14 +100,14 @@ class _Points:
     rays: Tensor  # [n, 3, P] at depth 1
     origin: Tensor  # [n, 3, 1]
     colours: Tensor  # [3, P] in the view's photo, 0 to 255
-    stored: Selected  # of the neighbours: evidence, and colours from 0 to 255
+    stored: Selected  # evidence of the neighbours, and their colours from 0 to 255
     depth: Selected
     surface: Selected  # depth of the sparse points
 
 
 @dataclass(frozen=True)
 class _Answers:
-    """What n views say about P points of another view, [n, P] each."""
+    """The evidence of n views about P points of another view, [n, P] each."""
 
     evidence: Tensor  # float32, NaN where a view sees another surface or none
     same: Tensor  # bool, where it sees the surface
@@ -139,12 +139,12 @@ class OtherViews:
         ]
         self.stored = MapStack(stored, device, pad="edge")
         self.depth = MapStack([np.zeros((1, *size), np.float32) for size in self.sizes], device)
-        # 0 until the view has stored evidence, as its depth
+        # copied to `surface` once the view has stored evidence, like its depth
         self.known_surfaces = [None if s is None else sized(_depths(s), device) for s in sparse]
         blank = np.zeros((1, 1), np.float32)
         self.surface = MapStack([np.zeros_like(blank if s is None else s)[None] for s in sparse], device)
         self.stored_views: set[int] = set()  # views with stored evidence
-        # once a size: they take as much memory as the maps
+        # made once for each size, because they take as much memory as the maps
         shrinks = {
             (camera.height, camera.width): (
                 sized(blur_and_shrink(camera.height, h, SPREAD), device),
@@ -168,9 +168,9 @@ class OtherViews:
         """Store the evidence of a view.
 
         Args:
-            view: which.
-            evidence: [H, W] of the photo's size.
-            depth: [h, w] of its half, from `halved`.
+            view: index of the view.
+            evidence: [H, W] at the photo's size.
+            depth: [h, w] at half this size, from `halved`.
         """
         rows, columns = self.queries[view].shrink
         self.stored.put(view, rows @ evidence @ columns, channel=0)
@@ -179,8 +179,8 @@ class OtherViews:
 
     def restore(self, evidence: dict[int, Tensor], depth: dict[int, Tensor]) -> None:
         """Restore the evidence of views from a checkpoint, [h, w] at half their photos' size."""
-        for view, known in evidence.items():
-            self.stored.put(view, known, channel=0)
+        for view, stored in evidence.items():
+            self.stored.put(view, stored, channel=0)
             self.depth.put(view, depth[view])
             self._mark_known(view)
 
@@ -191,15 +191,15 @@ class OtherViews:
         self.stored_views.add(view)
 
     def halved(self, view: int, depth: Tensor) -> Tensor:
-        """Expected depth of any size, [h, w] at half the photo's."""
+        """Resize an expected depth to half the photo's size, [h, w]."""
         return nearest(depth, self.sizes[view])
 
     def ask(self, view: int, depth: Tensor) -> MultiViewEvidence | None:
-        """The other views' evidence about the surface that each pixel shows; None if there is no other view.
+        """Return other views' evidence about the surface at each pixel; None if there is no other view.
 
         Args:
             view: the querying view.
-            depth: [h, w] of its surface, from `halved`.
+            depth: depth of its surface, [h, w], from `halved`.
         """
         if not self.count:
             return None
@@ -211,44 +211,45 @@ class OtherViews:
             self.stored.of(view)[1:].flatten(1),
             *(stack.select(own.neighbours) for stack in stacks),
         )
-        found, difference = self._look_up(points, slice(None), depth.flatten())
+        answers, difference = self._look_up(points, slice(None), depth.flatten())
         offset = None
         if difference is not None:
-            some, same = (_every_second(t, shape) for t in (difference, found.same))
+            some, same = (_every_second(t, shape) for t in (difference, answers.same))
             offset = common_offset(some, same, config.agree)
-            found = replace(found, agree=agree(difference, found.same, config.agree, offset))
-        few = found.same.sum(0) < config.known_by
+            answers = replace(answers, agree=agree(difference, answers.same, config.agree, offset))
+        few = answers.same.sum(0) < config.known_by
         if own.sparse_depth is not None:
-            self._look_up_sparse(points, own.sparse_depth.flatten(), found, few, offset)
-        seen = found.same.sum(0)
-        weight = agreement_weight(seen, found.agree.sum(0), config.agreeing, few)
-        evidence = self.ranks.quantile_of(found.evidence, seen)
-        # also in the first round: waiting until all neighbours have evidence gave 16.9 instead of 18.7 dB
+            self._look_up_sparse(points, own.sparse_depth.flatten(), answers, few, offset)
+        seen = answers.same.sum(0)
+        weight = agreement_weight(seen, answers.agree.sum(0), config.agreeing, few)
+        evidence = self.ranks.quantile_of(answers.evidence, seen)
+        # also in the first round: to wait until all neighbours have evidence gave 16.9 dB instead of 18.7
         least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
         taught = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
         maps = (evidence, weight.float(), taught.float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))
 
     def _look_up_sparse(
-        self, points: _Points, depth: Tensor, found: _Answers, few: Tensor, offset: Tensor | None
+        self, points: _Points, depth: Tensor, answers: _Answers, few: Tensor, offset: Tensor | None
     ) -> None:
-        """Use evidence about the sparse points' surface where few views see the render's and more see it.
+        """Use evidence about the sparse points' surface where more views see it than the render's.
 
         Args:
-            points: of the querying view.
-            depth: [P] of the sparse points' surface, NaN where there is none.
-            found: answers about the render's surface, changed in place.
-            few: [P] bool, where few views see that. Where the answers change it becomes False: a few views
-                that see the render's surface have full weight, but views that see the sparse points' surface
-                may look past a distractor at the background.
-            offset: of colours, from the first answers: these pixels alone could take a car for exposure.
+            points: pixels of the querying view.
+            depth: depth of the sparse points' surface, [P], NaN if none.
+            answers: answers about the render's surface, changed in place.
+            few: [P] bool, where few views see that surface. It becomes False where the answers change: few
+                views of the render's surface have full weight, but views of the sparse points' surface may
+                look past a distractor at the background.
+            offset: offset of colours from the first answers; from these pixels alone, a car could look like
+                exposure.
         """
         rows = backend_of(few.device).rows(lambda: few & depth.isfinite())
-        again, difference = self._look_up(points, rows, depth[rows], sparse=True)
+        other, difference = self._look_up(points, rows, depth[rows], sparse=True)
         if difference is not None and offset is not None:
-            again = replace(again, agree=agree(difference, again.same, self.config.agree, offset))
-        more = few[rows] & (again.same.sum(0) > found.same[:, rows].sum(0))
-        pairs = ((found.evidence, again.evidence), (found.same, again.same), (found.agree, again.agree))
+            other = replace(other, agree=agree(difference, other.same, self.config.agree, offset))
+        more = few[rows] & (other.same.sum(0) > answers.same[:, rows].sum(0))
+        pairs = ((answers.evidence, other.evidence), (answers.same, other.same), (answers.agree, other.agree))
         for old, new in pairs:
             old[:, rows] = torch.where(more, new, old[:, rows])
         few[rows] &= ~more
@@ -256,20 +257,20 @@ class OtherViews:
     def _look_up(
         self, points: _Points, rows: Tensor | slice, depth: Tensor, *, sparse: bool = False
     ) -> tuple[_Answers, Tensor | None]:
-        """The neighbours' answers at depths [P'] of some pixels, and how the colours differ, [n, 3, P'].
+        """Look up the neighbours' evidence at depths [P'] of some pixels.
 
         Args:
-            points: of the querying view.
-            rows: P' of its pixels.
-            depth: [P'] along the rays.
-            sparse: this is the sparse points' surface, so seeing that is enough.
+            points: pixels of the querying view.
+            rows: P' of these pixels.
+            depth: depth along their rays, [P'].
+            sparse: the depth is that of the sparse points, so a view that sees this surface counts too.
 
         Returns:
-            The answers, and the differences; None where colours are not compared.
+            The answers, and the differences of colours [n, 3, P']; None if colours are not compared.
         """
         at = torch.addcmul(points.origin, points.rays[:, :, rows], depth)
         z = at[:, 2]
-        # far outside is clamped to a little outside, so that every pixel index fits
+        # clamped to a place just outside, so that every pixel index fits
         places = (at[:, :2] / z[:, None].clamp(min=1e-6)).clamp_(-2.0, 2.0).permute(0, 2, 1)[:, None]
         same = self._near(points.depth.nearest(places)[:, 0, 0], z)
         if sparse:
@@ -280,27 +281,27 @@ class OtherViews:
             return _Answers(evidence, same, same.clone()), None
         return _Answers(evidence, same, same), points.colours[:, rows] - theirs[:, 1:].round_()
 
-    def _near(self, there: Tensor, z: Tensor) -> Tensor:
-        """Points of depth z that lie on a view's surface of depth `there`; 0 = none."""
-        return ((z - there).abs_() < self.config.depth * there) & (z > 0)
+    def _near(self, surface_z: Tensor, z: Tensor) -> Tensor:
+        """Return which points of depth z lie on a view's surface of depth `surface_z`; 0 = no surface."""
+        return ((z - surface_z).abs_() < self.config.depth * surface_z) & (z > 0)
 
 
 def _every_second(x: Tensor, shape: torch.Size) -> Tensor:
-    """[..., P] at every second row and column of the maps [h, w] that they are, flat."""
+    """Take every second row and column of flat maps [..., h w], flat."""
     return x.view(*x.shape[:-1], *shape)[..., ::2, ::2].flatten(-2)
 
 
 def discount(
     evidence: Tensor, others: MultiViewEvidence | None, unit: Tensor, config: MultiViewConfig
 ) -> Tensor:
-    """Evidence [H, W] * taught / sqrt(1 + strength * excess).
+    """Return evidence [H, W] * taught / sqrt(1 + strength * excess).
 
-    excess = weight * (the others' evidence above `free`).
+    The excess is weight * (other views' evidence above `free`).
 
     Args:
         evidence: [H, W] >= 0.
-        others: from `OtherViews.ask`, any size; NaN evidence discounts nothing.
-        unit: 0-d, above 0: evidence that is normal in the scene.
+        others: result of `OtherViews.ask`, any size; NaN evidence discounts nothing.
+        unit: normal evidence in the scene, 0-d, above 0.
         config: strength and `free`.
     """
     if others is None:
@@ -349,25 +350,25 @@ def _query_of(
 
 
 def _depths(inverse: np.ndarray) -> np.ndarray:
-    """Depths of a map of inverse ones, float32; 0 where nothing is known."""
+    """Return the depths of a map of inverse depths, float32; 0 where unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(inverse > 0, 1.0 / inverse, 0.0).astype(np.float32)
 
 
 def half_size(camera: Camera) -> tuple[int, int]:
-    """(width, height) px of the maps that are kept."""
+    """Return the size (width, height) in px of stored maps."""
     return max(camera.width // _SHRINK, 1), max(camera.height // _SHRINK, 1)
 
 
 def small_colours(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A photo [H, W, 3] in [0, 1] at (width, height), uint8, blurred against depth errors of a pixel."""
+    """Shrink a photo [H, W, 3] in [0, 1] to (width, height), uint8, blurred against errors of depth."""
     blurred = cv2.blur(np.ascontiguousarray(photo), (_BLUR, _BLUR), borderType=cv2.BORDER_REPLICATE)
     small = cv2.resize(blurred, size, interpolation=cv2.INTER_AREA)
     return np.clip(np.rint(small * 255.0), 0, 255).astype(np.uint8)
 
 
 def nearest_views(cameras: Sequence[Camera], count: int) -> list[list[int]]:
-    """For each camera the `count` most similar others: near, and with the same direction."""
+    """Return for each camera the `count` most similar others: near, and in the same direction."""
     centres = np.stack([np.linalg.inv(c.cam_from_world)[:3, 3] for c in cameras])
     axes = np.stack([c.cam_from_world[2, :3] for c in cameras])
     result = []

@@ -1,7 +1,7 @@
 """The paper's method: `refinesplat-paper` (repaired where the print degenerates), `refinesplat-printed`.
 
-docs/fidelity.md compares both with the paper, equation by equation. What the paper does not state has the
-values of `refinesplat`.
+docs/fidelity.md compares both with the paper, equation by equation. Settings that the paper does not state
+have the values of `refinesplat`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ambiguous_wild.methods.refinesplat.merging import MergeConfig
 from ambiguous_wild.vision.backends import BY_MACHINE, first_here
 
 # Masks by entropy (Eqs. 3 to 7). Two forms are repaired: Kapur's for the additive objective of T_ent, and the
-# standard deviation for the variance in T_glb. No gate or limit of ours is on but `most`.
+# standard deviation for the variance in T_glb. Of our gates and limits only `most` is on.
 MASK = MaskConfig(
     statistic="entropy",
     variant="sigmoid",
@@ -53,27 +53,27 @@ PRINTED_DENSITY = dataclasses.replace(DENSITY, merge=MergeConfig(form="literal",
 
 
 def features(size: str = "") -> str:
-    """The paper's features, DINOv2 ViT-S/14, where their weights are on this machine.
+    """Return the paper's features, DINOv2 ViT-S/14, if this machine has their weights.
 
-    Else EfficientNet-Lite0, and without its weights `labhog`: docs/fidelity.md compares them.
+    Otherwise EfficientNet-Lite0, and without its weights `labhog`; docs/fidelity.md compares them.
 
     Args:
-        size: of the net's input as a back end has it, e.g. "@504".
+        size: size of the net's input as in the name of a back end, e.g. "@504".
     """
     return first_here(f"dinov2-small{size}", "efficientnet-lite0", "labhog")
 
 
 def instances() -> str:
-    """All masks of SAM 2, joined over photos by SfM tracks, where its weights are here.
+    """Return all masks of SAM 2, joined over photos by SfM tracks, if this machine has its weights.
 
-    Else segments grouped by EfficientNet-Lite0, and without its weights `graph`.
+    Otherwise segments grouped by EfficientNet-Lite0, and without its weights `graph`.
     """
     return first_here("sam2", "efficientnet-lite0", "graph")
 
 
 @dataclass(frozen=True)
 class PaperConfig(RefineSplatConfig):
-    """All parts of the paper; its networks where they are on this machine, see `features`, `instances`."""
+    """All parts of the paper; its networks depend on this machine, see `features`, `instances`."""
 
     mask: MaskConfig = MASK
     first_look: FirstLookConfig = FirstLookConfig(on=False)  # noqa: RUF009
@@ -91,7 +91,7 @@ class PaperConfig(RefineSplatConfig):
 
 @dataclass(frozen=True)
 class PrintedConfig(PaperConfig):
-    """To the letter, with nothing limited."""
+    """The paper to the letter, without limits."""
 
     mask: MaskConfig = PRINTED_MASK
     features: str = field(default_factory=lambda: features("@504"), metadata=BY_MACHINE)

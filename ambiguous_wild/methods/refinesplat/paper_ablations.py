@@ -21,7 +21,7 @@ _THRESHOLDS = (
 
 
 def _plugged(host: str) -> tuple[Variant, ...]:
-    """The host by itself, then with the paper's masks under each threshold."""
+    """Return a row of the host itself, and rows with the paper's masks under each threshold."""
     return (
         Variant(host, method=host, text="its own masks"),
         *(

@@ -20,7 +20,7 @@ from ambiguous_wild.vision.moving import POINTS, draw_points
 
 
 class Policy(Protocol):
-    """What pictures show of `RefineSplatMask`."""
+    """What pictures need of `RefineSplatMask`."""
 
     config: RefineSplatConfig
     data: TrainData
@@ -42,12 +42,12 @@ class Policy(Protocol):
 
 
 def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.ndarray]:
-    """Entropy, instances by their statistic, and the local, global and final mask; [H, W, 3] uint8 each.
+    """Return pictures of entropy, instances by their statistic, and all masks; [H, W, 3] uint8 each.
 
     Args:
-        policy: it learns nothing here.
-        step: of one train view at the photo's own size.
-        begun: whether masks are in force at this step.
+        policy: the policy, which learns nothing here.
+        step: step of a train view at the photo's own size.
+        begun: whether masks are used at this step.
     """
     maps, masks = policy.examine(step)
     entropy = maps.entropy if maps.entropy is not None else policy.compare(step).entropy
@@ -76,7 +76,7 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
 
 
 def _outlined(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """The image with dark lines between instances."""
+    """Draw dark lines between instances."""
     edge = np.zeros(labels.shape, bool)
     edge[:, 1:] |= labels[:, 1:] != labels[:, :-1]
     edge[1:] |= labels[1:] != labels[:-1]
@@ -86,7 +86,7 @@ def _outlined(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
-    """entropies.png: instances of all photos when they were last judged, and their thresholds."""
+    """Write entropies.png: the last statistics of all photos' instances, and their thresholds."""
     views = [v for v in sorted(policy.judged) if v in policy.shares and len(policy.judged[v].values)]
     if not views:
         return []
@@ -101,7 +101,7 @@ def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
     figure = Figure(figsize=(11, 4.2), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
-    # the few largest would squeeze all others into one bar
+    # clip the few largest, which would squeeze all others into one bar
     end = max(float(np.quantile(values, 0.995)), 1.1 * float(cuts[np.isfinite(cuts)].max(initial=0.0)), 1e-6)
     bins = np.linspace(0.0, end, 60)
     clipped = np.minimum(values, end)
@@ -111,7 +111,7 @@ def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
     left.set_yscale("symlog", linthresh=10)
     left.set_ylabel("instances")
     size = 4 + 60 * np.sqrt(areas / max(float(areas.max()), 1.0))
-    # `structure` is itself how far photo and render are apart: beside it stands how large an instance is
+    # `structure` is itself a distance of photo and render, so its other axis is the area of the instance
     features = policy.config.mask.statistic != "structure"
     beside = distances if features else areas
     for chosen, colour in ((~above, kept), (above, masked)):

@@ -1,8 +1,9 @@
-"""Evidence of a distractor at every pixel of a photo, in units of what is normal in the scene.
+"""Evidence of a distractor at every pixel of a photo, and the regions of masks that are made of it.
 
-Regions of masks: hysteresis, gaps, growth and the limit of a mask's size.
+Evidence is in units of what is normal in the scene. Regions are made by hysteresis, filling of gaps, growth
+and a limit of the mask's size.
 
-Connected components are OpenCV's on the CPU; on an accelerator a fixed number of rounds finds them, without
+Connected components are OpenCV's on the CPU. On an accelerator a fixed number of rounds finds them, without
 loops that depend on values. Every pixel points to a pixel of its own component, at first to the largest among
 itself and its neighbours. A round takes the largest pointer among each pixel's neighbours, points the pixel's
 own target to it, and follows all pointers three times (FastSV: Zhang, Azad, Buluc 2020). Pointers only grow,
@@ -13,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.maps import sized
 from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
@@ -30,8 +31,8 @@ from ambiguous_wild.methods.refinesplat.structure import resized, structure_resi
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.vision.sparse_surface import seldom_seen
 
-GAPS = 1.25  # times its limit: as large may a mask be whose gaps are filled
-_JUMPS = 3  # need half as many rounds as one; more do not help
+GAPS = 1.25  # a mask with filled gaps may be this many times its limit
+_JUMPS = 3  # three jumps need half as many rounds as one; more do not help
 # Needed at 504 x 378 px, 4 or 8 neighbours, mirrored or not: 7 by 6 of 49 mazes and 6 by the others and by
 # Hilbert curves, 5 by spirals, serpentines, combs and stairs, 5 by random pixels of any density, 4 by blobs;
 # 7 by a maze of four times the pixels. A round leaves the local maxima of the parts that touch, so the number
@@ -42,15 +43,15 @@ _FLOAT32_EXACT = 1 << 24
 
 
 def rounds_for(pixels: int) -> int:
-    """Rounds that suffice for a photo of so many pixels."""
+    """Return a sufficient number of rounds for a photo of this many pixels."""
     return _ROUNDS + max(math.ceil(math.log(pixels / _ROUNDS_PIXELS, 4)), 0)
 
 
 def components(masks: Tensor, connectivity: int) -> Tensor:
-    """Components of masks [n, H, W] bool: [n * H * W] int64, a number from 1 on for each; 0 = in no mask."""
+    """Number the components of masks [n, H, W] bool from 1 on, [n * H * W] int64; 0 = in no mask."""
     if backend_of(masks.device).kernels:
-        found = [cv2.connectedComponents(m, connectivity=connectivity)[1] for m in masks.byte().numpy()]
-        stack = np.stack(found).astype(np.int64)
+        each = [cv2.connectedComponents(m, connectivity=connectivity)[1] for m in masks.byte().numpy()]
+        stack = np.stack(each).astype(np.int64)
         stack += np.arange(len(stack))[:, None, None] * masks[0].numel() * (stack > 0)
         return torch.from_numpy(stack.ravel())
     pixels = masks.numel()
@@ -73,7 +74,7 @@ def components(masks: Tensor, connectivity: int) -> Tensor:
 
 
 def hysteresis(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Connected regions above `low` that somewhere exceed `high` (Canny's rule).
+    """Return the connected regions above `low` that somewhere exceed `high` (Canny's rule).
 
     Args:
         values: [n, H, W].
@@ -92,7 +93,7 @@ def hysteresis(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def fill_holes(mask: Tensor, share: float) -> Tensor:
-    """The mask [H, W] bool with every enclosed gap filled that is smaller than `share` of the photo."""
+    """Fill the enclosed gaps of a mask [H, W] bool that are smaller than `share` of the photo."""
     if share <= 0:
         return mask
     labels = components(~mask[None], 4)
@@ -101,20 +102,20 @@ def fill_holes(mask: Tensor, share: float) -> Tensor:
 
 
 def dilate(mask: Tensor, size: int) -> Tensor:
-    """The mask [H, W] bool grown by a size x size square, `size` odd; 1 leaves it alone."""
+    """Grow a mask [H, W] bool by a size x size square, `size` odd; 1 changes nothing."""
     if size <= 1:
         return mask
     return F.max_pool2d(mask[None].float(), size, 1, size // 2)[0] > 0.5
 
 
 def grown(transient: Tensor, config: MaskConfig, evidence: Tensor) -> Tensor:
-    """M_final [H, W] bool of what passed the threshold: no larger than allowed, gaps filled, dilated.
+    """Make M_final [H, W] bool: limit the mask's size, fill its gaps, dilate it.
 
-    Of a too large mask the surest pixels are masked. Their gaps are filled too, because a mask with specks
-    lets a distractor through; the mask may be a quarter larger then (`GAPS`).
+    If the mask is too large, its surest pixels stay. Their gaps are filled too, because a mask with specks
+    lets a distractor through; then the mask may be a quarter larger (`GAPS`).
 
     Args:
-        transient: [H, W] bool.
+        transient: pixels above the threshold, [H, W] bool.
         config: `most`, the largest share of the photo that is masked; `fill`, `dilation`.
         evidence: [H, W], larger = surer.
     """
@@ -128,7 +129,7 @@ def grown(transient: Tensor, config: MaskConfig, evidence: Tensor) -> Tensor:
 
 
 def _largest_around(labels: Tensor, connectivity: int, dtype: torch.dtype) -> Tensor:
-    """The largest label [n, H, W] among each pixel and its 4 or 8 neighbours, flat int64."""
+    """Return the largest of labels [n, H, W] among each pixel and its 4 or 8 neighbours, flat int64."""
     x = labels.to(dtype)
     if connectivity == 8:
         return F.max_pool2d(x, 3, 1, 1).long().view(-1)
@@ -136,7 +137,7 @@ def _largest_around(labels: Tensor, connectivity: int, dtype: torch.dtype) -> Te
     return torch.maximum(upright, level).long().view(-1)
 
 
-STATIC_QUANTILE = 0.25  # of a photo's pixels: static even where distractors cover two thirds of it
+STATIC_QUANTILE = 0.25  # pixels at this quantile are static even if distractors cover two thirds
 
 
 class PixelEvidence:
@@ -152,7 +153,7 @@ class PixelEvidence:
         tensors: Sequence[Tensor] | None = None,  # the photos, if they are on the device already
     ) -> None:
         self.config = config
-        # unchanged: photos that do not fit on the device are sent there one at a time
+        # not copied: photos that do not fit on the device are sent one at a time
         self.photos = tensors or [sized(photo, device) for photo in photos]
         self.other_views = OtherViews(cameras, photos, config.multiview, surfaces, device)
         self.unseen_on_host = [
@@ -161,30 +162,30 @@ class PixelEvidence:
                 seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(photos), photos
             )
         ]
-        # [H, W] bool of each view, where masks may be; None: everywhere
+        # [H, W] bool of each view: pixels that may be masked; None: all
         self.seen = [
             None if unseen is None else torch.from_numpy(~unseen).to(device) for unseen in self.unseen_on_host
         ]
         self.unrelated = unrelated_residual([torch.from_numpy(photo) for photo in photos], config.base)
-        # quantile of each view's residual that static pixels have; NaN before it was looked at
+        # normal residual of each view's static pixels; NaN before the first `look`
         self.normal = torch.full((len(photos),), torch.nan, dtype=torch.float64, device=device)
-        # view: [H, W] float16, its residual averaged over its visits
+        # view -> its residual, averaged over its visits, [H, W] float16
         self.before: dict[int, Tensor] = {}
 
     def look(
         self, view: int, image: Tensor, alpha: Tensor, depth: Tensor, *, remember: bool
     ) -> tuple[Tensor, Tensor]:
-        """Evidence in units, and that unit.
+        """Return the evidence of a view in units, and the unit.
 
         Args:
-            view: which photo.
-            image: [h, w, 3] render of its camera, any size.
-            alpha: [h, w] its opacity; below `least_alpha` the model is not learnt yet: no evidence.
-            depth: [h, w] sum of weight times z.
-            remember: whether the evidence is stored for other views.
+            view: index of the photo.
+            image: render of its camera, [h, w, 3], any size.
+            alpha: opacity of the render, [h, w]; below `least_alpha` there is no evidence.
+            depth: sum of weight times z, [h, w].
+            remember: whether to store the evidence for other views.
 
         Returns:
-            [H, W] float32 at the photo's size, and 0-d float64.
+            Evidence [H, W] float32 at the photo's size, and the unit, 0-d float64.
         """
         photo, config = self.photos[view], self.config
         size = (photo.shape[0], photo.shape[1])
@@ -210,10 +211,10 @@ class PixelEvidence:
         return discount(evidence, others, unit, config.multiview) / unit, unit
 
     def ceiling(self, unit: Tensor) -> Tensor | None:
-        """Upper limit of thresholds, in the unit that `look` divided by, 0-d; None: no limit.
+        """Return the upper limit of thresholds in the unit of `look`, 0-d; None: no limit.
 
-        `ceiling` of the residual of unrelated pictures, never below `ceiling_least`: while the model is
-        hardly learnt, every pixel has such a residual.
+        It is the share `ceiling` of the residual of unrelated pictures, but at least `ceiling_least`, because
+        while little is learnt every pixel has such a residual.
         """
         share = self.config.ceiling
         if share <= 0 or self.unrelated <= 0:
@@ -221,12 +222,12 @@ class PixelEvidence:
         return (share * self.unrelated / unit).clamp_(min=self.config.ceiling_least)
 
     def _unit(self, normal: Tensor) -> Tensor:
-        """Normal residual of the scene: the median over views; of this view alone before any was seen."""
-        found = median(self.normal)
+        """Return the normal residual of the scene, the median over views; that of this view before any."""
+        scene = median(self.normal)
         # a perfect render of a synthetic scene has no noise at all
-        return torch.where(found > 0, found, normal).clamp_(min=1e-4)
+        return torch.where(scene > 0, scene, normal).clamp_(min=1e-4)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         others, normal = self.other_views, self.normal.tolist()
         views = sorted(others.stored_views)
         return {
@@ -236,7 +237,7 @@ class PixelEvidence:
             "depth": {str(v): others.depth.of(v)[0].cpu().contiguous() for v in views},
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         device = self.normal.device
         normal = np.full(len(self.photos), np.nan)
         for view, x in state["normal"].items():
@@ -250,5 +251,5 @@ class PixelEvidence:
 
 
 def _at_size(few: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A coarse bool map at the size of a photo of that shape."""
+    """Enlarge a coarse bool map to the size of a photo of this shape."""
     return cv2.resize(few.astype(np.uint8), shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0

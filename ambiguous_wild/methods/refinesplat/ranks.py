@@ -11,22 +11,22 @@ from torch import Tensor
 
 from ambiguous_wild.splat.backend import backend_of
 
-FAR_MORE = 1.5  # times as many pixels
-_WHITE = 255.0  # colours are kept as uint8 holds them
+FAR_MORE = 1.5  # ratio of agreeing pixels from which an offset is accepted
+_WHITE = 255.0  # colours are from 0 to 255
 
 
 def ascending(x: Tensor, dim: int = 0) -> Tensor:
-    """The values in ascending order along an axis, NaN last."""
+    """Sort values along an axis in ascending order, NaN last."""
     if backend_of(x.device).kernels:
-        # 2 to 20 times as fast as torch's on one thread
+        # numpy's sort is 2 to 20 times as fast as torch's on one thread
         return torch.from_numpy(np.sort(x.numpy(), axis=dim))
     return x.sort(dim).values
 
 
 def median(x: Tensor) -> Tensor:
-    """Median over the last axis, ignoring NaN; NaN if all are NaN.
+    """Return the median over the last axis, ignoring NaN; NaN if all are NaN.
 
-    As numpy's, the mean of the middle two of an even number; torch gives the lower one.
+    Of an even number it is the mean of the middle two, as in numpy; torch returns the lower one.
     """
     last = (~x.isnan()).sum(-1, keepdim=True).sub_(1).clamp_(min=0)
     middle = torch.cat([last // 2, (last + 1) // 2], -1)
@@ -34,22 +34,22 @@ def median(x: Tensor) -> Tensor:
 
 
 def low_quantile(x: Tensor, left_out: Tensor, quantile: float) -> tuple[Tensor, Tensor]:
-    """Quantile of the pixels of x [H, W] that are not left out (bool), linear between ranks; 0 of none.
+    """Return a quantile of the pixels of x [H, W] that are not left out, linear between ranks; 0 of none.
 
     Returns:
-        The quantile, 0-d float64, and how many pixels it is of, 0-d int64.
+        The quantile, 0-d float64, and the number of pixels, 0-d int64.
     """
     ordered = ascending(x.masked_fill(left_out, torch.inf).flatten())
     count = x.numel() - left_out.sum()
     rank = (count.double() - 1.0).clamp_(min=0.0) * quantile
     low = rank.floor()
     below, above = ordered.double().gather(0, torch.stack([low, rank.ceil()]).long())
-    # with no pixel both are infinite and their difference is NaN
+    # without a pixel both are infinite and their difference is NaN
     return (below + (rank - low) * (above - below)).nan_to_num_(nan=0.0), count
 
 
 def spread_of(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Median and 1.4826 MAD, 0-d; NaN among values [n] is ignored.
+    """Return the median and 1.4826 MAD of values [n], 0-d; NaN is ignored.
 
     The spread is at least 5 % of the median, so that equal values do not stand apart.
     """
@@ -59,7 +59,7 @@ def spread_of(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Ranks:
-    """Quantiles over n views of which any number may be missing: ranks by the number present."""
+    """Quantiles over n views of which any number may be missing."""
 
     def __init__(self, views: int, quantile: float, device: torch.device | str) -> None:
         last = np.maximum(np.arange(views + 1) - 1, 0)
@@ -69,25 +69,25 @@ class Ranks:
         self.pair = torch.from_numpy(pair).to(device)  # [2, views + 1]
         self.share = torch.from_numpy(share).to(device)  # [views + 1]
 
-    def quantile_of(self, stack: Tensor, there: Tensor) -> Tensor:
-        """Quantile over the first axis ignoring NaN, linear between ranks; NaN if all are.
+    def quantile_of(self, stack: Tensor, present: Tensor) -> Tensor:
+        """Return the quantile over the first axis, ignoring NaN, linear between ranks; NaN if all are.
 
         Args:
             stack: [n, ...] float32, n the number of views.
-            there: [...] int64, how many are not NaN.
+            present: [...] int64, number of values that are not NaN.
 
         Returns:
             [...] float32.
         """
-        below, above = ascending(stack).gather(0, self.pair[:, there])
-        return below + self.share[there] * (above - below)
+        below, above = ascending(stack).gather(0, self.pair[:, present])
+        return below + self.share[present] * (above - below)
 
 
 def agree(difference: Tensor, same: Tensor, most: float, offset: Tensor) -> Tensor:
-    """Where pictures show the same colour, bool [n, P].
+    """Return where views show the same colour, [n, P] bool.
 
     Args:
-        difference: [n, 3, P] of the colours of n views, 0 to 255.
+        difference: [n, 3, P], differences of colours of n views, from 0 to 255.
         same: [n, P] bool, where they show the same surface.
         most: difference in [0, 1] up to which two colours are the same.
         offset: [n, 3], from `common_offset`.
@@ -97,13 +97,13 @@ def agree(difference: Tensor, same: Tensor, most: float, offset: Tensor) -> Tens
 
 
 def common_offset(difference: Tensor, same: Tensor, most: float) -> Tensor:
-    """The colour offsets between pictures of the same surfaces, [n, 3]; zeros where there is none.
+    """Return the colour offsets between pictures of the same surfaces, [n, 3]; zeros if there is none.
 
     The median difference is an offset (exposure, weather) only if far more pixels agree once it is
     subtracted; behind a crowd it is chance.
 
     Args:
-        difference: [n, 3, P] of their colours, 0 to 255.
+        difference: [n, 3, P], differences of their colours, from 0 to 255.
         same: [n, P] bool, where they show the same surface.
         most: difference in [0, 1] up to which two colours are the same.
     """
@@ -116,12 +116,12 @@ def common_offset(difference: Tensor, same: Tensor, most: float) -> Tensor:
 
 
 def agreement_weight(seen: Tensor, agreed: Tensor, enough: float, always: Tensor) -> Tensor:
-    """Weight of the evidence of n views, in [0, 1].
+    """Return the weight of the evidence of n views, in [0, 1].
 
     Args:
-        seen: [P] int64, how many views see the surface.
-        agreed: [P] int64, how many see it in the same colour.
-        enough: above 0, share of the seeing views that must agree for a weight of 1.
+        seen: [P] int64, number of views that see the surface.
+        agreed: [P] int64, number of views that see it in the same colour.
+        enough: share of the seeing views that must agree for a weight of 1, above 0.
         always: [P] bool, pixels whose weight is 1 in any case.
     """
     share = agreed / seen.clamp(min=1)

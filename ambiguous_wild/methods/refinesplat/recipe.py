@@ -1,23 +1,21 @@
-"""RefineSplat as a recipe of parts.
+"""RefineSplat as a recipe: its mask policy, the losses L_id and L_cr, and the parts of the training loop.
 
-Source: "Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios" (WACV 2027
-submission).
+The mask policy decides when masks are made and refreshed, what is learnt, and what is saved. The losses (Eq.
+13) give a gradient to the image through frozen features.
 
-RefineSplat's mask policy: when masks are made and refreshed, what is learnt and saved.
-
-L_id and the consistency regulariser L_cr (RefineSplat, Eq. 13), and their gradient to the image.
+Source: "Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios" (WACV 2027 submission).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, upsampled
@@ -32,7 +30,7 @@ from ambiguous_wild.methods.refinesplat.threshold import Variant
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import Parts, Schedule, State
+from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.moving import moving_labels, moving_map
@@ -47,10 +45,10 @@ def identity_loss(
     weights: Tensor,  # [n] >= 0, the keep map at these cells
     variant: Variant = "sigmoid",
 ) -> Tensor:
-    """L_id = CE(psi(phi(render)), identities), a mean over cells weighted by keep.
+    """Return L_id = CE(psi(phi(render)), identities), a mean over cells weighted by keep.
 
-    Without weights it would make the render show the distractor. sigmoid: binary cross-entropy, one against
-    rest, summed over identities; cells without identity are ignored.
+    Without weights the loss would make the render show the distractor. sigmoid: binary cross-entropy, one
+    against rest, summed over identities; cells without identity are ignored.
     """
     counts = weights * (identities > 0)
     index = (identities - 1).clamp(min=0)[:, None]
@@ -65,11 +63,11 @@ def identity_loss(
 
 
 def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoid") -> Tensor:
-    """L_cr = 1/K sum_j mean_{p,q in j} KL(sigma(E(p)) || sigma(E(q))), in O(N).
+    """Return L_cr = 1/K sum_j mean_{p,q in j} KL(sigma(E(p)) || sigma(E(q))), in O(N).
 
-    Printed as a double loop over pixel pairs. With s = sigma(E), the mean of s_p (log s_p - log s_q) over
-    pairs is mean_p[s log s] - mean_p[s] mean_q[log s], per channel; with the same for 1 - s, the covariance
-    of s and E.
+    The paper prints a double loop over pixel pairs. With s = sigma(E), the mean of s_p (log s_p - log s_q)
+    over pairs is mean_p[s log s] - mean_p[s] mean_q[log s], per channel; with the same for 1 - s, the
+    covariance of s and E.
 
     Args:
         logits: [n, P].
@@ -79,7 +77,7 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
     """
     sizes = one_hot.sum(1)
     used = sizes > 0
-    # instances without cells stay, with weights of 0: which they are is not read on the host
+    # instances without cells stay, with weights of 0, so that the host need not read which these are
     weights = one_hot / torch.where(used, sizes, 1.0)[:, None]
     # logits beyond +-1e4 are saturated; the clamp keeps products finite
     logits = logits.clamp(-1e4, 1e4)
@@ -90,9 +88,9 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
         s, log_s = torch.softmax(logits, 1), F.log_softmax(logits, 1)
     else:
         raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
-    of = one_hot.argmax(0)  # the instance of each cell; cells without one have weight 0
-    with torch.no_grad():  # the means have no gradient: deviations from them sum to 0
-        middle, middle_log = (weights @ s)[of], (weights @ log_s)[of]
+    index = one_hot.argmax(0)  # the instance of each cell; cells without one have weight 0
+    with torch.no_grad():  # the means need no gradient, as deviations from them sum to 0
+        middle, middle_log = (weights @ s)[index], (weights @ log_s)[index]
     # mean[s l] - mean[s] mean[l] = mean[(s - mean s) (l - mean l)]: if the cells agree, the first form is a
     # difference of numbers that are equal to seven digits
     total = weights @ ((s - middle) * (log_s - middle_log)).sum(1)
@@ -100,9 +98,9 @@ def consistency_loss(logits: Tensor, one_hot: Tensor, variant: Variant = "sigmoi
 
 
 def instance_matrix(labels: Tensor, count: int, weights: Tensor | None = None) -> Tensor:
-    """Membership [count, n] float32 of cells in instances 1..count; labels [n], 0 = none.
+    """Return the membership [count, n] float32 of cells in instances 1..count; labels [n], 0 = none.
 
-    A dense matrix instead of scatter adds: sums by matmul repeat bit for bit.
+    The matrix is dense, because sums by matmul, unlike scatter adds, repeat bit for bit.
     """
     ids = torch.arange(1, count + 1, device=labels.device)
     matrix = (labels[None, :] == ids[:, None]).float()
@@ -110,11 +108,11 @@ def instance_matrix(labels: Tensor, count: int, weights: Tensor | None = None) -
 
 
 class RefineSplatMask(PausingMask):
-    """Entropy-aware local and global masks, cached per view and refreshed as the render improves."""
+    """Entropy-aware local and global masks, stored per view and refreshed as the render improves."""
 
     config: RefineSplatConfig
     inputs: FrozenInputs
-    masks: MaskStore  # makes and keeps them
+    masks: MaskStore
 
     def __init__(
         self,
@@ -125,9 +123,9 @@ class RefineSplatMask(PausingMask):
         self.config = config
         self.features = features or make_features(config.features)
         self.instances = instances or _instances(config)
-        self.visits: dict[int, int] = {}  # view: steps since masks began
-        self.points: dict[str, MotionPoints] = {}  # of the scene, by the photo's name
-        self.looks: dict[int, FirstLook] = {}  # view: its comparison with other photos, if there is one
+        self.visits: dict[int, int] = {}  # view -> number of steps since masks began
+        self.points: dict[str, MotionPoints] = {}  # photo's name -> its moving and static features
+        self.looks: dict[int, FirstLook] = {}  # view -> its comparison with other photos, if any
 
     def setup(self, data: TrainData) -> None:
         self.data = data
@@ -139,13 +137,13 @@ class RefineSplatMask(PausingMask):
         surfaces = static_surfaces(data.cameras, data.scene.points.sure_xyz)
         if config.first_look.on:
             moving = self._moving(surfaces) if config.first_look.motion > 0 else None
-            found = first_look(data.cameras, photos, surfaces, config.first_look, moving)
-            self.looks = {view: look for view, look in enumerate(found) if look is not None}
+            looks = first_look(data.cameras, photos, surfaces, config.first_look, moving)
+            self.looks = {view: look for view, look in enumerate(looks) if look is not None}
         self.masks = MaskStore(
             config, photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
             data.device, self.compare, data.photos,
         )  # fmt: skip
-        # view: keep map before masks begin, [H, W] float32; absent if everything is kept
+        # view -> its keep map before masks begin, [H, W] float32; absent if everything is kept
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
             for view, look in self.looks.items()
@@ -153,16 +151,16 @@ class RefineSplatMask(PausingMask):
         }
 
     def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
-        """What moves in each photo, of its surface's shape; None where nothing is known."""
+        """Return what moves in each photo, in the shape of its surface; None if unknown."""
         points = self.points = read_motion_points(self.data.scene.root)
         data = self.data
-        found: list[np.ndarray | None] = [None] * len(surfaces)
+        by_photo: list[np.ndarray | None] = [None] * len(surfaces)
         for k, (view, surface) in enumerate(zip(data.scene.train, surfaces, strict=True)):
-            known, photo, labels = points.get(view.name), data.photos[k], self.inputs.labels[k]
-            if known is not None and surface is not None:
-                labels = moving_labels(self.instances, photo, labels, known, data.cache_dir)
-                found[k] = moving_map(known, labels, surface.shape)
-        return found
+            of_photo, photo, labels = points.get(view.name), data.photos[k], self.inputs.labels[k]
+            if of_photo is not None and surface is not None:
+                labels = moving_labels(self.instances, photo, labels, of_photo, data.cache_dir)
+                by_photo[k] = moving_map(of_photo, labels, surface.shape)
+        return by_photo
 
     def keep(self, step: Step) -> Tensor | None:
         if not self.begun(step):
@@ -179,7 +177,7 @@ class RefineSplatMask(PausingMask):
         return None if keep is None else shrink_keep(keep, step.divisor)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
-        """d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
+        """Return d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
         config = self.config
         if not self.regularises() or not self.begun(step) or step.iteration % config.entropy_every:
             return None
@@ -192,7 +190,7 @@ class RefineSplatMask(PausingMask):
         return self._limited(gradient, step, keep) * config.entropy_every
 
     def _limited(self, gradient: Tensor, step: Step, keep: Tensor | None) -> Tensor:
-        """The entropy terms' gradient, no longer than `entropy_limit` times that of L_GS (L2, all pixels)."""
+        """Limit the entropy terms' gradient to `entropy_limit` times the L2 norm of that of L_GS."""
         config = self.config
         if config.entropy_limit <= 0:
             return gradient
@@ -200,7 +198,7 @@ class RefineSplatMask(PausingMask):
             step.rendered.image, step.photo, keep, lambda_dssim=config.lambda_dssim, weighting=config.ssim
         )
         longest = config.entropy_limit * torch.linalg.vector_norm(photo.d_image)
-        # a product, not a test: on an accelerator the host does not wait for it
+        # a product instead of a test, so that the host of an accelerator does not wait
         return gradient * (longest / torch.linalg.vector_norm(gradient).clamp(min=1e-30)).clamp(max=1.0)
 
     def regularises(self) -> bool:
@@ -211,7 +209,7 @@ class RefineSplatMask(PausingMask):
             return None
         return shrink_keep(self.masks.examine(step)[1].keep, step.divisor)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         shares = self.shares
         rows = np.array([shares[view] for view in sorted(shares)], dtype=np.float64).reshape(-1, 4)
         finite = rows[np.isfinite(rows[:, 3]), 3]
@@ -222,15 +220,15 @@ class RefineSplatMask(PausingMask):
             "masked_share_global": float(mean[2]),
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
             "w2": self.w2,
-            # of a photo, in the mean: what the first look masks
+            # mean share of a photo that the first look masks
             "first_look_share": masked_share([look.passing for look in self.looks.values()]),
-            # pictures may read identities that the training never used
-            "identities": self.inputs.semantics.found.count if self._reads_identities else None,
+            # not if only pictures read identities
+            "identities": self.inputs.semantics.association.count if self._reads_identities else None,
         }
 
     @property
     def _reads_identities(self) -> bool:
-        """Whether masks or losses do; pictures do anyway."""
+        """Whether masks or losses read identities; pictures always do."""
         return self.config.mask.needs_identities or self.regularises()
 
     @property
@@ -240,30 +238,30 @@ class RefineSplatMask(PausingMask):
 
     @property
     def shares(self) -> dict[int, tuple[float, float, float, float]]:
-        """View: share masked in all, locally, globally, and T_ent when its mask was last made."""
+        """Each view's shares masked in all, locally and globally, and T_ent, when its mask was last made."""
         return self.masks.shares
 
     @property
     def judged(self) -> dict[int, Judged]:
-        """View: its instances when its mask was last made."""
+        """Each view's instances when its mask was last made."""
         return self.masks.judged
 
     def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
-        """The maps of the step's view and its masks at the photo's own size.
+        """Return the maps of the step's view and its masks at the photo's own size.
 
         Args:
-            step: of any train view.
-            remember: whether the evidence is stored for other views; else nothing is kept.
+            step: step of any train view.
+            remember: whether to store the evidence for other views.
         """
         return self.masks.examine(step, remember=remember)
 
     @torch.no_grad()
     def compare(self, step: Step) -> Maps:
-        """Entropy and distances on the feature grid, from the step's render."""
-        found, mask = self.inputs.semantics, self.config.mask
+        """Compute entropy and distances on the feature grid from the step's render."""
+        frozen, mask = self.inputs.semantics, self.config.mask
         features = self.inputs.features
         image = upsampled(step.rendered.image, *self.data.photos[step.view].shape[:2])
-        maps = compare(found.phi[step.view], features(image), found.psi, features.unit, mask)
+        maps = compare(frozen.phi[step.view], features(image), frozen.psi, features.unit, mask)
         h, w = maps.distance.shape
         alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
         return silence(maps, alpha < mask.least_alpha)
@@ -274,7 +272,7 @@ class RefineSplatMask(PausingMask):
         logits = inputs.psi(self.inputs.features(upsampled(image, *self.data.photos[step.view].shape[:2])))
         h, w, channels = logits.shape
         flat = logits.reshape(-1, channels)
-        # unweighted, the capture's own masks still hold
+        # without weights the capture's own masks still apply
         own = self.data.user_keep[step.view]
         everywhere = _cells(None if own is None else shrink_keep(own, step.divisor), h, w, image)
         kept = _cells(keep, h, w, image)
@@ -303,7 +301,7 @@ class RefineSplatMask(PausingMask):
             **self.masks.state_dict(),
             "visits": {str(view): count for view, count in self.visits.items()},
             "last_reset": self.last_reset,
-            # the last bits of psi's training may differ on another machine: a run goes on with the same one
+            # saved, because the last bits of psi's training may differ on another machine
             "psi": None if psi is None else dict(psi.state_dict()),
         }
 
@@ -316,7 +314,7 @@ class RefineSplatMask(PausingMask):
 
 
 def _cells(keep: Tensor | None, h: int, w: int, like: Tensor) -> Tensor:
-    """Weights [h * w] of cells under a keep map [H, W]: a cell counts only if every pixel in it is kept."""
+    """Return weights [h * w] of cells under a keep map [H, W]: the least value in each cell."""
     if keep is None:
         return torch.ones(h * w, device=like.device)
     return -F.adaptive_max_pool2d(-keep[None, None], (h, w)).reshape(-1)
@@ -330,7 +328,7 @@ Config = RefineSplatConfig
 
 
 def build(options: RefineSplatConfig) -> Parts:
-    """Masks, entropy terms and density control; the rest of the loop is 3DGS."""
+    """Return 3DGS with masks, entropy terms and density control of RefineSplat."""
     return Parts(
         mask=RefineSplatMask(options),
         density=EntropyAwareDensity,

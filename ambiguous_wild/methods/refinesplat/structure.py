@@ -22,15 +22,15 @@ from ambiguous_wild.splat.backend import backend_of
 RESIDUAL_BOX = 5  # px
 STRUCTURE_BOX = 7  # px
 GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # BT.601 luma
-NOISE = 5e-4  # variance below which a patch counts as plain: (2.2 %)^2, JPEG, sensor, a render's own
+NOISE = 5e-4  # variance below which a patch counts as plain: (2.2 %)^2 of JPEG, sensor and render
 
 
 def structure_residual(photo: Tensor, render: Tensor, base: float = 0.3) -> Tensor:
-    """mean |photo - render| times (1 - NCC + base), both over boxes; [H, W] float32 in [0, 2 + base].
+    """Return mean |photo - render| times (1 - NCC + base), both over boxes; [H, W] in [0, 2 + base].
 
     Args:
         photo: [H, W, 3] float32 in [0, 1].
-        render: of the same camera, same size.
+        render: render of the same camera and size.
         base: factor of the residual where the structure agrees perfectly.
     """
     residual = box(_channels((photo - render).abs_(), (1 / 3, 1 / 3, 1 / 3))[None], RESIDUAL_BOX)[0]
@@ -39,21 +39,21 @@ def structure_residual(photo: Tensor, render: Tensor, base: float = 0.3) -> Tens
 
 
 def _channels(image: Tensor, weights: Sequence[float]) -> Tensor:
-    """Weighted sum of three channels, [H, W]; several times as fast as a sum over the last axis."""
+    """Sum three channels by weights, [H, W]; several times as fast as a sum over the last axis."""
     first, second, third = image.unbind(2)
     return torch.add(torch.add(first * weights[0], second, alpha=weights[1]), third, alpha=weights[2])
 
 
 def unrelated_residual(photos: Sequence[Tensor], base: float = 0.3) -> float:
-    """The `structure_residual` of two unrelated pictures.
+    """Return the `structure_residual` of two unrelated pictures.
 
-    Median over pixels, then over photos, of each photo against the mirror image of another one: same place,
-    same light, other content. The scale does not depend on any render, so it also holds where little is
-    learnt: behind a crowd even "normal" residuals are large.
+    It is the median over pixels, then over photos, of each photo against the mirror image of another: the
+    same place and light, but other content. It depends on no render, so it also holds where little is learnt:
+    behind a crowd even "normal" residuals are large.
 
     Args:
-        photos: [H, W, 3] float32 in [0, 1] each, sizes may differ.
-        base: of `structure_residual`.
+        photos: photos [H, W, 3] float32 in [0, 1], of any sizes.
+        base: argument of `structure_residual`.
     """
     values = []
     for index, photo in enumerate(photos):
@@ -65,10 +65,10 @@ def unrelated_residual(photos: Sequence[Tensor], base: float = 0.3) -> float:
 
 
 def correlation(a: Tensor, b: Tensor, size: int = STRUCTURE_BOX) -> Tensor:
-    """Normalised cross-correlation of grey images [H, W] float32 over boxes, in [-1, 1].
+    """Return the normalised cross-correlation of grey images [H, W] float32 over boxes, in [-1, 1].
 
-    1 where both are plain, near 0 where one of them is: a plain coat in front of a textured wall shares no
-    structure with it.
+    It is 1 where both are plain, and near 0 where only one is: a plain coat in front of a textured wall
+    shares no structure with it.
     """
     # variances are small differences of these means
     mean_a, mean_b, aa, bb, ab = box(torch.stack([a, b, a * a, b * b, a * b]), size)
@@ -78,18 +78,18 @@ def correlation(a: Tensor, b: Tensor, size: int = STRUCTURE_BOX) -> Tensor:
 
 
 def box(maps: Tensor, size: int) -> Tensor:
-    """Box filter of maps [n, H, W], summed in float64, `size` odd; the border is replicated."""
+    """Filter maps [n, H, W] by a box of odd `size`, summed in float64; the border is replicated."""
     if backend_of(maps.device).kernels:
         # a tenth of the time of torch's pooling
-        found = [cv2.blur(m, (size, size), borderType=cv2.BORDER_REPLICATE) for m in maps.numpy()]
-        return torch.from_numpy(np.stack(found))
+        blurred = [cv2.blur(m, (size, size), borderType=cv2.BORDER_REPLICATE) for m in maps.numpy()]
+        return torch.from_numpy(np.stack(blurred))
     padded = F.pad(maps[None].double(), (size // 2,) * 4, mode="replicate")
-    # one axis after the other: 2 * size sums a pixel instead of size^2
+    # one axis after the other needs 2 * size additions a pixel instead of size^2
     return F.avg_pool2d(F.avg_pool2d(padded, (size, 1), 1), (1, size), 1)[0].to(maps)
 
 
 def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """[h, w] or [h, w, 3] at (height, width), bilinear."""
+    """Resize [h, w] or [h, w, 3] to (height, width), bilinear."""
     if tuple(x.shape[:2]) == size:
         return x
     maps = x[None] if x.ndim == 2 else x.permute(2, 0, 1)
@@ -98,14 +98,14 @@ def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def nearest(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """[h, w] at (height, width), the pixel that contains each upper left corner (cv2.INTER_NEAREST)."""
+    """Resize [h, w] to (height, width): the pixel at each upper left corner (cv2.INTER_NEAREST)."""
     return F.interpolate(x[None, None], size=size, mode="nearest")[0, 0]
 
 
 def blur_and_shrink(length: int, parts: int, size: int) -> np.ndarray:
-    """One axis of a box filter, border replicated, and then of cv2.INTER_AREA: [parts, length] float32.
+    """Return a matrix [parts, length] float32 that applies a box filter, then cv2.INTER_AREA, along an axis.
 
-    Both are linear: `rows @ x @ columns.T` applies them in two products.
+    The border is replicated. `rows @ x @ columns.T` filters and shrinks a map in two products.
     """
     edges = np.arange(parts + 1) * (length / parts)
     cells = np.arange(length)

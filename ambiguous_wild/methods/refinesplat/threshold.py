@@ -1,16 +1,15 @@
-"""The adaptive entropy threshold T_ent (RefineSplat, Eq. 4) and its learnt weight w2, in float64.
+"""The adaptive entropy threshold T_ent (RefineSplat, Eq. 4) with its learnt weight w2, and entropies (Eq. 3).
 
-Printed: argmax_t (1 - w2) Ent(Hbar >= t) + w2 Ent(Hbar < t), Ent(X) = -sum x log x on raw values. That sum is
-additive over the two subsets, so for w2 < 1/2 the smallest value wins (all others are transient) and for
-w2 > 1/2 the largest (nothing is). The default normalises within each subset (Kapur's maximum entropy):
-q_i = x_i / sum x, Ent = -sum q_i log q_i. Both always divide the set in two, so a gate requires outliers.
+The printed objective is argmax_t (1 - w2) Ent(Hbar >= t) + w2 Ent(Hbar < t), Ent(X) = -sum x log x on raw
+values. That sum is additive over the two subsets, so for w2 < 1/2 the smallest value wins (all others are
+transient) and for w2 > 1/2 the largest (nothing is). The default normalises within each subset (Kapur's
+maximum entropy): q_i = x_i / sum x, Ent = -sum q_i log q_i. Both always divide the set in two, so a gate
+requires outliers. It is computed in float64. Missing values (NaN) stay, and values that are no candidates
+score -inf, so that no count is read on the host.
 
-Missing values (NaN) stay, and values that are no candidates score -inf: no count is read on the host.
-
-Entropy of identity logits (RefineSplat, Eq. 3), and how it compares between photo and render.
-
-Everything is computed through log-sigmoid and log-softmax, never through the log of a clipped
-probability: sigma log sigma is 0 at saturated logits and its gradient is finite there.
+Entropies of identity logits compare photo and render. They are computed through log-sigmoid and log-softmax,
+never through the log of a clipped probability: sigma log sigma is 0 at saturated logits and its gradient is
+finite there.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ Statistic = Literal["structure", "entropy", "surprise", "contrast", "evidence"]
 
 
 def entropy(logits: Tensor, variant: Variant = "sigmoid") -> Tensor:
-    """H in [0, 1] of logits [..., P].
+    """Return H in [0, 1] of logits [..., P].
 
     sigmoid (printed form, Eq. 3): sum_k -sigma(E_k) log sigma(E_k), over its largest value P / e.
     softmax: -sum_k p_k log p_k over log P; 0 where P = 1.
 
     Returns:
-        H [...], the logits' dtype.
+        H [...], in the dtype of the logits.
     """
     channels = logits.shape[-1]
     if variant == "sigmoid":
@@ -52,7 +51,7 @@ def entropy(logits: Tensor, variant: Variant = "sigmoid") -> Tensor:
 
 
 def surprise(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Tensor:
-    """Cross-entropy in nats of the render's identities under the photo's: H(p_I, p_render) >= H(p_I).
+    """Return the cross-entropy in nats of the render's identities under the photo's, H(p_I, p_render).
 
     It equals the entropy of the photo's own identities where the render shows the same thing, and grows by
     KL(p_I || p_render) where it does not. Shapes as `entropy`; both logits [..., P].
@@ -66,7 +65,7 @@ def surprise(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Ten
 
 
 def contrast(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Tensor:
-    """KL(p_I || p_render) in nats: the part of `surprise` that the photo's own ambiguity does not explain."""
+    """Return KL(p_I || p_render) in nats: `surprise` without the photo's own ambiguity."""
     return (surprise(render, photo, variant) - surprise(photo, photo, variant)).clamp(min=0.0)
 
 
@@ -78,27 +77,27 @@ def _x_log_x(log_p: Tensor) -> Tensor:
 
 Form = Literal["kapur", "literal", "hard", "statistics"]
 THETA_LIMIT = 8.0  # |theta| beyond this, sigmoid(theta) rounds to 0 or 1 in float32
-TEMPERATURE = 0.1  # nats, of the threshold that w2 is learnt through
-RATE = 1.0  # of plain gradient steps on theta, each clipped to 1
+TEMPERATURE = 0.1  # nats, temperature of the soft threshold by which w2 is learnt
+RATE = 1.0  # rate of plain gradient steps on theta, each clipped to 1
 
 
 @dataclass(frozen=True)
 class Pool:
     """The instances that a threshold divides, with the sums that it and the learning of w2 need; float64."""
 
-    order: Tensor  # [n] ascending, NaN (missing) last
-    index: Tensor  # [n] int64, its instance
-    x: Tensor  # [n] the same, 0 where it is missing
-    total: Tensor  # 0-d sum of x
-    middle: Tensor  # 0-d median
-    spread: Tensor  # 0-d robust deviation
-    upper: Tensor  # [n] entropy of the upper set of a cut below each value
-    more_below: Tensor  # [n] how much greater that of the lower set is
-    above_previous: Tensor  # [n] bool: larger than the one before, so a cut may lie between
-    logs: Tensor  # [2, n] sum x log x of the lower and the upper set of a cut below each value
+    order: Tensor  # [n] values in ascending order, NaN (missing) last
+    index: Tensor  # [n] int64, instance of each value
+    x: Tensor  # [n] `order` with 0 for missing values
+    total: Tensor  # 0-d, sum of x
+    middle: Tensor  # 0-d, median
+    spread: Tensor  # 0-d, robust deviation
+    upper: Tensor  # [n] entropy of the upper set, for a cut below each value
+    more_below: Tensor  # [n] entropy of the lower set minus that of the upper set
+    above_previous: Tensor  # [n] bool, whether a value is larger than the one before: a cut may lie between
+    logs: Tensor  # [2, n] sums of x log x over the lower and the upper set, for a cut below each value
 
     def floor(self, gate: float) -> Tensor:
-        """median + gate * robust spread, 0-d; NaN if all are missing."""
+        """Return median + gate * robust spread, 0-d; NaN if all are missing."""
         return self.middle + gate * self.spread
 
 
@@ -106,11 +105,11 @@ class Pool:
 class Cut:
     """The threshold between static and transient values."""
 
-    threshold: Tensor  # 0-d float64, above: transient; inf = no value is an outlier
-    floor: Tensor  # 0-d: the gate's own bound, the larger of median + gate * robust spread and `least`
+    threshold: Tensor  # 0-d float64, larger values are transient; inf = no value is an outlier
+    floor: Tensor  # 0-d, bound of the gate: the larger of median + gate * robust spread and `least`
 
     def below(self, ceiling: Tensor | None) -> Cut:
-        """The cut with threshold and floor limited to the ceiling."""
+        """Return the cut with threshold and floor limited to the ceiling."""
         if ceiling is None:
             return self
         high = self.threshold > ceiling
@@ -124,7 +123,7 @@ def pool_of(values: Tensor) -> Pool:
     x = order.nan_to_num(nan=0.0).clamp_(min=0.0)
     sums = torch.stack([x, torch.xlogy(x, x)])
     through = sums.cumsum(1)
-    lower = through - sums  # of all values before each
+    lower = through - sums  # sums of all values before each
     totals, logs = torch.stack([lower, through[:, -1:] - lower], 1)  # [2, n] each
     # -sum q log q with q = x / total: log(total) - sum(x log x) / total; 0 of nothing
     lower, upper = (totals.log() - logs / totals).masked_fill_(totals <= 0, 0.0)
@@ -142,16 +141,16 @@ def t_ent(
     least: float = 0.0,
     hard: float = 0.0,
 ) -> Cut:
-    """The threshold T_ent, or one of the two it is compared with.
+    """Compute the threshold T_ent, or one of the two that it is compared with.
 
     Args:
-        pool: of the mean statistic of each instance.
+        pool: pool of the mean statistic of each instance.
         w2: weight of the lower subset, in (0, 1).
         form: `kapur` or `literal` (the printed objective) for T_ent; `hard` for T_hard, a fixed value;
             `statistics` for T_statistics, mean + standard deviation (DroneSplat's).
         gate: only values this many robust deviations above the median may be flagged; 0 = no gate.
-        least: and only values above this; 0 = no such bound.
-        hard: the value of T_hard.
+        least: only values above this may be flagged; 0 = no such bound.
+        hard: value of T_hard.
 
     Returns:
         The cut; with T_ent and T_statistics, one value or equal values flag nothing.
@@ -159,7 +158,7 @@ def t_ent(
     if form not in get_args(Form):
         raise unknown("threshold", form, get_args(Form))
     if form == "hard":
-        fixed = torch.full_like(pool.middle, hard)  # whatever the values are
+        fixed = torch.full_like(pool.middle, hard)  # does not depend on the values
         return Cut(fixed, fixed)
     floor = pool.floor(gate) if gate > 0 else torch.full_like(pool.middle, -math.inf)
     if least > 0:
@@ -167,10 +166,10 @@ def t_ent(
     last = pool.order.nan_to_num(nan=-math.inf).amax()
     apart = last - pool.order[0] > 1e-9 * last.abs().clamp(min=1e-300)
     if form == "statistics":
-        there = ~pool.order.isnan()
-        count = there.sum()
+        present = ~pool.order.isnan()
+        count = present.sum()
         mean = pool.total / count
-        away = (pool.x - mean) * there
+        away = (pool.x - mean) * present
         statistics = torch.maximum(mean + (torch.dot(away, away) / count).sqrt(), floor)
         return Cut(torch.where(apart, statistics, math.inf), floor)
     candidate = candidates(pool, floor, form)
@@ -184,7 +183,7 @@ def t_ent(
 
 
 def candidates(pool: Pool, floor: Tensor, form: Form) -> Tensor:
-    """The values below which a cut may lie, [n] bool; the printed form may cut below the smallest."""
+    """Return the values below which a cut may lie, [n] bool; the printed form may cut below the smallest."""
     candidate = pool.above_previous & (pool.order > floor)
     if form == "literal":
         candidate[:1] = pool.order[:1] > floor
@@ -192,7 +191,7 @@ def candidates(pool: Pool, floor: Tensor, form: Form) -> Tensor:
 
 
 def objective(pool: Pool, w2: float | Tensor, form: Form = "kapur") -> tuple[Tensor, Tensor]:
-    """(1 - w2) Ent(upper) + w2 Ent(lower) of a cut below each value, and its slope in w2, [n] each."""
+    """Return (1 - w2) Ent(upper) + w2 Ent(lower) for a cut below each value, and its slope in w2, [n]."""
     upper, slope = pool.upper, pool.more_below
     if form == "literal":
         upper, slope = -pool.logs[1], pool.logs[1] - pool.logs[0]
@@ -207,7 +206,7 @@ def learnt(
     floor: Tensor,
     form: Form = "kapur",
 ) -> Tensor:
-    """theta after one gradient step on one photo, 0-d float64; w2 = sigmoid(theta).
+    """Return theta after one gradient step on one photo, 0-d float64; w2 = sigmoid(theta).
 
     The paper does not say how w2 is learnt: an argmax has no gradient. Here T is soft: with
     p = softmax(objective / temperature), T = sum p x and dT/dw2 = sum p (x - T) slope / temperature. Soft
@@ -215,30 +214,30 @@ def learnt(
     a price of 1 per pixel, so that masking everything is no solution. The gradient is written out.
 
     Args:
-        theta: before, 0-d.
+        theta: value before the step, 0-d.
         pool: the instances.
-        costs: [n] >= 0, residuals in units of the price of masking; in the order before sorting.
-        areas: [n] px, likewise; NaN = missing.
-        floor: of the cut; candidates lie above it.
-        form: of the objective that T is soft in; other forms than `literal` learn through `kapur`.
+        costs: [n] >= 0, residuals in units of the price of masking, in the order before sorting.
+        areas: [n] px, in the order before sorting; NaN = missing.
+        floor: floor of the cut; candidates lie above it.
+        form: form of the objective; forms other than `literal` learn through `kapur`.
     """
     w2 = torch.sigmoid(theta)
     candidate = candidates(pool, floor, form)
     scores, slope = objective(pool, w2, form)
     weights = areas.take(pool.index).nan_to_num_(nan=0.0)
-    there = weights > 0
-    count = there.sum()
+    present = weights > 0
+    count = present.sum()
     p = torch.softmax(scores.masked_fill_(~candidate, -math.inf) / TEMPERATURE, 0)
     away = pool.x - torch.dot(p, pool.x)  # from the soft threshold T
     dt_dw2 = torch.dot(p * away, slope) / TEMPERATURE
-    centred = (pool.x - pool.total / count) * there
+    centred = (pool.x - pool.total / count) * present
     variance = torch.dot(centred, centred) / count
     spread = variance.clamp_(min=1e-18).sqrt_() / 4
     member = torch.sigmoid(away / spread)
     cost = costs.take(pool.index).nan_to_num_(nan=0.0).clamp_(max=10.0)
-    # of sum shares ((1 - member) cost + member), to T; shares are weights over their sum
+    # derivative of sum shares ((1 - member) cost + member) by T; shares are weights over their sum
     dl_dt = torch.dot(weights * (cost - 1.0), member * (1.0 - member)) / (spread * weights.sum())
     gradient = dl_dt * dt_dw2 * (w2 * (1.0 - w2))
     step = gradient.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0).clamp_(-1.0, 1.0)
     moved = (theta - RATE * step).clamp_(-THETA_LIMIT, THETA_LIMIT)
-    return torch.where(candidate.sum() >= 2, moved, theta)  # with fewer, w2 has no influence
+    return torch.where(candidate.sum() >= 2, moved, theta)  # w2 has no influence on fewer candidates

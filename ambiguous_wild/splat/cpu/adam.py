@@ -1,8 +1,8 @@
-"""Kernels over flat arrays: Adam in sixteen lanes, and whether all values are finite.
+"""Kernels over flat arrays: Adam in sixteen lanes, and a check that all values are finite.
 
-Adam has one definition for every row, seen or not: a row nobody sees has gradient zero, its moments decay
-and it moves on momentum alone. Both the dense step and the postponed one run `_moments` and `_change`, so
-that postponing changes no bit.
+Adam has one definition for every row, seen or not: a row that no view sees has gradient zero, its moments
+decay and it moves on momentum alone. The dense step and the postponed steps both run `_moments` and
+`_change`, so that postponing changes no bit.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from ambiguous_wild.splat.cpu.simd import (
 )
 
 BETAS, EPS = (0.9, 0.999), 1e-15
-# 1 - beta is rounded after the difference: float32(0.999) alone is off by 5e-5 of 0.001.
+# 1 - beta is computed in float64, then rounded: with float32(0.999) it would be off by 5e-5 of 0.001.
 _BETA1, _REST1, _BETA2, _REST2 = (np.float32(c) for b in BETAS for c in (b, 1 - b))
 _EPS = np.float32(EPS)
-# Denormal numbers cost a hundred cycles an operation and move nothing: at |m| < 1e-30 a step is below
-# 1e-15 of the learning rate even if v is 0 and only eps = 1e-15 is left below the line.
+# Denormal numbers cost a hundred cycles an operation and change nothing: at |m| < 1e-30 a step is below 1e-15
+# of the learning rate, even if v is 0 and the denominator is eps = 1e-15.
 _TINY_M = np.float32(1e-30)
 _TINY_V = np.float32(1.2e-38)
 
@@ -52,13 +52,13 @@ def _change(m, v, rate, root):
 
 @kernel
 def _read(array, at, count):
-    """Up to 16 values; sixteen without a mask: the step took 0.6 ms with masks, 0.3 without."""
+    """Read up to 16 values; without a mask if there are 16: a step takes 0.3 ms, with masks 0.6 ms."""
     return load(array, at) if count == 16 else load_some(array, at, count)
 
 
 @kernel
 def _write(array, at, value, count):
-    """Up to 16 values, as `_read`."""
+    """Write up to 16 values, as `_read`."""
     if count == 16:
         store(array, at, value)
     else:
@@ -67,7 +67,7 @@ def _write(array, at, value, count):
 
 @kernel
 def _dense_range(begin, end, p, m, v, g, rate, root):
-    """One step of values begin .. end - 1 of flat arrays."""
+    """Step the values begin .. end - 1 of flat arrays."""
     for at in range(begin, end, 16):
         count = min(16, end - at)
         mean, square = _moments(_read(m, at, count), _read(v, at, count), _read(g, at, count))
@@ -78,7 +78,7 @@ def _dense_range(begin, end, p, m, v, g, rate, root):
 
 @kernel
 def _dense_part(part, parts, p, m, v, g, rate, root):
-    """The part-th of `parts` slices of a flat array, one step."""
+    """Step slice number `part` of `parts` slices of flat arrays."""
     blocks = (p.shape[0] + 15) // 16
     begin = part * blocks // parts * 16
     end = min((part + 1) * blocks // parts * 16, p.shape[0])
@@ -87,14 +87,14 @@ def _dense_part(part, parts, p, m, v, g, rate, root):
 
 @parallel_kernel
 def dense(p, m, v, g, rate, root, parts):
-    """One step of a flat array."""
+    """Step flat arrays."""
     for part in numba.prange(parts):
         _dense_part(part, parts, p, m, v, g, rate, root)
 
 
 @kernel
 def _advance(p, m, v, at, count, first, last, rates, roots):
-    """Steps first .. last - 1 with gradient zero for up to 16 values from flat index `at`."""
+    """Take steps first .. last - 1, with gradient zero, for up to 16 values from flat index `at`."""
     value = _read(p, at, count)
     mean = _read(m, at, count)
     square = _read(v, at, count)
@@ -128,7 +128,7 @@ def _row_catch_up(row, width, p, m, v, last, now, rates, roots):
 
 @parallel_kernel
 def catch_up(rows, width, p, m, v, last, now, rates, roots, parts):
-    """Bring rows up to step `now`; last[row] counts a row's steps, the flat arrays hold `width` a row."""
+    """Bring rows up to step `now`. last[row] counts a row's steps; flat arrays have `width` values a row."""
     n = rows.shape[0]
     for part in numba.prange(parts):
         for k in range(part * n // parts, (part + 1) * n // parts):
@@ -137,7 +137,7 @@ def catch_up(rows, width, p, m, v, last, now, rates, roots, parts):
 
 @parallel_kernel
 def catch_up_all(width, p, m, v, last, now, rates, roots, parts):
-    """`catch_up` of every row."""
+    """Do as `catch_up` for every row."""
     n = last.shape[0]
     for part in numba.prange(parts):
         for row in range(part * n // parts, (part + 1) * n // parts):
@@ -146,7 +146,7 @@ def catch_up_all(width, p, m, v, last, now, rates, roots, parts):
 
 @parallel_kernel
 def sparse(visible, width, p, m, v, g, last, now, rates, roots, parts):
-    """Step `now` (counted from 0) of the visible rows with their gradient; the others are left for later."""
+    """Take step `now` (counted from 0) of the visible rows; the others are put off."""
     n = visible.shape[0]
     for part in numba.prange(parts):
         row = part * n // parts
@@ -157,13 +157,13 @@ def sparse(visible, width, p, m, v, g, last, now, rates, roots, parts):
                 _row_catch_up(row, width, p, m, v, last, now, rates, roots)
                 last[row] = now + 1
                 row += 1
-            # neighbours in one go: a row alone ends in a vector that is not full
+            # neighbouring rows are stepped together: a single row ends in a vector that is not full
             _dense_range(begin * width, row * width, p, m, v, g, rates[now], roots[now])
             row += 1
 
 
 def flat(parameter: Tensor, moments: tuple[Tensor, Tensor]) -> tuple[np.ndarray, ...]:
-    """A parameter and its moments as flat arrays on the same memory.
+    """Return a parameter and its moments as flat arrays on the same memory.
 
     Raises:
         RuntimeError: the parameter is not contiguous.
@@ -174,25 +174,25 @@ def flat(parameter: Tensor, moments: tuple[Tensor, Tensor]) -> tuple[np.ndarray,
 
 
 def step_size(rate: float, steps: int) -> tuple[np.float32, np.float32]:
-    """lr / bias1 and 1 / sqrt(bias2) of the step that makes it so many."""
+    """Return lr / bias1 and 1 / sqrt(bias2) of step number `steps`, counted from 1."""
     return np.float32(rate / (1 - BETAS[0] ** steps)), np.float32((1 - BETAS[1] ** steps) ** -0.5)
 
 
 def dense_step(
     parameter: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor], rate: float, steps: int
 ) -> None:
-    """One step of every value, in place; arguments as of `Backend.adam_step`."""
+    """Step every value in place; arguments as for `Backend.adam_step`."""
     arrays = *flat(parameter, moments), gradient.numpy().reshape(-1)
     dense(*arrays, *step_size(rate, steps), 8 * threads())
 
 
-_MAGNITUDE = np.int32(0x7FFFFFFF)  # all of a float32 but its sign
-_INFINITY = np.int32(0x7F800000)  # as an integer: every finite magnitude lies below, every NaN above
+_MAGNITUDE = np.int32(0x7FFFFFFF)  # all bits of a float32 but its sign
+_INFINITY = np.int32(0x7F800000)  # as an integer: finite magnitudes are smaller, NaN is larger
 
 
 @kernel
 def _largest(arrays):
-    """The largest magnitude as an integer, in which magnitudes order as they do as numbers."""
+    """Return the largest magnitude as an integer; as integers magnitudes have the same order."""
     largest = np.int32(0)
     for bits in arrays:
         for i in range(bits.shape[0]):

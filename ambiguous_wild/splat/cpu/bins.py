@@ -1,12 +1,14 @@
-"""Who is drawn in which tile, front to back, and which blocks of pixels of a tile a Gaussian can reach.
+"""Which Gaussians are drawn in which tile, front to back, and which blocks of pixels of a tile they can
+reach.
 
-One depth sort of what is visible, then a counting sort by tile. The tile test is exact (fast-training.md
-eq. 3): for each row of tiles the interval of x the 1/255 contour reaches among that row's pixel centres.
-Every loop splits into a fixed number of parts, so the lists do not depend on the number of threads.
+Visible Gaussians are sorted by depth once, then by tile in a counting sort. The tile test is exact
+(fast-training.md eq. 3): for each row of tiles it finds the interval of x that the 1/255 contour reaches
+among the pixel centres of that row. Every loop splits into a fixed number of parts, so the lists do not
+depend on the number of threads.
 
-A tile's pixels lie in memory as blocks of 4 x 4, each one vector. Most Gaussians are a few pixels wide: of
-the 32 000 of a trained capture at 240 px, 185 000 blocks of 4 x 4 hold a pixel that is drawn, but 208 000
-of 8 x 2 and 290 000 rows of 16.
+A tile's pixels lie in memory as blocks of 4 x 4, each one vector. Most Gaussians are a few pixels wide: for
+the 32 000 of a trained capture at 240 px, 185 000 blocks of 4 x 4 hold a pixel that is drawn, but 208 000 of
+8 x 2 and 290 000 rows of 16.
 """
 
 from __future__ import annotations
@@ -32,17 +34,17 @@ from ambiguous_wild.splat.cpu.project import (
 )
 from ambiguous_wild.splat.cpu.simd import prefetch
 
-TILE = 16  # px, both ways; a row of a tile is one vector
+TILE = 16  # px, width and height; a row of a tile is one vector
 PARTS = 16  # work items of the parallel loops over ranks
-SPAN_ROWS = 3  # rows of tiles whose spans are kept between the two passes; most Gaussians reach fewer
-SPANS = 2 + 2 * SPAN_ROWS  # int16 a Gaussian: first and last row, first and last column in each
-_AHEAD = 8  # ranks; records lie in another order and are asked for before they are read
-_SLACK = 1e-3  # px; float32 rounding never loses a pixel, the alpha test decides
+SPAN_ROWS = 3  # rows of tiles whose spans are stored between the two passes; few Gaussians reach more
+SPANS = 2 + 2 * SPAN_ROWS  # int16 values of a Gaussian: first and last row, first and last column of each row
+_AHEAD = 8  # ranks between a record that is used and one that is prefetched; records lie in another order
+_SLACK = 1e-3  # px, so that float32 rounding loses no pixel; the alpha test decides
 
 
 @kernel
 def visible_slots(ids, counts):
-    """Slots of the records in use, in the order of their Gaussians."""
+    """Return the slots of the records in use, in the order of their Gaussians."""
     total = 0
     for chunk in range(counts.shape[0]):
         total += counts[chunk]
@@ -58,7 +60,7 @@ def visible_slots(ids, counts):
 
 @kernel
 def depth_order(slots, records):
-    """The slots sorted by depth, ties in the order given: radix sort of the float bits, 11 bits a pass."""
+    """Sort the slots by depth, stably: a radix sort of the float bits, 11 bits a pass."""
     n = slots.shape[0]
     keys = np.empty(n, np.uint32)
     depths = np.empty(n, np.float32)
@@ -94,20 +96,20 @@ def depth_order(slots, records):
 
 @kernel
 def first_pixel(border, size):
-    """First pixel whose centre is not before `border`; at least 0, and past the end where there is none."""
-    # bounded before it is a whole number: of a centre far out, centre - extent is rounded to anything
+    """Return the first pixel whose centre is not before `border`: at least 0, past the end if none."""
+    # bounded before conversion to an integer: for a distant centre, centre - extent can round to any value
     return math.ceil(min(max(border - 0.5 - _SLACK, 0.0), size + TILE))
 
 
 @kernel
 def last_pixel(border, size):
-    """Last pixel whose centre is not behind `border`; at most size - 1, and negative where there is none."""
+    """Return the last pixel whose centre is not behind `border`: at most size - 1, negative if none."""
     return math.floor(max(min(border - 0.5 + _SLACK, size - 1.0), -1.0))
 
 
 @kernel
 def tile_rows(record, height):
-    """First and last row of tiles that hold a pixel centre within the contour's y extent."""
+    """Return the first and last row of tiles with a pixel centre within the contour's y extent."""
     low = first_pixel(record[MY] - record[EXTENT_Y], height)
     high = last_pixel(record[MY] + record[EXTENT_Y], height)
     return int(low) // TILE, int(high) // TILE
@@ -115,7 +117,7 @@ def tile_rows(record, height):
 
 @kernel
 def tile_span(record, row, width):
-    """First and last tile column the contour reaches in a row of tiles; last < first if none.
+    """Return the first and last tile column that the contour reaches in a row; last < first if none.
 
     Over a band of y the right border of an ellipse is largest at its rightmost point if that lies in
     the band, else at the band's edge nearest to it; the left border is its mirror image.
@@ -124,7 +126,7 @@ def tile_span(record, row, width):
     high = last_pixel(record[MX] + record[EXTENT_X], width)
     if low > high:
         return 1, 0
-    if int(low) // TILE == int(high) // TILE:  # nothing to be narrowed
+    if int(low) // TILE == int(high) // TILE:  # a single column cannot be narrowed
         return int(low) // TILE, int(high) // TILE
     ex = np.float64(record[EXTENT_X])
     ey = np.float64(record[EXTENT_Y])
@@ -150,13 +152,13 @@ def tile_span(record, row, width):
 
 @parallel_kernel
 def count_tiles(order, records, width, height, columns, instances, histogram, spans):
-    """Per slot the number of tiles, per part and tile the number of ranks.
+    """Count the tiles of each slot, and for each part the ranks in each tile.
 
     Args:
         order: [M] int32 slots by depth.
-        instances: [N] int32 out.
-        histogram: [PARTS, tiles] int32 out.
-        spans: [M, SPANS] int16 out, of each rank.
+        instances: [N] int32 out, number of tiles of each slot.
+        histogram: [PARTS, tiles] int32 out, number of ranks.
+        spans: [M, SPANS] int16 out, rows and columns of each rank.
     """
     n = order.shape[0]
     for part in numba.prange(PARTS):
@@ -182,7 +184,7 @@ def count_tiles(order, records, width, height, columns, instances, histogram, sp
 
 @kernel
 def prefix(slots, instances, offsets, histogram, starts):
-    """Exclusive sums: offsets of a slot's instances, starts of the tiles, cursors of the parts in each."""
+    """Sum exclusively: offsets of each slot's instances, starts of tiles, cursors of the parts in them."""
     total = 0
     for k in range(slots.shape[0]):
         offsets[slots[k]] = total
@@ -225,20 +227,20 @@ def scatter(order, records, width, columns, spans, offsets, histogram, tile_slot
 
 
 PIXELS = TILE * TILE
-SIDE = 4  # px, both ways, of a block
+SIDE = 4  # px, width and height of a block
 BLOCK = SIDE * SIDE
-ACROSS = TILE // SIDE  # blocks of a tile, both ways; block b lies in row b // 4 and column b % 4 of them
+ACROSS = TILE // SIDE  # blocks along a side of a tile; block b lies in row b // 4 and column b % 4
 
 
 @kernel
 def in_tile(x, y):
-    """Where pixel (x, y) of a tile stands in its planes: block after block, each row by row."""
+    """Return the index of pixel (x, y) of a tile in its planes: block after block, each row by row."""
     return ((y // SIDE) * ACROSS + x // SIDE) * BLOCK + (y % SIDE) * SIDE + x % SIDE
 
 
 @kernel
 def aligned_planes(count):
-    """[count, 256] float32 zeros that start on a cache line: a block that lies across two costs twice."""
+    """Return zeros [count, 256] float32 that start on a cache line: a block across two lines costs twice."""
     room = np.zeros(count * PIXELS + BLOCK, np.float32)
     start = (-room.ctypes.data % (4 * BLOCK)) // 4
     return room[start : start + count * PIXELS].reshape(count, PIXELS)
@@ -246,7 +248,7 @@ def aligned_planes(count):
 
 @kernel
 def pixel_centres():
-    """x and y [256] of the pixel centres of a tile, in the order of its planes."""
+    """Return x and y [256] of the pixel centres of a tile, in the order of its planes."""
     planes = aligned_planes(2)
     x_centres, y_centres = planes[0], planes[1]
     for y in range(TILE):
@@ -258,7 +260,7 @@ def pixel_centres():
 
 @kernel
 def _block_range(middle, extent):
-    """First and one past the last block, along one axis, with pixel centres within `extent` of `middle`."""
+    """Return the first block, and one past the last, with pixel centres within `extent` of `middle`."""
     low = math.ceil(middle - extent - np.float32(0.501))
     high = math.floor(middle + extent - np.float32(0.499))
     return np.int64(max(low, 0)) // SIDE, np.int64(min(high, TILE - 1)) // SIDE + 1
@@ -266,7 +268,7 @@ def _block_range(middle, extent):
 
 @kernel
 def candidates(record, mx, my):
-    """Blocks that the box around the contour reaches, as bits; (mx, my) is the centre in the tile."""
+    """Return the blocks that the contour's box reaches, as bits; (mx, my) is the centre in the tile."""
     left, right = _block_range(mx, record[EXTENT_X])
     low, high = _block_range(my, record[EXTENT_Y])
     if left >= right or low >= high:

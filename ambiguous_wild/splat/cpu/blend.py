@@ -1,10 +1,10 @@
-"""Blending, tile by tile and sixteen pixels at a time, and its way back.
+"""Blending, tile by tile and sixteen pixels at a time, and its backward pass.
 
-Forward: front to back with the state of a tile in the first-level cache; the blocks of 4 x 4 pixels that a
-Gaussian drew in are noted. Backward: back to front through the noted blocks alone; the transmittance is
-recovered by dividing by 1 - alpha, never below 0.01, so its relative error stays that of the forward product
-and what lies behind is a sum without cancellation. Each (tile, Gaussian) writes one row of sums; `reverse.py`
-adds the rows of a Gaussian in a fixed order.
+Forward: Gaussians are blended front to back, with the state of a tile in the first-level cache; the blocks of
+4 x 4 pixels in which a Gaussian was drawn are noted. Backward: back to front, only through the noted blocks.
+The transmittance is recovered by a division by 1 - alpha, which is never below 0.01, so its relative error
+stays that of the forward product, and the light from behind is a sum without cancellation. Each (tile,
+Gaussian) writes one row of sums; `reverse.py` adds the rows of a Gaussian in a fixed order.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ from ambiguous_wild.splat.cpu.simd import (
 )
 
 MAX_ALPHA = np.float32(0.99)
-STOP = np.float32(1e-4)  # a Gaussian that would bring the transmittance to or below it is not drawn
+STOP = np.float32(1e-4)  # a Gaussian that would lower the transmittance to this or less is not drawn
 LOG2_MIN_ALPHA = np.float32(-math.log2(255.0))
-# Entries of a list between the one blended and the one whose record is asked for: records lie in the order of
-# the Gaussians, and waiting for each took longer than blending it (backward: 5.7 ms without, 2.6 ms with).
+# Entries of a list between the one that is blended and the one whose record is prefetched: records lie in the
+# order of the Gaussians, and waiting for one takes longer than blending it (backward 2.6 ms instead of 5.7).
 AHEAD = 6
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -71,7 +71,7 @@ ROW = 16
 def _forward_tile(records, slots, begin, end, left, top, width, height, centres, state, touched):
     """Blend a tile's list into `state` = (T, red, green, blue, depth, last); notes the blocks drawn.
 
-    T carries a sign: negative once the pixel has stopped (or lies outside the image).
+    T is negative once the pixel has stopped, or if it lies outside the image.
     """
     transmittance, red, green, blue, depth, last = state
     x_centres, y_centres = centres
@@ -177,7 +177,7 @@ def forward(
         image, alpha, depth: [H, W, 3], [H, W], [H, W] out.
         kept: [tiles, 2, 256] float32 out, in the order of `in_tile`: final transmittance (sign: see
             `_forward_tile`), last index drawn.
-        touched: [I] uint16 out: blocks of its tile that an entry of the lists drew in, as bits.
+        touched: [I] uint16 out: blocks of the tile in which each entry of the lists was drawn, as bits.
     """
     for worker in numba.prange(workers):
         _forward_worker(
@@ -192,8 +192,8 @@ def _backward_tile(
     absolute, tally, sums,
 ):  # fmt: skip
     """Walk a tile's list back to front; planes = (T, last, behind, cotangents of red, green, blue,
-    alpha, depth). `extra` = (behind, red, green, blue) of the second cotangent. What is None of `with_extra`,
-    `with_depth`, `absolute` and `tally` is compiled away.
+    alpha, depth). `extra` = (behind, red, green, blue) of the second cotangent. If one of `with_extra`,
+    `with_depth`, `absolute` and `tally` is None, its code is not compiled.
     """
     transmittance, last, behind, d_red, d_green, d_blue, d_alpha, depths = planes
     x_centres, y_centres = centres
@@ -259,11 +259,11 @@ def _backward_tile(
             if absolute is not None:
                 hu_main = h * u
                 a_u = a_u + magnitude(hu_main)
-                # dsigma/dv apart from constants that the reduction multiplies in.
+                # dsigma/dv without constants, by which `reverse` multiplies the sum
                 a_v = a_v + magnitude(fma(hu_main, curve_x * slant, h * (dy * -curve_y)))
             if tally is not None:
                 hu_one = h * u
-                # as above, and dsigma/du with the same constants left out
+                # as above, and dsigma/du without the same constants
                 along_u = hu_one * curve_x
                 along_v = fma(hu_one, curve_x * slant, h * (dy * -curve_y))
                 squares = squares + fma(along_u, along_u, along_v * along_v)
@@ -318,7 +318,7 @@ def _backward_worker(
         rows = min(TILE, height - top)
         across = min(TILE, width - left)
         if rows < TILE or across < TILE:
-            # Pixels outside the picture meet weight 0, which only makes 0 of what is finite.
+            # Pixels outside the picture have weight 0; 0 times a value is 0 only if the value is finite.
             room[:] = _ZERO
         for at in range(PIXELS):
             planes[0][at] = abs(kept[tile, 0, at])
@@ -358,11 +358,11 @@ def backward(
     records, tile_slots, tile_instances, starts, tile_order, workers, width, height, background, kept,
     touched, d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
 ):  # fmt: skip
-    """Row of sums of every (tile, Gaussian).
+    """Write the row of sums of every (tile, Gaussian).
 
     Args:
         d_image: [H, W, 3]; d_alpha, d_depth: [H, W] or None; d_extra: [H, W, 3] or None.
-        absolute, tally: True or None; a tally is squared sums and pixel counts.
+        absolute, tally: True or None; the tally holds squared sums and pixel counts.
         sums: [I * 16] float32 out, row `tile_instances[k]` for list entry k.
         others: as in `forward`.
     """

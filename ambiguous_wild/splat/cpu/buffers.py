@@ -1,4 +1,4 @@
-"""Large arrays used again from step to step: fresh pages from the system cost more than filling them."""
+"""Large arrays that are reused from step to step: fresh pages from the system cost more than filling them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-_LINE = 64  # bytes of a cache line; what starts on one is read and written in whole lines
+_LINE = 64  # bytes of a cache line, on which arrays start so that they are accessed in whole lines
 
 
 class _Memory:
     """A block of bytes that is lent out as one array at a time.
 
-    The lease is an array right on the bytes. Whatever is made of it (views, tensors, views of tensors) keeps
-    the lease alive: numpy shortens a chain of views to the first array that does not lie in another array,
-    which is the lease, because it lies in a memoryview. So when the lease is gone, nobody can see the bytes.
+    The lease is an array directly on the bytes. All that is made of it (views, tensors, views of tensors)
+    keeps it alive: numpy lets a view refer to the first array whose memory is no other array's. That is the
+    lease, because its memory is a memoryview's. So when the lease is gone, nothing can read the bytes.
     """
 
     __slots__ = ("_bytes", "_lease", "_start")
@@ -25,8 +25,8 @@ class _Memory:
     def __init__(self, block: np.ndarray, start: int = 0) -> None:
         """
         Args:
-            block: [bytes] uint8, held by nobody else.
-            start: byte where leases begin.
+            block: [bytes] uint8 that nothing else refers to.
+            start: first byte of a lease.
         """
         self._bytes, self._start = memoryview(block), start
         self._lease: weakref.ref[np.ndarray] | None = None
@@ -36,33 +36,33 @@ class _Memory:
 
     @property
     def lent(self) -> bool:
-        """Whether somebody still holds the last lease, or anything made of it."""
+        """Whether the last lease, or anything made of it, still exists."""
         return self._lease is not None and self._lease() is not None
 
     def lend(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """An array with the content that the bytes have; only where nothing is lent."""
+        """Return an array on the bytes as they are; call it only if nothing is lent."""
         lease = np.frombuffer(self._bytes, dtype, math.prod(shape), self._start)
         self._lease = weakref.ref(lease)
         return lease.reshape(shape)
 
 
 class Pool:
-    """Hands out arrays, and the same memory again as soon as nobody holds the array.
+    """Lends arrays, and lends their memory again as soon as nothing refers to an array any more.
 
-    A tensor or view made from an array keeps it lent and thereby keeps its memory out of the pool, so what a
-    caller holds never changes under it. At most `keep` blocks a kind are remembered.
+    A tensor or view of an array keeps it lent, so the values that a caller holds never change. At most `keep`
+    blocks are remembered for each name.
     """
 
     def __init__(self, keep: int = 3) -> None:
         self._keep = keep
         self._blocks: dict[str, list[_Memory]] = {}
-        self._rows: dict[tuple[Any, ...], list[tuple[_Memory, np.ndarray]]] = {}  # with the mask of each
+        self._rows: dict[tuple[Any, ...], list[tuple[_Memory, np.ndarray]]] = {}  # each with its mask
         self._lock = threading.Lock()
 
     def take(
         self, name: str, shape: tuple[int, ...], dtype: Any = np.float32, slack: float = 0.0
     ) -> np.ndarray:
-        """An array of that shape with any content; `slack` is room for a somewhat larger need next time."""
+        """Return an array of any content; `slack` is the share of room added for a larger shape next time."""
         room = np.dtype(dtype).itemsize * math.prod(shape)
         with self._lock:
             blocks = self._blocks.setdefault(name, [])
@@ -76,21 +76,21 @@ class Pool:
             return memory.lend(shape, dtype)
 
     def take_rows(self, name: str, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """A float32 array whose rows are zero but where the mask given with it, [rows] bool, is set.
+        """Return a float32 array and a mask [rows] bool; rows outside of the mask are zero.
 
-        Who writes rows keeps the mask up to date, so that the next one to get the array clears only them.
+        Code that writes rows updates the mask, so that the next user of the array clears only those.
         """
         with self._lock:
-            known = self._rows.setdefault((name, *shape), [])
-            for memory, dirty in known:
+            pairs = self._rows.setdefault((name, *shape), [])
+            for memory, dirty in pairs:
                 if not memory.lent:
                     return memory.lend(shape, np.float32), dirty
             memory = _Memory(np.zeros(4 * math.prod(shape), np.uint8))
             dirty = np.zeros(shape[0], np.bool_)
             for key in [key for key in self._rows if key[0] == name and key != (name, *shape)]:
                 del self._rows[key]
-            if len(known) < self._keep:
-                known.append((memory, dirty))
+            if len(pairs) < self._keep:
+                pairs.append((memory, dirty))
             return memory.lend(shape, np.float32), dirty
 
     def clear(self) -> None:

@@ -1,12 +1,12 @@
-"""How kernels are compiled: one place for the cache, the threads and the threading layer.
+"""How kernels are compiled: the cache, the threads and the threading layer.
 
-Numba's own cache compares a kernel's file alone, so that a change in a function it calls, in another file,
-would go unnoticed. Here compiled kernels lie in a folder whose name is a hash over all of them.
+Numba's own cache compares only a kernel's own file, so a change in another file that the kernel uses would go
+unnoticed. Here compiled kernels lie in a folder whose name is a hash over the source of all kernels.
 
-The layer is OpenMP where Numba finds it, which shares two cores with torch's own pool without loss: a step
-of 11 ms and torch work of 7 ms took 20 ms one after the other. Numba's work queue took 35 to 80 ms: torch's
-threads wait on the core its worker needs. The queue, used where there is no OpenMP, allows one caller at a
-time, so parallel kernels run under a lock. OpenMP does not survive a fork: start processes anew.
+The layer is OpenMP where Numba finds it. It shares two cores with torch's threads without loss: a step of 11
+ms and torch work of 7 ms took 20 ms one after the other. Numba's work queue took 35 to 80 ms, because torch's
+threads wait on the core that its worker needs. The queue is used where there is no OpenMP. It allows one
+caller at a time, so parallel kernels run under a lock. OpenMP does not survive a fork: start processes anew.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ambiguous_wild.io.numba_cache import rebuild_damaged_cache as forgiving
 
 
 def kernel_cache() -> Path:
-    """The user's own NUMBA_CACHE_DIR first, then the home cache, then a private temporary folder."""
+    """Return the folder of compiled kernels: NUMBA_CACHE_DIR, else in the home cache, else temporary."""
     explicit = os.environ.get("NUMBA_CACHE_DIR")
     if explicit:
         return Path(explicit)
@@ -46,7 +46,7 @@ def kernel_cache() -> Path:
 
 
 def _private_temporary() -> Path:
-    """A temporary folder of this user alone: compiled code is loaded from it."""
+    """Return a temporary folder that only this user can write to, as compiled code is loaded from it."""
     user = os.getuid() if hasattr(os, "getuid") else None  # Windows: its temporary folder is the user's own
     folder = Path(tempfile.gettempdir()) / f"ambiguous_wild-{'user' if user is None else user}"
     try:
@@ -59,7 +59,7 @@ def _private_temporary() -> Path:
     return folder if mine else Path(tempfile.mkdtemp(prefix="ambiguous_wild-"))
 
 
-LAYERS = ["omp", "tbb", "workqueue"]  # the first that is there
+LAYERS = ["omp", "tbb", "workqueue"]  # threading layers; the first that is installed is used
 _config: Any = numba.config
 _lock = threading.RLock()
 
@@ -74,25 +74,25 @@ _prepare()
 
 
 def intrinsic(function: Callable[..., Any]) -> Any:
-    """Numba's `intrinsic`, untyped: callers see the compiled signature, without the typing context."""
+    """Decorate with Numba's `intrinsic`; untyped, because callers do not pass the typing context."""
     return _intrinsic(function)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile for one thread; the result is kept on disk. Every operation rounds by itself, as written."""
+    """Compile for one thread; the result is kept on disk. Every operation is rounded as written."""
     return forgiving(numba.njit(cache=True, error_model="numpy")(function))
 
 
 def fused_kernel(function: Callable[..., Any]) -> Any:
     """Like `kernel`, but a product may be fused into a sum and a division turned into a product.
 
-    NaN and infinity keep their meaning; what must round alike in two kernels does not belong here.
+    NaN and infinity keep their meaning. Do not use it for values that must round alike in two kernels.
     """
     return forgiving(numba.njit(cache=True, error_model="numpy", fastmath={"contract", "arcp"})(function))
 
 
 class _Serialized:
-    """A parallel kernel that one thread of the process runs at a time."""
+    """A parallel kernel that only one thread of the process runs at a time."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.compiled = forgiving(numba.njit(cache=True, parallel=True, error_model="numpy")(function))
@@ -118,13 +118,13 @@ def set_threads(n: int) -> None:
 
 
 def threads() -> int:
-    """Threads the kernels use."""
+    """Return the number of threads that the kernels use."""
     return int(numba.get_num_threads())
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run kernels on one thread meanwhile."""
+    """Run kernels on one thread inside of the context."""
     before = threads()
     set_threads(1)
     try:

@@ -1,9 +1,9 @@
 """L1 and SSIM of two pictures with the gradient to the first, fused: two passes over rows of sixteen lanes.
 
-Window: Gaussian of 11 taps, sigma 1.5, zero padding, each channel by itself (as Inria's code does). The
-gradient is the closed form: with S = A1 A2 / (B1 B2) and w the weight of a pixel, the maps w dS/dmean,
-w dS/dE[xx], w dS/dE[xy] go through the same window and meet x and y. Rows of a picture are laid out
-channel-interleaved, so that a tap to the right is three floats away.
+The window is a Gaussian of 11 taps and sigma 1.5, with zero padding, for each channel separately (as in
+Inria's code). The gradient is the closed form: with S = A1 A2 / (B1 B2) and w the weight of a pixel, the maps
+w dS/dmean, w dS/dE[xx], w dS/dE[xy] are blurred by the same window and multiplied by x and y. Rows of a
+picture are stored channel-interleaved, so that a tap to the right is three floats away.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ PAD = 16  # floats on either side of a row buffer, at least 3 * RADIUS
 
 
 def window() -> np.ndarray:
-    """[11] float32 taps of the Gaussian window, sum 1."""
+    """Return the taps [11] float32 of the Gaussian window, sum 1."""
     taps = np.exp(-((np.arange(11) - 5.0) ** 2) / (2 * 1.5**2))
     return (taps / taps.sum()).astype(np.float32)
 
 
 def stride(width: int) -> int:
-    """Floats a padded row of `width` RGB pixels takes."""
+    """Return the number of floats in a padded row of `width` RGB pixels."""
     return -(-3 * width // 16) * 16
 
 
@@ -52,7 +52,7 @@ def pack(image, keep, out):
 def _statistics_row(
     y, height, width, x_rows, y_rows, taps, keep, scale, buffers, maps, weights, ssim, totals
 ):
-    """Row y of the statistics: sums of w |x - y| and w (1 - S), and the three maps times `scale`."""
+    """Compute row y of the statistics: sums of w |x - y| and w (1 - S), and the three maps times `scale`."""
     length = x_rows.shape[1]
     flat_x = x_rows.reshape(-1)
     flat_y = y_rows.reshape(-1)
@@ -137,7 +137,7 @@ def _statistics_row(
 
 @kernel
 def _gradient_row(y, height, width, x_rows, y_rows, taps, keep, outer, l1_scale, buffers, maps, weights, out):
-    """Row y of the gradient: window of the three maps plus l1_scale times the sign, times `outer`."""
+    """Compute row y of the gradient: the blurred maps plus l1_scale times the sign, times `outer`."""
     length = x_rows.shape[1]
     flat_x = x_rows.reshape(-1)
     flat_y = y_rows.reshape(-1)
@@ -240,7 +240,7 @@ def _packed(name: str, image: Tensor, keep: np.ndarray | None) -> np.ndarray:
 def photometric_cpu(
     render: Tensor, photo: Tensor, keep: Tensor | None, lambda_dssim: float, weighting: str
 ) -> tuple[float, float, Tensor]:
-    """L1, 1 - SSIM and the gradient of their mix; arguments as `losses.photometric`."""
+    """Return L1, 1 - SSIM and the gradient of their mix; arguments as for `losses.photometric`."""
     height, width = render.shape[:2]
     mask = None if keep is None else _plain(keep)
     inside = mask if weighting == "images" else None
@@ -254,13 +254,13 @@ def photometric_cpu(
         x_rows, y_rows, width, _taps, outside, inside, float(lambda_dssim), min(height, threads()), maps,
         None, totals, out,
     )  # fmt: skip
-    # One serial sum over rows: the order, and so the bits, do not depend on the threads.
+    # One serial sum over rows, so that its order, and so the bits, do not depend on the threads.
     l1, dssim = (totals.cumsum(axis=0)[-1] / (3 * height * width)).tolist()
     return l1, dssim, torch.from_numpy(out)
 
 
 def ssim_map_cpu(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM of every pixel and channel, [H, W, 3]."""
+    """Return SSIM of every pixel and channel, [H, W, 3]."""
     height, width = a.shape[:2]
     x_rows = _packed("render", a, None)
     y_rows = _packed("photo", b, None)

@@ -1,15 +1,16 @@
-"""Gaussians to splats: activations, EWA projection and culls, one record of 16 floats for each that is seen.
+"""From Gaussians to splats: activations, EWA projection, culls and colours, one record of 16 floats each.
 
-Card gsplat.md eq. 1 to 6 with opacity-aware extents (fast-training.md eq. 1). The blurred 2D covariance
-S is kept in the form that needs no difference of large numbers: with ``k = Sxy / Syy``,
+The projection is card gsplat.md eq. 1 to 6 with opacity-aware extents (fast-training.md eq. 1). The blurred
+2D covariance S is stored in a form that needs no difference of large numbers: with ``k = Sxy / Syy``,
 ``v = det S / Syy`` (variance of x given y) and ``q = 1 / Syy``,
 
     sigma = u^2 / (2 v) + q dy^2 / 2,    u = dx - k dy,
 
-and ``det S = |f1 x f2|^2 + blur trace + blur^2`` where f1, f2 are the rows of J W R diag(s). A needle
-of aspect 1e6 keeps its shape in float32 that way.
+and ``det S = |f1 x f2|^2 + blur trace + blur^2`` where f1, f2 are the rows of J W R diag(s). So a needle of
+aspect 1e6 keeps its shape in float32.
 
-Real spherical harmonics to degree 3: colours of the splats and the way back, without a basis in memory.
+Colours are real spherical harmonics to degree 3; their values are computed where they are needed, forward and
+backward, and not stored.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 
 @fused_kernel
 def basis(x, y, z, degree, out):
-    """Values of the harmonics 1 .. (degree + 1)^2 - 1 at a unit direction, in 3DGS's order and signs."""
+    """Write the harmonics 1 .. (degree + 1)^2 - 1 at a unit direction to `out`, in 3DGS's order and signs."""
     if degree >= 1:
         out[0] = -C1 * y
         out[1] = C1 * z
@@ -66,7 +67,7 @@ def basis(x, y, z, degree, out):
 
 @fused_kernel
 def direction_gradient(x, y, z, degree, d):
-    """sum_j d[j] * d(basis j)/d(x, y, z), the harmonics taken as polynomials of three free variables."""
+    """Return sum_j d[j] * d(basis j)/d(x, y, z), for harmonics as polynomials of three free variables."""
     gx = -C1 * d[2]
     gy = -C1 * d[0]
     gz = C1 * d[1]
@@ -140,8 +141,8 @@ def _colours_chunk(first, stop, means, sh0, sh_rest, degree, centre, records, id
 def colours(means, sh0, sh_rest, degree, centre, records, ids, counts, radii, base):
     """Fill red, green, blue of the records: max(SH(direction) + 0.5, 0).
 
-    A colour that is not finite takes its Gaussian out of the picture: id -1 and radius 0. `base` [slots, 3]
-    or None takes the colours before they are clamped, for a shading function.
+    A Gaussian whose colour is not finite is not drawn: it gets id -1 and radius 0. `base` [slots, 3] or None
+    gets the colours before they are clamped, for a shading function.
     """
     for chunk in numba.prange(counts.shape[0]):
         first = chunk * CHUNK
@@ -153,8 +154,8 @@ def colours(means, sh0, sh_rest, degree, centre, records, ids, counts, radii, ba
 BLUR = 0.3  # px^2 added to both variances unless a method says otherwise
 NEAR = 0.01  # smallest depth that is drawn
 MIN_ALPHA = 1.0 / 255.0
-CHUNK = 1024  # Gaussians a work item; records of a chunk are contiguous
-GROUP = 64  # Gaussians whose values are brought side by side before eight at a time are computed
+CHUNK = 1024  # Gaussians of a work item; records of a chunk are contiguous
+GROUP = 64  # Gaussians whose values are transposed together, and then computed eight at a time
 RECORD = 16  # floats a record: one cache line
 
 # Fields of a record.
@@ -163,19 +164,19 @@ EXTENT_X, EXTENT_Y, VARIANCE_Y, VARIANCE_X, HALF_WIDTH, OPACITY = range(10, 16)
 
 _LOG2E = 1.4426950408889634
 _LOG_255 = math.log(255.0)
-_FAR_PX = 1e15  # a centre so far out is no place in float32 any more
+_FAR_PX = 1e15  # centres farther out have no accurate position in float32
 _HUGE = 1e30
-_SHORT = 1e-30  # norm of a quaternion: its gradient is divided by it, and float32 ends at 3e38
+_SHORT = 1e-30  # least norm of a quaternion: its gradient is divided by it, and float32 ends at 3e38
 
 
 @fused_kernel
 def footprint(quat, cam, x, y, z):
-    """Rows p, q of J W R, its rows without R, and R: what S and its gradient are made of.
+    """Return the rows p, q of J W R, those of J W, and R: S and its gradient are computed from these.
 
     Args:
-        quat: w, x, y, z of norm 1, a vector each.
+        quat: w, x, y, z of norm 1, each a vector.
         cam: as in `project`.
-        x, y, z: the centre as the camera sees it.
+        x, y, z: the centre in the camera's coordinates.
     """
     w_, qx, qy, qz = quat
     near = 1.0 / z
@@ -225,7 +226,7 @@ def take(given, k, i, means, quats, log_scales, opacity_logits):
 
 @fused_kernel
 def in_camera(given, at, cam):
-    """The centres of columns at .. at + 7 as the camera sees them."""
+    """Return the centres of columns at .. at + 7 in the camera's coordinates."""
     m0 = load8(given, at)
     m1 = load8(given, GROUP + at)
     m2 = load8(given, 2 * GROUP + at)
@@ -238,7 +239,7 @@ def in_camera(given, at, cam):
 
 @fused_kernel
 def shape_of(given, at):
-    """Unit quaternion, the norm it had, and the scales of columns at .. at + 7."""
+    """Return unit quaternion, norm before normalisation, and scales of columns at .. at + 7."""
     w_ = load8(given, 3 * GROUP + at)
     qx = load8(given, 4 * GROUP + at)
     qy = load8(given, 5 * GROUP + at)
@@ -254,8 +255,8 @@ def shape_of(given, at):
 
 
 @fused_kernel
-def _project_eight(given, at, cam, antialias, found):
-    """Project columns at .. at + 7 into `found` [14, GROUP]; returns which pass the culls, as bits."""
+def _project_eight(given, at, cam, antialias, splats):
+    """Project columns at .. at + 7 into `splats` [14, GROUP]; returns which pass the culls, as bits."""
     blur = cam[22]
     x, y, z = in_camera(given, at, cam)
     # Comparisons are written so that NaN fails them: a broken Gaussian is culled.
@@ -293,21 +294,21 @@ def _project_eight(given, at, cam, antialias, found):
     seen = seen & (ceiling(at_least(u - ex - 0.5, 0.0)) <= floor(at_most(u + ex, cam[16]) - 0.5))
     seen = seen & (ceiling(at_least(v - ey - 0.5, 0.0)) <= floor(at_most(v + ey, cam[17]) - 0.5))
     half = 0.5 * (sxx - syy)
-    store(found, at, u)
-    store(found, GROUP + at, v)
-    store(found, 2 * GROUP + at, sxy / syy)
-    store(found, 3 * GROUP + at, -0.5 * _LOG2E * syy / det)
-    store(found, 4 * GROUP + at, -0.5 * _LOG2E / syy)
-    store(found, 5 * GROUP + at, strength * _LOG2E)
-    store(found, 6 * GROUP + at, z)
-    store(found, 7 * GROUP + at, ex)
-    store(found, 8 * GROUP + at, ey)
-    store(found, 9 * GROUP + at, syy)
-    store(found, 10 * GROUP + at, sxx)
-    store(found, 11 * GROUP + at, square_root(tau * det / syy))
-    store(found, 12 * GROUP + at, opacity)
+    store(splats, at, u)
+    store(splats, GROUP + at, v)
+    store(splats, 2 * GROUP + at, sxy / syy)
+    store(splats, 3 * GROUP + at, -0.5 * _LOG2E * syy / det)
+    store(splats, 4 * GROUP + at, -0.5 * _LOG2E / syy)
+    store(splats, 5 * GROUP + at, strength * _LOG2E)
+    store(splats, 6 * GROUP + at, z)
+    store(splats, 7 * GROUP + at, ex)
+    store(splats, 8 * GROUP + at, ey)
+    store(splats, 9 * GROUP + at, syy)
+    store(splats, 10 * GROUP + at, sxx)
+    store(splats, 11 * GROUP + at, square_root(tau * det / syy))
+    store(splats, 12 * GROUP + at, opacity)
     widest = 0.5 * (sxx + syy) + square_root(half * half + sxy * sxy)  # variance along the long axis
-    store(found, 13 * GROUP + at, square_root(tau * widest))
+    store(splats, 13 * GROUP + at, square_root(tau * widest))
     return bits_of(seen)
 
 
@@ -316,33 +317,33 @@ def _project_chunk(first, means, quats, log_scales, opacity_logits, cam, antiali
     slot = first
     stop = min(first + CHUNK, means.shape[0])
     given = np.zeros((11, GROUP), np.float32)
-    found = np.empty((14, GROUP), np.float32)
+    splats = np.empty((14, GROUP), np.float32)
     for begin in range(first, stop, GROUP):
         count = min(GROUP, stop - begin)
         for k in range(count):
             take(given, k, begin + k, means, quats, log_scales, opacity_logits)
         for at in range(0, count, LANES):
-            seen = _project_eight(given, at, cam, antialias, found)
+            seen = _project_eight(given, at, cam, antialias, splats)
             for k in range(at, min(at + LANES, count)):
                 if not (seen >> (k - at)) & 1:
                     radii[begin + k] = np.float32(0.0)
                     continue
                 ids[slot] = begin + k
                 record = records[slot]
-                record[MX] = found[0, k]
-                record[MY] = found[1, k]
-                record[SLANT] = found[2, k]
-                record[CURVE_X] = found[3, k]
-                record[CURVE_Y] = found[4, k]
-                record[LOG2_OPACITY] = found[5, k]
-                record[DEPTH] = found[6, k]
-                record[EXTENT_X] = found[7, k]
-                record[EXTENT_Y] = found[8, k]
-                record[VARIANCE_Y] = found[9, k]
-                record[VARIANCE_X] = found[10, k]
-                record[HALF_WIDTH] = found[11, k]
-                record[OPACITY] = found[12, k]
-                radii[begin + k] = found[13, k]
+                record[MX] = splats[0, k]
+                record[MY] = splats[1, k]
+                record[SLANT] = splats[2, k]
+                record[CURVE_X] = splats[3, k]
+                record[CURVE_Y] = splats[4, k]
+                record[LOG2_OPACITY] = splats[5, k]
+                record[DEPTH] = splats[6, k]
+                record[EXTENT_X] = splats[7, k]
+                record[EXTENT_Y] = splats[8, k]
+                record[VARIANCE_Y] = splats[9, k]
+                record[VARIANCE_X] = splats[10, k]
+                record[HALF_WIDTH] = splats[11, k]
+                record[OPACITY] = splats[12, k]
+                radii[begin + k] = splats[13, k]
                 slot += 1
     return slot - first
 
@@ -355,7 +356,7 @@ def project(means, quats, log_scales, opacity_logits, cam, antialias, records, i
         means, quats, log_scales, opacity_logits: raw parameters, float32.
         cam: [24] float64: rows of W with t as columns 3 (0-11), fx, fy, cx, cy (12-15), width, height
             (16, 17), limits of x/z and y/z (18-21), the blur in px^2 and its square (22, 23).
-        antialias: 1 scales the opacity by sqrt(det S0 / det S).
+        antialias: 1 = scale the opacity by sqrt(det S0 / det S).
         records: [N, 16] float32 out; chunk i starts at row i * CHUNK.
         ids: [N] int32 out: the Gaussian of each record.
         counts: [chunks] int32 out.

@@ -1,4 +1,4 @@
-"""`render_cpu`: raw parameters to pictures and back with the kernels of this package."""
+"""`render_cpu`: from raw parameters to pictures and back, with the kernels of this package."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _pool = Pool()
 
 
 def camera_vector(camera: Camera, blur: float = project.BLUR) -> np.ndarray:
-    """[24] float64: pose, intrinsics, size, limits of x/z and y/z in the Jacobian, blur and its square."""
+    """Return pose, intrinsics, size, limits of x/z and y/z, blur and its square, [24] float64."""
     out = np.empty(24)
     out[:12] = camera.cam_from_world[:3].ravel()
     out[12:18] = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
@@ -47,7 +47,7 @@ def camera_vector(camera: Camera, blur: float = project.BLUR) -> np.ndarray:
 
 @dataclass
 class _Lists:
-    """What the backward pass needs of the forward pass."""
+    """What the backward pass needs from the forward pass."""
 
     cam: np.ndarray
     centre: np.ndarray
@@ -70,10 +70,10 @@ class _Lists:
 
 @dataclass
 class _Shaded:
-    """Of a render whose colours a function gave."""
+    """State of a render whose colours came from a shading function."""
 
-    rows: Tensor  # [M] int64, Gaussians that were shaded
-    slots: np.ndarray  # [M] their records
+    rows: Tensor  # [M] int64, the shaded Gaussians
+    slots: np.ndarray  # [M] slots of their records
     pull: ShadePull
 
 
@@ -89,27 +89,27 @@ class RenderedCpu:
         self._lists = lists
 
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
-        """Gradients of sum(cotangent * picture) for every raw parameter; may be called more than once.
+        """Return the gradients of sum(cotangent * picture); may be called more than once.
 
-        The Gaussians must hold the values they were rendered with.
+        The Gaussians must still hold the values that were rendered.
 
         Raises:
-            AwError: a cotangent of another shape than its picture, or an unknown statistic.
+            AwError: a cotangent and its picture differ in shape, or a statistic is unknown.
         """
         check_needs(needs)
-        given = as_cotangents(cotangents)
+        c = as_cotangents(cotangents)
         shape = (self._camera.height, self._camera.width, 3)
-        image = torch.zeros(shape) if given.image is None else given.image
+        image = torch.zeros(shape) if c.image is None else c.image
         sums = self._sums(
             _cotangent("d_image", image, shape),
-            _optional("d_alpha", given.alpha, shape[:2]),
-            _optional("d_depth", given.depth, shape[:2]),
-            _optional("d_image_extra", given.extra, shape),
+            _optional("d_alpha", c.alpha, shape[:2]),
+            _optional("d_depth", c.depth, shape[:2]),
+            _optional("d_image_extra", c.extra, shape),
             True if "absolute" in needs else None,
             True if needs & {"squared", "count"} else None,
         )
-        gradients = self._chain(sums, given.extra is not None, needs)
-        gradients.own = sum_own(given.own, gradients.own)
+        gradients = self._chain(sums, c.extra is not None, needs)
+        gradients.own = sum_own(c.own, gradients.own)
         return gradients
 
     def _sums(
@@ -140,10 +140,8 @@ class RenderedCpu:
             out["means"], out["quats"], out["log_scales"], out["opacity_logits"], out["sh0"], rest,
             dirty, screen, screen_extra, screen_abs, tally, None if through is None else through[0],
         )  # fmt: skip
-        found: dict[str, Any] = {name: torch.from_numpy(a) for name, a in out.items()}
         gradients = Gradients(
-            **found,
-            sh_rest=torch.from_numpy(rest),
+            *(torch.from_numpy(values) for values in (*out.values(), rest)),
             screen=torch.from_numpy(screen),
             screen_extra=None if screen_extra is None else torch.from_numpy(screen_extra),
             screen_abs=None if screen_abs is None else torch.from_numpy(screen_abs),
@@ -159,13 +157,13 @@ class RenderedCpu:
         return self._lists.shaded.rows
 
     def _through_shading(self, sums: np.ndarray, shaded: _Shaded) -> tuple[np.ndarray, ShadeGradients]:
-        """dL/d(SH colour) [slots, 3] of every record, and what the shading function itself learns."""
+        """Return dL/d(SH colour) [slots, 3] of every record, and the gradients of the shading function."""
         s = self._lists
         colours = np.zeros((len(s.ids), 3), np.float32)
         reverse.colour_sums(s.records, s.ids, s.counts, s.offsets, s.instances, sums, colours)
-        found = shaded.pull(torch.from_numpy(colours[shaded.slots]))
-        colours[shaded.slots] = _array(found.base)
-        return colours, found
+        gradients = shaded.pull(torch.from_numpy(colours[shaded.slots]))
+        colours[shaded.slots] = _array(gradients.base)
+        return colours, gradients
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -196,11 +194,11 @@ def render_cpu(
 ) -> RenderedCpu:
     """Render on the CPU; arguments and conventions as in `splat.render.render`.
 
-    Between the projection and the colours the optimiser brings the harmonics of the rows about to be seen
-    up to date, see `Gaussians.postponed`.
+    After the projection the optimiser brings the harmonics of the visible rows up to date, see
+    `Gaussians.postponed`.
 
     Raises:
-        AwError: `sh_degree` is not between 0 and what the Gaussians hold.
+        AwError: `sh_degree` is negative or above that of the Gaussians.
     """
     if not 0 <= sh_degree <= gaussians.sh_degree:
         raise AwError(

@@ -1,4 +1,4 @@
-"""From the rows of sums of the tiles to gradients of the raw parameters, eight Gaussians at a time."""
+"""From the rows of sums that tiles wrote to gradients of raw parameters, eight Gaussians at a time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from ambiguous_wild.splat.cpu.project import (
 )
 from ambiguous_wild.splat.cpu.simd import LANES, exp, load, load8, select, splat, store
 
-_PER_LOG2 = 1.3862943611198906  # 2 / log2(e): curvatures of the records are of 2 to the power
+_PER_LOG2 = 1.3862943611198906  # 2 / log2(e), because curvatures of the records are for powers of 2
 
 
 @fused_kernel
@@ -48,7 +48,7 @@ def _cross(a, b):
 
 @fused_kernel
 def _covariance_gradient(sums, f1, f2, antialias, blur, squared_blur):
-    """dL/d(u, v) and dL/d(rows f1, f2 of J W R diag(s)) from the sums h to yy over pixels."""
+    """Return dL/d(u, v) and dL/d(rows f1, f2 of J W R diag(s)) from the sums h to yy over pixels."""
     s_h, s_u, s_uu, s_y, s_uy, s_yy = sums
     sxx = f1[0] * f1[0] + f1[1] * f1[1] + f1[2] * f1[2] + blur
     syy = f2[0] * f2[0] + f2[1] * f2[1] + f2[2] * f2[2] + blur
@@ -88,7 +88,7 @@ def _covariance_gradient(sums, f1, f2, antialias, blur, squared_blur):
 
 @fused_kernel
 def _quaternion_gradient(quat, norm, g):
-    """dL/d(raw quaternion) from dL/dR (nine values, row by row)."""
+    """Return dL/d(raw quaternion) from dL/dR (nine values, row by row)."""
     w, x, y, z = quat
     dw = 2.0 * (z * (g[3] - g[1]) + y * (g[2] - g[6]) + x * (g[7] - g[5]))
     dx = 2.0 * (y * (g[1] + g[3]) + z * (g[2] + g[6]) - 2.0 * x * (g[4] + g[8]) + w * (g[7] - g[5]))
@@ -99,11 +99,11 @@ def _quaternion_gradient(quat, norm, g):
 
 
 @fused_kernel
-def _reverse_eight(given, at, cam, antialias, found):
-    """Chain the sums of columns at .. at + 7 of `given` [18, GROUP] to parameters, into `found` [16, GROUP].
+def _reverse_eight(given, at, cam, antialias, gradients):
+    """Compute gradients [16, GROUP] from the sums of columns at .. at + 7 of `given` [18, GROUP].
 
-    Rows of `given`: as `take` fills them, then the sums h to yy and that of depth. Rows of `found`: means
-    without what colours add, quats, log scales, opacity logit, screen u and v, 1 / v, 1 / Syy, slant.
+    Rows of `given`: as `take` fills them, then the sums h to yy and that of depth. Rows of `gradients`: means
+    without the part from colours, quats, log scales, opacity logit, screen u and v, 1 / v, 1 / Syy, slant.
     """
     x, y, z = in_camera(given, at, cam)
     quat, norm, s = shape_of(given, at)
@@ -121,15 +121,15 @@ def _reverse_eight(given, at, cam, antialias, found):
     )
     du, dv, g1, g2, inv_v, inv_y, slant = _covariance_gradient(sums, f1, f2, antialias, cam[22], cam[23])
     opacity = 1.0 / (1.0 + exp(0.0 - load8(given, 10 * GROUP + at)))
-    store(found, 7 * GROUP + at, g1[0] * f1[0] + g2[0] * f2[0])
-    store(found, 8 * GROUP + at, g1[1] * f1[1] + g2[1] * f2[1])
-    store(found, 9 * GROUP + at, g1[2] * f1[2] + g2[2] * f2[2])
-    store(found, 10 * GROUP + at, s_h * (1.0 - opacity))
-    store(found, 11 * GROUP + at, du)
-    store(found, 12 * GROUP + at, dv)
-    store(found, 13 * GROUP + at, inv_v)
-    store(found, 14 * GROUP + at, inv_y)
-    store(found, 15 * GROUP + at, slant)
+    store(gradients, 7 * GROUP + at, g1[0] * f1[0] + g2[0] * f2[0])
+    store(gradients, 8 * GROUP + at, g1[1] * f1[1] + g2[1] * f2[1])
+    store(gradients, 9 * GROUP + at, g1[2] * f1[2] + g2[2] * f2[2])
+    store(gradients, 10 * GROUP + at, s_h * (1.0 - opacity))
+    store(gradients, 11 * GROUP + at, du)
+    store(gradients, 12 * GROUP + at, dv)
+    store(gradients, 13 * GROUP + at, inv_v)
+    store(gradients, 14 * GROUP + at, inv_y)
+    store(gradients, 15 * GROUP + at, slant)
 
     gp = (g1[0] * s[0], g1[1] * s[1], g1[2] * s[2])
     gq = (g2[0] * s[0], g2[1] * s[1], g2[2] * s[2])
@@ -139,10 +139,10 @@ def _reverse_eight(given, at, cam, antialias, found):
         a[2] * gp[0] + b[2] * gq[0], a[2] * gp[1] + b[2] * gq[1], a[2] * gp[2] + b[2] * gq[2],
     )  # fmt: skip
     dw, dx, dy, dz = _quaternion_gradient(quat, norm, gr)
-    store(found, 3 * GROUP + at, dw)
-    store(found, 4 * GROUP + at, dx)
-    store(found, 5 * GROUP + at, dy)
-    store(found, 6 * GROUP + at, dz)
+    store(gradients, 3 * GROUP + at, dw)
+    store(gradients, 4 * GROUP + at, dx)
+    store(gradients, 5 * GROUP + at, dy)
+    store(gradients, 6 * GROUP + at, dz)
 
     # a = (fx / z) (W0 - rx W2), b likewise; rx is constant where the frustum clamp holds it.
     ga0 = gp[0] * rot[0] + gp[1] * rot[1] + gp[2] * rot[2]
@@ -166,14 +166,14 @@ def _reverse_eight(given, at, cam, antialias, found):
     slope = select((ry >= cam[20]) & (ry <= cam[21]), slope, 0.0)
     cy = cy + slope
     cz = cz - slope * ry
-    store(found, at, cam[0] * cx + cam[4] * cy + cam[8] * cz)
-    store(found, GROUP + at, cam[1] * cx + cam[5] * cy + cam[9] * cz)
-    store(found, 2 * GROUP + at, cam[2] * cx + cam[6] * cy + cam[10] * cz)
+    store(gradients, at, cam[0] * cx + cam[4] * cy + cam[8] * cz)
+    store(gradients, GROUP + at, cam[1] * cx + cam[5] * cy + cam[9] * cz)
+    store(gradients, 2 * GROUP + at, cam[2] * cx + cam[6] * cy + cam[10] * cz)
 
 
 @fused_kernel
 def _reverse_harmonics(i, colour, means, sh_rest, degree, centre, values, weights, d_sh_rest):
-    """Chain dL/d(red, green, blue) to the harmonics of Gaussian i; returns what its mean gets of them."""
+    """Chain dL/d(red, green, blue) to the harmonics of Gaussian i; returns their part of dL/dmean."""
     terms = (degree + 1) * (degree + 1) - 1
     red, green, blue = colour
     for j in range(terms, d_sh_rest.shape[1]):
@@ -200,7 +200,7 @@ def _reverse_harmonics(i, colour, means, sh_rest, degree, centre, values, weight
 
 @fused_kernel
 def _mark(first, stop, n, ids, sh, dirty):
-    """Zero the harmonics' gradients of Gaussians of a chunk that were seen before and are not now."""
+    """Zero the harmonics' gradients of Gaussians of a chunk that were seen before, but are not now."""
     seen = np.zeros(CHUNK, np.bool_)
     for slot in range(first, stop):
         if ids[slot] >= 0:
@@ -213,29 +213,29 @@ def _mark(first, stop, n, ids, sh, dirty):
 
 @fused_kernel
 def _write(
-    i, k, total, found, colour, screen, screen_extra, screen_abs, tally, d_means, d_quats, d_log_scales,
+    i, k, total, gradients, colour, screen, screen_extra, screen_abs, tally, d_means, d_quats, d_log_scales,
     d_opacity_logits, d_sh0,
 ):  # fmt: skip
-    """Column k of `found` and the rest of the sums to the row of Gaussian i, but for the harmonics."""
-    d_means[i, 0] = found[0, k]
-    d_means[i, 1] = found[1, k]
-    d_means[i, 2] = found[2, k]
-    d_quats[i, 0] = found[3, k]
-    d_quats[i, 1] = found[4, k]
-    d_quats[i, 2] = found[5, k]
-    d_quats[i, 3] = found[6, k]
-    d_log_scales[i, 0] = found[7, k]
-    d_log_scales[i, 1] = found[8, k]
-    d_log_scales[i, 2] = found[9, k]
-    d_opacity_logits[i] = found[10, k]
+    """Write column k of `gradients` and the other sums to the rows of Gaussian i, except harmonics."""
+    d_means[i, 0] = gradients[0, k]
+    d_means[i, 1] = gradients[1, k]
+    d_means[i, 2] = gradients[2, k]
+    d_quats[i, 0] = gradients[3, k]
+    d_quats[i, 1] = gradients[4, k]
+    d_quats[i, 2] = gradients[5, k]
+    d_quats[i, 3] = gradients[6, k]
+    d_log_scales[i, 0] = gradients[7, k]
+    d_log_scales[i, 1] = gradients[8, k]
+    d_log_scales[i, 2] = gradients[9, k]
+    d_opacity_logits[i] = gradients[10, k]
     d_sh0[i, 0] = np.float32(C0) * colour[0]
     d_sh0[i, 1] = np.float32(C0) * colour[1]
     d_sh0[i, 2] = np.float32(C0) * colour[2]
-    du = found[11, k]
-    dv = found[12, k]
+    du = gradients[11, k]
+    dv = gradients[12, k]
     if screen_extra is not None:
-        eu = found[13, k] * total[EXTRA_U]
-        ev = found[14, k] * total[EXTRA_Y] - found[15, k] * eu
+        eu = gradients[13, k] * total[EXTRA_U]
+        ev = gradients[14, k] * total[EXTRA_Y] - gradients[15, k] * eu
         screen_extra[i, 0] = eu
         screen_extra[i, 1] = ev
         du -= eu
@@ -243,7 +243,7 @@ def _write(
     screen[i, 0] = du
     screen[i, 1] = dv
     if screen_abs is not None:
-        screen_abs[i, 0] = found[13, k] * total[ABS_U]
+        screen_abs[i, 0] = gradients[13, k] * total[ABS_U]
         screen_abs[i, 1] = _PER_LOG2 * total[ABS_V]
     if tally is not None:
         tally[i, 0] = _PER_LOG2 * _PER_LOG2 * total[SUM_SQUARED]
@@ -274,7 +274,7 @@ def _reverse_chunk(
     values = np.zeros(15, np.float32)
     weights = np.zeros(15, np.float32)
     given = np.zeros((18, GROUP), np.float32)
-    found = np.empty((16, GROUP), np.float32)
+    gradients = np.empty((16, GROUP), np.float32)
     totals = np.empty((GROUP, ROW), np.float32)
     slots = np.empty(GROUP, np.int64)
     slot = first
@@ -294,7 +294,7 @@ def _reverse_chunk(
                 count += 1
             slot += 1
         for at in range(0, count, LANES):
-            _reverse_eight(given, at, cam, antialias, found)
+            _reverse_eight(given, at, cam, antialias, gradients)
         for k in range(count):
             i = ids[slots[k]]
             total = totals[k]
@@ -308,7 +308,7 @@ def _reverse_chunk(
             else:  # through the shading function, clamp included
                 colour = (d_base[slots[k], 0], d_base[slots[k], 1], d_base[slots[k], 2])
             _write(
-                i, k, total, found, colour, screen, screen_extra, screen_abs, tally, d_means, d_quats,
+                i, k, total, gradients, colour, screen, screen_extra, screen_abs, tally, d_means, d_quats,
                 d_log_scales, d_opacity_logits, d_sh0,
             )  # fmt: skip
             wx, wy, wz = _reverse_harmonics(
@@ -326,12 +326,12 @@ def reverse(
     d_means, d_quats, d_log_scales, d_opacity_logits, d_sh0, d_sh_rest, dirty,
     screen, screen_extra, screen_abs, tally, d_base,
 ):  # fmt: skip
-    """Add each Gaussian's rows and chain them to its raw parameters; Gaussians not seen get zeros.
+    """Add each Gaussian's rows and chain them to its raw parameters; Gaussians that are not seen get zeros.
 
     Args:
         offsets, instances: [N] int64 and int32, first row in `sums` and number of rows of each record.
         sums: [I * 16] float32.
-        dirty: [N] bool, rows of `d_sh_rest` that are not zero before; updated.
+        dirty: [N] bool, rows of `d_sh_rest` that were written before; it is updated.
         screen_extra, screen_abs: [N, 2] or None.
         tally: [N, 2] squared sums and pixel counts, or None.
         d_base: [slots, 3] dL/d(SH colour) of each record where colours are shaded, or None.
@@ -348,7 +348,7 @@ def reverse(
 
 @parallel_kernel
 def colour_sums(records, ids, counts, offsets, instances, sums, d_colours):
-    """dL/dcolour [slots, 3] of every record, 0 where the colour was clamped; for shading functions.
+    """Write dL/dcolour [slots, 3] of every record, 0 where the colour was clamped; for shading functions.
 
     Args:
         ids: [N] int32, -1 where a record is not drawn; its row is not written.

@@ -1,9 +1,9 @@
 """Vectors as Numba values: sixteen float32 lanes, or eight float64 lanes, without relying on the vectoriser.
 
 `f32x16` lowers to LLVM's ``<16 x float>``: one AVX-512 register, two AVX ones, four NEON ones; `f64x8` to
-``<8 x double>``. Operators round like their scalar forms, and of doubles a product may be fused into a sum;
-nothing else is reordered, so results repeat bit for bit. Arrays hold float32: `load8` widens and `store`
-rounds. Inside kernels only: the values never leave compiled code.
+``<8 x double>``. Operators round like their scalar forms; of doubles a product may be fused into a sum.
+Nothing else is reordered, so results repeat bit for bit. Arrays hold float32: `load8` widens and `store`
+rounds. The values exist only inside of kernels.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _ELEMENTS = {"f32": _F32, "f64": ir.DoubleType(), "mask": ir.IntType(1)}
 
 
 class Lanes(types.Type):
-    """Numba type of a number of equal lanes: floats, doubles or truth values."""
+    """Numba type of a vector of floats, doubles or truth values."""
 
     def __init__(self, kind: str, count: int) -> None:
         super().__init__(name=f"{kind}x{count}")
@@ -35,7 +35,7 @@ class Lanes(types.Type):
 
     @property
     def vector(self) -> ir.VectorType:
-        """As LLVM has it."""
+        """The type in LLVM."""
         return ir.VectorType(_ELEMENTS[self.kind], self.count)
 
 
@@ -64,7 +64,7 @@ def _broadcast(builder: Any, scalar: Any, vector: ir.VectorType) -> Any:
 
 
 def _as(lanes: Lanes, builder: Any, kinds: Sequence[Any], values: Sequence[Any]) -> list[Any]:
-    """The values as these lanes; scalars are broadcast."""
+    """Return the values as these lanes; scalars are broadcast."""
     return [
         value if isinstance(kind, Lanes) else _broadcast(builder, value, lanes.vector)
         for kind, value in zip(kinds, values)
@@ -88,23 +88,23 @@ def _lanewise(builder: Any, name: str, *arguments: Any) -> Any:
 
 
 def _operator(op: Any, emit: Any, *, compares: bool = False) -> None:
-    """Teach Numba an operator of lanes with lanes, and with scalars on either side."""
-    known: list[tuple[Lanes, Any, Any, Any]] = []
+    """Register an operator of lanes with lanes, and with scalars on either side, at Numba."""
+    signatures: list[tuple[Lanes, Any, Any, Any]] = []
     for mask, lanes in _FLOATS.items():
         result = mask if compares else lanes
-        known.append((lanes, result, lanes, lanes))
+        signatures.append((lanes, result, lanes, lanes))
         for scalar in (types.float32, types.float64) if lanes is f32x16 else (types.float64,):
-            known += [(lanes, result, lanes, scalar), (lanes, result, scalar, lanes)]
+            signatures += [(lanes, result, lanes, scalar), (lanes, result, scalar, lanes)]
 
     @infer_global(op)
     class _Template(ConcreteTemplate):
-        cases = [signature(*case) for _, *case in known]  # noqa: RUF012
+        cases = [signature(*case) for _, *case in signatures]  # noqa: RUF012
 
     def lowered(lanes: Lanes) -> Any:
         flags = ("contract",) if lanes is f64x8 else ()
         return lambda context, builder, sig, args: emit(builder, *_as(lanes, builder, sig.args, args), flags)
 
-    for lanes, _, left, right in known:
+    for lanes, _, left, right in signatures:
         lower_builtin(op, left, right)(lowered(lanes))
 
 
@@ -127,7 +127,7 @@ for _mask in _FLOATS:
 
 @intrinsic
 def select(typingctx: Any, mask: Any, yes: Any, no: Any) -> Any:
-    """Lane by lane `yes` where the mask is set, else `no`; scalars are broadcast."""
+    """Select lane by lane `yes` where the mask is set, else `no`; scalars are broadcast."""
     lanes = _FLOATS[mask]
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -149,7 +149,7 @@ def any_lane(typingctx: Any, mask: Any) -> Any:
 
 @intrinsic
 def bits_of(typingctx: Any, mask: Any) -> Any:
-    """The mask as an integer, lane i as bit i."""
+    """Return the mask as an integer, lane i as bit i."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.zext(builder.bitcast(args[0], ir.IntType(mask.count)), _I64)
@@ -158,7 +158,7 @@ def bits_of(typingctx: Any, mask: Any) -> Any:
 
 
 def _unary(emit: Any) -> Any:
-    """A function of one vector, lane by lane; `emit` gets LLVM's builder and the value."""
+    """Make a function of one vector, lane by lane; `emit` gets LLVM's builder and the value."""
 
     def typer(typingctx: Any, value: Any) -> Any:
         return value(value), lambda context, builder, sig, args: emit(builder, args[0])
@@ -190,13 +190,13 @@ at_least = _bound("<")
 
 
 def _pointer(context: Any, builder: Any, sig: Any, args: Any, element: Any) -> Any:
-    """To an element of the array that is the first argument, at the index that is the second."""
+    """Return a pointer into the array of the first argument, at the index of the second."""
     data = make_array(sig.args[0])(context, builder, args[0]).data
     return builder.bitcast(builder.gep(data, [args[1]]), element.as_pointer())
 
 
 def _integers(vector: ir.VectorType) -> ir.VectorType:
-    """Integers of the same width, for the bits."""
+    """Return the type of integers of the same width, for bit operations."""
     return ir.VectorType(_I32 if vector.element == _F32 else _I64, vector.count)
 
 
@@ -204,16 +204,16 @@ def _load(lanes: Lanes) -> Any:
     def typer(typingctx: Any, array: Any, index: Any) -> Any:
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             narrow = ir.VectorType(_F32, lanes.count)
-            found = builder.load(_pointer(context, builder, sig, args, narrow), align=4)
-            return found if lanes is f32x16 else builder.fpext(found, lanes.vector)
+            values = builder.load(_pointer(context, builder, sig, args, narrow), align=4)
+            return values if lanes is f32x16 else builder.fpext(values, lanes.vector)
 
         return lanes(array, types.intp), codegen
 
     return intrinsic(typer)
 
 
-# Sixteen floats, or eight widened to doubles, of a contiguous float32 array from a flat element index; bounds
-# are the caller's.
+# Load sixteen floats, or eight widened to doubles, of a contiguous float32 array from a flat element index,
+# without a check of bounds.
 load = _load(f32x16)
 load8 = _load(f64x8)
 
@@ -233,7 +233,7 @@ def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line at a flat element index of a contiguous array; any index will do."""
+    """Prefetch the cache line at a flat element index of a contiguous array; any index is allowed."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         pointer = _pointer(context, builder, sig, args, ir.IntType(8))
@@ -246,7 +246,7 @@ def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def trailing_zeros(typingctx: Any, bits: Any) -> Any:
-    """Number of the lowest set bit of an int64 that is not 0."""
+    """Return the number of the lowest set bit of an int64 that is not 0."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -264,7 +264,7 @@ def _polynomial(builder: Any, x: Any, coefficients: Sequence[float]) -> Any:
 
 @intrinsic
 def splat(typingctx: Any, value: Any) -> Any:
-    """All lanes equal to a scalar."""
+    """Set all lanes to a scalar."""
     return f32x16(value), lambda context, builder, sig, args: _broadcast(builder, args[0], f32x16.vector)
 
 
@@ -301,7 +301,7 @@ def exp2(builder: Any, x: Any) -> Any:
 
 @intrinsic
 def sum_lanes(typingctx: Any, values: Any) -> Any:
-    """Tuple of up to sixteen vectors -> one vector: lane i holds the sum over the lanes of values[i].
+    """Sum the lanes of each of up to sixteen vectors: lane i of the result is the sum of values[i].
 
     A butterfly in a fixed order: 45 instructions for sixteen sums, and no lane is special.
     """
@@ -327,7 +327,7 @@ def sum_lanes(typingctx: Any, values: Any) -> Any:
 
 
 def _first_lanes(builder: Any, count: Any) -> Any:
-    """Mask of the first `count` lanes."""
+    """Return the mask of the first `count` lanes."""
     indices = ir.VectorType(_I32, f32x16.count)
     limit = _broadcast(builder, builder.trunc(count, _I32), indices)
     return builder.icmp_signed("<", ir.Constant(indices, list(range(f32x16.count))), limit)
@@ -367,7 +367,7 @@ _ROUND64 = 6755399441055744.0  # 1.5 * 2^52, as `_ROUND`
 
 @_unary
 def exp(builder: Any, x: Any) -> Any:
-    """e^value to 2 units of the last place; beyond 708 either way that of 708, NaN stays NaN."""
+    """e^value to 2 units of the last place; values beyond +-708 count as +-708, NaN stays NaN."""
     vector, ints = x.type, _integers(x.type)
     for predicate, limit in ((">", 708.0), ("<", -708.0)):
         beyond = builder.fcmp_ordered(predicate, x, _filled(vector, limit))
@@ -386,7 +386,7 @@ def exp(builder: Any, x: Any) -> Any:
 
 @_unary
 def log(builder: Any, x: Any) -> Any:
-    """Natural logarithm of normal positive numbers, to 2 units of the last place; of others, any number."""
+    """Natural logarithm of normal positive numbers, to 2 units of the last place; any number for others."""
     ints, one = _integers(x.type), _filled(x.type, 1.0)
     bits = builder.bitcast(x, ints)
     half_root = _filled(ints, 0x3FE6A09E667F3BCD)  # sqrt(1/2): what remains lies in [sqrt(1/2), sqrt(2))

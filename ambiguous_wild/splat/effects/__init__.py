@@ -1,6 +1,6 @@
-"""Optional effects of the trainer, by name. What is not asked for is not imported, built or called.
+"""Optional effects of the trainer, by name. Effects that are not requested are not imported or built.
 
-Imports no torch: names are checked before anything heavy is loaded.
+This module imports no torch: names are checked before anything heavy is loaded.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ EFFECTS: dict[str, tuple[str, str, str]] = {
     "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
     "skybox": ("skybox", "Skybox", "first Gaussians on a far sphere too, for what lies behind the scene"),
     "dense": ("dense", "DenseStart", "first Gaussians on dense points too, for few photos"),
-    "near": ("skybox", "NearSpace", "no Gaussians close before a camera"),
+    "near": ("skybox", "NearSpace", "no Gaussians close in front of a camera"),
     "sh0": ("", "", "colours that do not depend on the direction"),
     "sh1": ("", "", "spherical harmonics up to degree 1"),
     "sh2": ("", "", "spherical harmonics up to degree 2"),
 }  # fmt: skip
-COLOUR = ("exposure", "appearance")  # what is fitted on half a test photo where the protocol says so
+COLOUR = ("exposure", "appearance")  # fitted on half a test photo if the protocol says so
 ALL = ("exposure", "appearance", "antialias", "poses")
 DEGREES = {"sh0": 0, "sh1": 1, "sh2": 2}
 
 
 def check_effects(names: Iterable[str]) -> tuple[str, ...]:
-    """The effects in the order in which they act, each once.
+    """Return the effects in the order in which they act, each once.
 
     Raises:
-        AwError: there is none of that name, or two SH degrees.
+        AwError: a name is unknown, or two SH degrees are named.
     """
     wanted = list(names)
     for name in wanted:
@@ -51,13 +51,13 @@ def check_effects(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def with_effects(parts: Parts, names: Sequence[str]) -> Parts:
-    """The method's parts with these effects on top; the same object where there are none."""
+    """Add effects to a method's parts; without effects returns the same object."""
     if not names:
         return parts
     built: list[Effect] = []
-    brought = {effect.name for effect in parts.effects}  # by the method itself: once is enough
+    present = {effect.name for effect in parts.effects}  # effects of the method are not added twice
     for name in check_effects(names):
-        if name in brought:
+        if name in present:
             continue
         if name in DEGREES:
             parts = dataclasses.replace(parts, sh_degree=min(parts.sh_degree, DEGREES[name]))

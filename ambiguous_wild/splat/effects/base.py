@@ -1,8 +1,9 @@
-"""What an effect is: a change around the render call, with its own way back for gradients.
+"""What an effect is: a change before or after the render call, with a backward pass of its own.
 
     camera -> [poses] -> model -> [appearance] -> [3D filter] -> render -> image -> [exposure]
 
-Forward in that order, backward in reverse. The mask policy and the loss see the changed picture.
+Effects act in this order; gradients pass them in reverse. The mask policy and the loss get the changed
+picture.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import (
@@ -28,91 +30,86 @@ from ambiguous_wild.splat.rendered import (
 )
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
 
-State = dict[str, Any]
-
 
 class Effect:
-    """Does nothing. Override the hooks of the places it acts in; the others are never called.
+    """An effect that does nothing. Override the hooks of the places where yours acts; others are not called.
 
-    What goes through a hook comes back through the pull that it returned: no hook keeps anything of one
-    picture in the object. Gradients of the effect's own parameters travel in `own`, under its name.
+    Gradients pass a hook through the pull that it returned: hooks store nothing about a picture.
+    Gradients of the effect's own parameters are passed in `own`, under the effect's name.
     """
 
     name = ""
-    reads_photo = (
-        False  # its colours come from the photo itself: of a test photo, from the part that may be read
-    )
-
+    reads_photo = False  # whether its colours come from the photo (of a test photo: from the part to fit to)
     antialias = False  # whether the renderer is to use Mip-Splatting's 2D filter, whatever the method says
 
     def acts(self, hook: str) -> bool:
-        """Whether that hook is to be called at all."""
+        """Whether this hook is overridden, so that it must be called."""
         return getattr(type(self), hook) is not getattr(Effect, hook)
 
     def first_points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """xyz [M, 3] and rgb [M, 3] uint8 of at most so many points to start from beside the method's."""
+        """Return xyz [M, 3] and rgb [M, 3] uint8 of at most `most` further points to start from."""
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
     def setup(self, data: TrainData) -> None:
         """Called once before the first step, and again when a run resumes."""
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
-        """What every Gaussian carries for this effect from the start, by name: `Gaussians.extra`."""
+        """Return the attributes that the effect needs with every Gaussian, see `Gaussians.attributes`."""
         return {}
 
     def spared(self, means: Tensor) -> Tensor:
-        """[N] bool of means [N, 3]: rows that density control neither copies nor removes."""
+        """Return the rows that density control must neither copy nor remove, [N] bool, from means [N, 3]."""
         return torch.zeros(len(means), dtype=torch.bool, device=means.device)
 
     def camera(self, shot: Shot) -> Camera:
-        """The camera of a train photo, at the resolution of the step."""
+        """Return the camera of a train photo, at the resolution of the step."""
         return shot.camera
 
     def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
-        """The Gaussians as they are drawn, all rows; the pull must not change tensors in place."""
+        """Return the Gaussians as they are drawn, all rows, and a pull that changes no tensor in place."""
         return gaussians, same
 
     def shade(
         self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: Shot
     ) -> tuple[Tensor, ShadePull]:
-        """Colours [M, 3] of the visible rows from those of the harmonics, see `rendered.Shade`."""
+        """Return colours [M, 3] of the visible rows from those of the harmonics, see `rendered.Shade`."""
         return base, ShadeGradients
 
     def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
-        """The pictures as they are compared; not in place.
+        """Return the pictures as they are compared with the photo, as new tensors.
 
-        The effect learns from `Cotangents.image` alone: a method's own loss on the render (`extra`) is no
-        statement about a photo's exposure.
+        The effect learns from `Cotangents.image` alone: a method's own loss on the render (`extra`) tells
+        nothing about a photo's exposure.
         """
         return frame, unchanged
 
     def pose(self, gaussians: Gaussians, gradients: Gradients, shot: Shot) -> Mapping[str, Tensor]:
-        """Own gradients of a train photo's camera; `gaussians` and `gradients` are the render call's."""
+        """Return own gradients from a train photo's camera, given Gaussians and gradients of the render."""
         return {}
 
     def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
         """Learn from the gradients of one step.
 
         Args:
-            own: of the effect's own parameters, as its pulls gave them.
-            shot: whose they are.
-            called_off: on an accelerator, [1] float32 there; 1 = nothing is to change, whatever they are.
+            own: gradients of the effect's own parameters, as its pulls returned them.
+            shot: shot of the step.
+            called_off: on an accelerator [1] float32; 1 = change nothing, whatever the gradients are.
         """
 
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
         """Called last in every step, with the Gaussians that the next one starts from."""
 
     def rows_changed(self) -> None:
-        """Density control made, split, merged or dropped Gaussians."""
+        """Called after density control made, split, merged or dropped Gaussians."""
 
     def begin_fit(self) -> None:
-        """A test photo is about to be fitted: its row starts neutral."""
+        """Called before a test photo is fitted: set its row to neutral."""
 
     def fit(self, own: Mapping[str, Tensor]) -> None:
-        """One step of that row alone; nothing shared changes."""
+        """Take one step of the test photo's row; nothing shared changes."""
 
-    def facts(self) -> dict[str, Any]:
-        """Plain values for the run's metrics."""
+    def facts(self) -> Facts:
+        """Return plain values for the run's metrics."""
         return {}
 
     def state_dict(self) -> State:
@@ -123,19 +120,19 @@ class Effect:
 
 
 def same(gradients: Gradients) -> Gradients:
-    """The pull of a model that was not changed."""
+    """Return the gradients: the pull of an unchanged model."""
     return gradients
 
 
 def unchanged(cotangents: Cotangents) -> Cotangents:
-    """The pull of a picture that was not changed."""
+    """Return the cotangents: the pull of an unchanged picture."""
     return cotangents
 
 
 class RowAdam:
-    """Adam over the rows of a table [V, ...], each with moments and a count of its own.
+    """Adam over the rows of a table [V, ...], each with its own moments and step count.
 
-    A row moves only when its photo was seen: Adam's momentum would carry the others along for nothing.
+    A row moves only in steps with its photo, so that momentum does not move it in the others.
     """
 
     betas, eps = (0.9, 0.999), 1e-15
@@ -148,10 +145,10 @@ class RowAdam:
     def step(
         self, row: int, gradient: Tensor, rate: float | Tensor, called_off: Tensor | None = None
     ) -> None:
-        """One step of one row; `rate` broadcasts over it, `called_off` is that of `Effect.step`.
+        """Step one row; `rate` broadcasts over it, `called_off` is that of `Effect.step`.
 
-        A step that was called off counts: the host does not know of it, and only the correction of the
-        moments' bias is off by it.
+        A step that was called off is counted, because the host does not know of it; this changes only the
+        bias correction of the moments.
         """
         self.steps[row] += 1
         first, second = self.first[row], self.second[row]
@@ -166,7 +163,7 @@ class RowAdam:
         self.values[row] -= rate / bias1 * first / ((second / bias2).sqrt() + self.eps)
 
     def reset(self, row: int) -> None:
-        """That row at zero, as if it had never been seen."""
+        """Set a row to zero, as if it had never been seen."""
         for tensor in (self.values, self.first, self.second):
             tensor[row] = 0.0
         self.steps[row] = 0
@@ -181,20 +178,21 @@ class RowAdam:
 
 
 def share_of(called_off: Tensor, like: Tensor) -> Tensor:
-    """0-d, in the type of `like`: 0 where the step was called off, 1 where not."""
+    """Return 0 if the step was called off, else 1, as a 0-d tensor in the type of `like`."""
     return 1.0 - called_off.reshape(()).to(like)
 
 
 def decayed(first: float, last: float, progress: float) -> float:
-    """Exponential decay from `first` to `last` over the run."""
+    """Decay exponentially from `first` to `last` over the run."""
     return float(first * (last / first) ** progress)
 
 
 def rate_for_run_length(rate: float, made_for: int, shot: Shot) -> float:
-    """A learning rate of Adam for a run of another length than the rate was published for.
+    """Return Adam's learning rate for a run of another length than the rate was published for.
 
-    Times the root of how many times shorter the run is, at most 10; a longer run gets the rate itself. Adam's
-    steps have the size of the rate, and a random walk of them goes as far as the root of their number.
+    It grows with the square root of the ratio of the lengths, at most tenfold; longer runs get the rate
+    itself. Adam's steps have the size of the rate, and a random walk goes as far as the root of its number of
+    steps.
     """
-    length = shot.iteration * NOMINAL_ITERATIONS / max(shot.nominal, 1e-9)  # of the run, in iterations
+    length = shot.iteration * NOMINAL_ITERATIONS / max(shot.nominal, 1e-9)  # iterations of the whole run
     return rate * min(max(made_for / length, 1.0), 100.0) ** 0.5

@@ -1,17 +1,17 @@
-"""The effects of a run as one object: the trainer calls it only where there is any."""
+"""The effects of a run as one object, which the trainer calls if the run has effects."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.effects.base import Effect, State
+from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import frames_of, renders_of
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -39,18 +39,18 @@ FIT_STEPS = 128  # WildGaussians' number for an embedding on half a test photo
 
 
 class Chain:
-    """Knows which effect acts where; one that does not override a hook is not called there."""
+    """Calls the effects in order; an effect is called only for the hooks that it overrides."""
 
     def __init__(self, effects: Sequence[Effect], data: TrainData) -> None:
         """
         Raises:
-            AwError: two effects of one name; checkpoints and results hold effects by name.
+            AwError: two effects have the same name, by which checkpoints and results hold them.
         """
         self.effects = tuple(effects)
         names = [effect.name for effect in self.effects]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise AwError(f"effect {twice[0]} is there twice; a method lists each effect once")
+            raise AwError(f"effect {twice[0]} is listed twice; a method lists each effect once")
         self.views = len(data.photos)
         for effect in self.effects:
             effect.setup(data)
@@ -59,30 +59,30 @@ class Chain:
         return tuple(e for e in self.effects if e.name not in without and e.acts(hook))
 
     def rows(self, gaussians: Gaussians) -> dict[str, GaussianAttribute]:
-        """What every Gaussian carries for the effects.
+        """Return the attributes of Gaussians that the effects need.
 
         Raises:
-            AwError: two effects carry something under the same name.
+            AwError: two effects have an attribute of the same name.
         """
-        found: dict[str, GaussianAttribute] = {}
+        attributes: dict[str, GaussianAttribute] = {}
         for effect in self._with("rows"):
             for name, row in effect.rows(gaussians).items():
-                if name in found:
+                if name in attributes:
                     raise AwError(
-                        f"effect {effect.name} carries {name!r} with every Gaussian, and another does too"
+                        f"effect {effect.name} has an attribute {name!r} of Gaussians, and so has another"
                     )
-                found[name] = row
-        return found
+                attributes[name] = row
+        return attributes
 
     def protected(self) -> Callable[[Tensor], Tensor] | None:
-        """Which rows density control leaves alone, from means [N, 3]; None = no effect protected any."""
-        sparing = self._with("spared")
-        if not sparing:
+        """Return a function of means [N, 3] that tells which rows are protected; None = no effect does."""
+        protecting = self._with("spared")
+        if not protecting:
             return None
-        return lambda means: torch.stack([effect.spared(means) for effect in sparing]).any(dim=0)
+        return lambda means: torch.stack([effect.spared(means) for effect in protecting]).any(dim=0)
 
     def camera(self, shot: Shot) -> Camera:
-        """The camera of a train photo as the effects have it."""
+        """Return the camera of a train photo as the effects change it."""
         for effect in self._with("camera"):
             shot = replace(shot, camera=effect.camera(shot))
         return shot.camera
@@ -90,7 +90,7 @@ class Chain:
     def model(
         self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()
     ) -> tuple[Gaussians, list[Pull]]:
-        """The Gaussians as they are drawn, and the pulls in the order in which the effects acted."""
+        """Return the Gaussians as they are drawn, and the pulls in the order of the effects."""
         pulls = []
         for effect in self._with("model", without):
             changed, pull = effect.model(gaussians, shot)
@@ -99,13 +99,13 @@ class Chain:
         return gaussians, pulls
 
     def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
-        """The Gaussians as they are drawn for no photo in particular; colours of nets are not in them."""
-        camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))  # no effect on all rows asks for it
+        """Return the Gaussians as they are drawn without a photo; they do not hold the colours of nets."""
+        camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))  # effects on the model do not read it
         shot = Shot(iteration=iteration, nominal=0.0, view=None, camera=camera)
         return self.model(gaussians, shot)[0]
 
     def render(self, gaussians: Gaussians, shot: Shot, draw: Draw, without: Collection[str] = ()) -> Rendered:
-        """Draw with all effects but those named; the camera is already theirs."""
+        """Draw with all effects except those named; the effects have already changed the camera."""
         drawn, model_pulls = self.model(gaussians, shot, without)
         rendered = draw(drawn, shot, self._shade(drawn, shot, without))
         frame, frame_pulls = frame_of(rendered), []
@@ -130,33 +130,33 @@ class Chain:
         return shade
 
     def step(self, gradients: Gradients, shot: Shot, called_off: Tensor | None = None) -> None:
-        """Every effect learns from the backward pass just done; see `Effect.step`."""
+        """Let every effect learn from the last backward pass; see `Effect.step`."""
         for effect in self._with("step"):
             own = gradients.own.get(effect.name)
             if own is not None:
                 effect.step(own, shot, called_off)
 
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
-        """The end of a step; see `Effect.after_step`."""
+        """Call the effects at the end of a step; see `Effect.after_step`."""
         for effect in self._with("after_step"):
             effect.after_step(step, gaussians)
 
     def rows_changed(self) -> None:
-        """Density control changed the set of Gaussians."""
+        """Tell the effects that density control changed the set of Gaussians."""
         for effect in self._with("rows_changed"):
             effect.rows_changed()
 
     def fit_view(self, gaussians: Gaussians, shot: Shot, photo: Tensor, keep: Tensor, draw: Draw) -> Tensor:
-        """Fit the colour effects, and nothing else, to a part of a photo; the picture under that fit.
+        """Fit only the colour effects to a part of a photo; returns the picture [H, W, 3] after the fit.
 
         Args:
             gaussians: the trained model; it does not change.
-            shot: of the photo, with `fitting`.
-            photo: [H, W, 3] in [0, 1]; outside `keep` it is not read.
-            keep: [H, W], 1 where the fit may look.
+            shot: shot of the photo, with `fitting`.
+            photo: [H, W, 3] in [0, 1]; it is not read outside of `keep`.
+            keep: [H, W], 1 where the fit may read the photo.
             draw: the render call.
         """
-        # black where it may not be looked at, for effects that read the photo too
+        # black where the fit must not read it, also for effects that read the photo
         photo = torch.where(keep[..., None] > 0, photo, torch.zeros_like(photo))
         shot = replace(shot, photo=photo)
         fitted = self._with("fit")
@@ -164,7 +164,7 @@ class Chain:
             effect.begin_fit()
         for _ in range(FIT_STEPS if fitted else 0):
             rendered = self.render(gaussians, shot, draw)
-            # "images" blanks both pictures outside: no window of SSIM reaches into the other half
+            # "images" blanks both pictures outside of `keep`, so no window of SSIM reaches the other half
             loss = photometric(rendered.image, photo, keep, weighting="images")
             own = rendered.backward(loss.d_image).own
             for effect in fitted:
@@ -172,15 +172,15 @@ class Chain:
                     effect.fit(own[effect.name])
         return self.render(gaussians, shot, draw).image
 
-    def fitted(self) -> dict[str, Any]:
-        """What `fit_view` does to a test photo: effects that are fitted and steps, effects that read it."""
+    def fitted(self) -> Facts:
+        """Return the effects that `fit_view` fits to a test photo, its steps, and effects that read it."""
         names = [effect.name for effect in self._with("fit")]
-        found: dict[str, Any] = {"effects": names, "steps": FIT_STEPS if names else 0}
+        fit: Facts = {"effects": names, "steps": FIT_STEPS if names else 0}
         reading = [effect.name for effect in self.effects if effect.reads_photo]
-        return found | ({"read_by": reading} if reading else {})
+        return {**fit, "read_by": reading} if reading else fit
 
-    def facts(self) -> dict[str, Any]:
-        """What every effect says of itself, by its name."""
+    def facts(self) -> Facts:
+        """Return the facts of every effect by its name."""
         return {effect.name: effect.facts() for effect in self.effects}
 
     def state_dict(self) -> State:
@@ -198,20 +198,20 @@ class Chain:
 
 
 def _pull_all(pulls: Sequence[ShadePull], d_colours: Tensor) -> ShadeGradients:
-    found = ShadeGradients(d_colours)
+    total = ShadeGradients(d_colours)
     for pull in reversed(pulls):
-        one = pull(found.base)
-        found = ShadeGradients(
+        one = pull(total.base)
+        total = ShadeGradients(
             one.base,
-            sum_named(one.extra, found.extra),
-            sum_where(one.means, found.means),
-            sum_own(found.own, one.own),
+            sum_named(one.attributes, total.attributes),
+            sum_where(one.means, total.means),
+            sum_own(total.own, one.own),
         )
-    return found
+    return total
 
 
 class EffectRender:
-    """A `Rendered` whose picture went through the image effects and whose gradients go back through all."""
+    """A `Rendered` after the image effects; its backward pass goes through all effects."""
 
     def __init__(
         self,
@@ -226,11 +226,11 @@ class EffectRender:
     ) -> None:
         """
         Args:
-            rendered: by the back end.
-            image, alpha: after the image effects.
-            drawn: the Gaussians that the back end drew.
-            shot: of the picture.
-            model_pulls, frame_pulls: in the order in which the effects acted.
+            rendered: render of the back end.
+            image, alpha: pictures after the image effects.
+            drawn: Gaussians that the back end drew.
+            shot: shot of the picture.
+            model_pulls, frame_pulls: pulls in the order in which the effects acted.
             posing: effects that learn from the camera's gradient.
         """
         self.image, self.alpha = image, alpha
@@ -249,11 +249,11 @@ class EffectRender:
 
     @torch.no_grad()
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
-        """As `Rendered.backward`, with gradients of the effects' own parameters in `own`."""
-        given = as_cotangents(cotangents)
+        """Do as `Rendered.backward`; gradients of the effects' own parameters are in `own`."""
+        passed = as_cotangents(cotangents)
         for frame_pull in reversed(self._frame_pulls):
-            given = frame_pull(given)
-        gradients = self._inner.backward(given, needs)
+            passed = frame_pull(passed)
+        gradients = self._inner.backward(passed, needs)
         for effect in self._posing:
             gradients = gradients.with_own(effect.name, effect.pose(self._drawn, gradients, self._shot))
         for pull in reversed(self._model_pulls):

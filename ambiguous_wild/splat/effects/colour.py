@@ -1,27 +1,27 @@
-"""Colours that change from photo to photo: affine exposure, and an embedding that asks where Gaussians lie.
+"""Colours that change from photo to photo: affine exposure, and an embedding that also depends on position.
 
-Affine exposure is 3DGS's option (Kerbl et al., later release): each photo sees the scene's colours through
-a 3x3 matrix and an offset of its own. With a constraint: over the train photos the changes sum to zero, so
-that the scene cannot drift darker while all photos grow brighter, and a test view, which has no photo, is
-drawn as the mean train photo sees it.
+Affine exposure is 3DGS's option (Kerbl et al., later release): a matrix 3x3 and an offset change the scene's
+colours for each photo. One constraint is added: over the train photos the changes sum to zero. So the scene
+cannot become darker while all photos become brighter, and a test view, which has no photo, is drawn as the
+mean train photo shows it.
 
-The embedding is after WildGaussians (Kulhanek et al. 2024), smaller and with a neutral that is exact: a few
-numbers per photo change the colour of every Gaussian; the change is *linear* in them, and they sum to zero
-over the train photos, so that zero is both the unchanged model and the mean of all photos. Positions enter
-as Fourier features, which needs no state per Gaussian and so nothing of density control.
+The embedding follows WildGaussians (Kulhanek et al. 2024), but is smaller: a few numbers per photo change the
+colour of every Gaussian. The change is linear in them, and they sum to zero over the train photos, so that
+zero is both the unchanged model and the mean of all photos. Positions enter as Fourier features, which need
+no state per Gaussian and so nothing from density control.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, same, unchanged
+from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, same, unchanged
 from ambiguous_wild.splat.effects.placing import Unit
 from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -86,7 +86,7 @@ class AffineExposure(Effect):
     def fit(self, own: Mapping[str, Tensor]) -> None:
         self.adam.step(self.views, own["affine"], EXPOSURE_FIT_RATE)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         gains = self.adam.values[: self.views, range(3), range(3)] + 1
         return {"gain_lowest": float(gains.min()), "gain_highest": float(gains.max())}
 
@@ -97,8 +97,8 @@ class AffineExposure(Effect):
         self.adam.load_state_dict(state)
 
 
-SIZE, HIDDEN, OCTAVES = 4, 32, 4  # of the embedding, of the net, of the Fourier features
-RATE_ROWS, RATE_NET, FINAL = 0.02, 2e-3, 0.1  # both decay to this share
+SIZE, HIDDEN, OCTAVES = 4, 32, 4  # sizes of the embedding, of the net, of the Fourier features
+RATE_ROWS, RATE_NET, FINAL = 0.02, 2e-3, 0.1  # two learning rates, and the share that both decay to
 EMBEDDING_FIT_RATE = 0.1  # WildGaussians
 
 
@@ -122,16 +122,16 @@ class AppearanceEmbedding(Effect):
         self.moments = {name: RowAdam(values[None]) for name, values in self.net.items()}
 
     def features(self, means: Tensor) -> Tensor:
-        """[N, 25]: Fourier features of positions, as WildGaussians starts its embeddings from, and 1."""
+        """Return Fourier features of positions, as WildGaussians starts embeddings from, and 1, [N, 25]."""
         unit = self.unit(means).clamp(-1.5, 1.5)
         angles = torch.cat([unit * (torch.pi * 2.0**k / 2) for k in range(OCTAVES)], dim=1)
         return torch.cat([angles.sin(), angles.cos(), torch.ones_like(unit[:, :1])], dim=1)
 
     def change(self, features: Tensor, embedding: Tensor, net: dict[str, Tensor]) -> Tensor:
-        """[N, 6]: what is added to gain and offset."""
+        """Return the changes of gain and offset, [N, 6]."""
         hidden = torch.relu(features @ net["first"])
         hidden = torch.cat([hidden, torch.ones_like(hidden[:, :1])], dim=1)
-        # the embedding first: one [33, 6] matrix a view instead of SIZE of them a Gaussian
+        # multiply by the embedding first: one matrix [33, 6] a view instead of SIZE of them a Gaussian
         return hidden @ torch.einsum("hse,s->he", net["last"].reshape(-1, SIZE, 6), embedding)
 
     def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
@@ -146,8 +146,8 @@ class AppearanceEmbedding(Effect):
             sh0 = (colour - 0.5) / SH_C0
 
         def pull(gradients: Gradients) -> Gradients:
-            found = torch.autograd.grad(sh0, list(leaves.values()), gradients.sh0.to(sh0), retain_graph=True)
-            own = dict(zip(leaves, found))
+            parts = torch.autograd.grad(sh0, list(leaves.values()), gradients.sh0.to(sh0), retain_graph=True)
+            own = dict(zip(leaves, parts))
             before = own.pop("sh0").contiguous()
             return replace(gradients, sh0=before).with_own(self.name, own)
 
@@ -168,7 +168,7 @@ class AppearanceEmbedding(Effect):
     def fit(self, own: Mapping[str, Tensor]) -> None:
         self.rows_of_photos.step(self.views, own["row"], EMBEDDING_FIT_RATE)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"embedding_std": float(self.rows_of_photos.values[: self.views].std(unbiased=False))}
 
     def state_dict(self) -> State:

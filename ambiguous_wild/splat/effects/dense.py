@@ -1,13 +1,13 @@
-"""A dense start: Gaussians at points of plane sweeps too, not only at those of structure from motion.
+"""A dense start: further first Gaussians at points of plane sweeps.
 
 Where photos overlap little, 3DGS's growth puts Gaussians where they explain one photo, often close to its
-camera. Points on which several photos agree leave less to be guessed. The idea is that of EDGS (Kotovenko et
+camera. Points on which several photos agree leave less room for that. The idea is that of EDGS (Kotovenko et
 al., 2025); we use plane sweeps instead of a matching network.
 
-A plane sweep (Collins, CVPR 1996) tries planes parallel to a photo's image plane. On each of them the
-neighbouring photos are drawn into the photo, and compared by the correlation of small windows (ZNCC), which
-does not see exposure. A depth is kept where the correlation is high at one depth only and where other photos'
-depths agree. A distractor that moves has no depth on which two other photos agree.
+A plane sweep (Collins, CVPR 1996) tries planes parallel to a photo's image plane. For each plane the
+neighbouring photos are warped into the photo and compared by the correlation of small windows (ZNCC), which
+does not depend on exposure. A depth is kept where the correlation is high at this depth only and where depths
+of other photos agree. A distractor that moves has no depth on which two other photos agree.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.tracks import tracks_of
 from ambiguous_wild.splat.step import TrainData
 
 
 class DenseStart(Effect):
-    """Acts on the first Gaussians alone."""
+    """Adds first Gaussians at points that several photos agree on."""
 
     name = "dense"
 
@@ -35,7 +35,7 @@ class DenseStart(Effect):
         self.count = 0
 
     def first_points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
-        def photo(view: int) -> np.ndarray:  # one at a time: they may lie on a GPU
+        def photo(view: int) -> np.ndarray:  # one photo at a time, because photos may lie on a GPU
             return data.photos[view].cpu().numpy()
 
         keep = [None if k is None else k.cpu().numpy() for k in data.user_keep]
@@ -43,36 +43,36 @@ class DenseStart(Effect):
         self.count = len(xyz)
         return xyz, rgb
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"points": self.count}
 
 
-_LEAST_POINTS = 10  # of the sparse model in a photo, for the range of its depths
-_MOST_POINTS = 5000  # that choose neighbours where there are no tracks
+_LEAST_POINTS = 10  # sparse points in a photo that give the range of its depths
+_MOST_POINTS = 5000  # points that choose neighbours if the model has no tracks
 SIDE = 160  # px, the longer side at which photos are compared
-PHOTOS = 64  # at most so many, evenly chosen
+PHOTOS = 64  # largest number of photos used, evenly chosen
 PLANES = 64  # evenly spaced in inverse depth
 VIEWS = 4  # neighbours that a photo is compared with; the best two count
 WINDOW = 7  # px
-CORRELATION = 0.75  # at least, in the mean of the best two neighbours
-ALONE = 0.02  # above that of all other depths
+CORRELATION = 0.75  # least mean correlation with the best two neighbours
+ALONE = 0.02  # least lead of the best correlation over those of all other depths
 TOLERANCE = 0.02  # relative difference of depths that agree
-AGREEING = 2  # photos whose depth must agree, of twice `VIEWS`
-# degrees between two photos' rays: the best, its spread below and above, and the least in the median
+AGREEING = 2  # photos whose depth must agree, out of 2 `VIEWS`
+# degrees between two photos' rays: the best angle, spreads below and above it, and the least median angle
 _ANGLE, _BELOW, _ABOVE, _LEAST_ANGLE = 8.0, 4.0, 12.0, 1.0
-_NOISE = 1e-5  # variance of grey in [0, 1] that is no structure
+_NOISE = 1e-5  # variance of grey in [0, 1] that noise has
 _PEAK = 3  # planes around the best one that belong to its peak
 
 
 @dataclass(frozen=True)
 class _Photo:
-    """One photo, made small."""
+    """One photo, reduced."""
 
-    camera: Camera  # of the small photo
+    camera: Camera  # for the size of the reduced photo
     rgb: np.ndarray  # [h, w, 3] float32
     grey: np.ndarray  # [h, w] float32
-    shown: np.ndarray  # the same, -1 where it is masked
-    judged: np.ndarray  # [h, w] bool, static by the capture's own masks
+    shown: np.ndarray  # `grey`, with -1 where the photo is masked
+    static: np.ndarray  # [h, w] bool, kept by the capture's own masks
     seen: np.ndarray  # indices of the sparse points it sees
 
 
@@ -84,15 +84,15 @@ def dense_points(
     keep: Sequence[np.ndarray | None],
     most: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points on surfaces that at least three photos see at the same depth.
+    """Find points on surfaces that at least three photos see at the same depth.
 
     Args:
-        cameras: of the photos.
-        photo: of a camera's index, [H, W, 3] in [0, 1], sRGB.
+        cameras: cameras of the photos.
+        photo: returns the photo of a camera's index, [H, W, 3] in [0, 1], sRGB.
         sparse: [N, 3] points of the sparse model, which give the range of depths.
-        tracks: of each photo, the indices of points that were found in it; may be empty.
-        keep: of each photo, [H, W], 1 = used; None = all is used.
-        most: points to return at most.
+        tracks: for each photo the indices of its sparse points; may be empty.
+        keep: for each photo [H, W], 1 = used; None = all is used.
+        most: largest number of points to return.
 
     Returns:
         xyz [M, 3] float64 and rgb [M, 3] uint8. M is 0 where nothing agrees.
@@ -104,10 +104,10 @@ def dense_points(
     small = [_small(cameras[k], photo(k), keep[k], sparse, tracks[k], SIDE) for k in chosen]
     near = [_neighbours(small, k, sparse, 2 * VIEWS) for k in range(len(small))]
     depths = [_depth(own, [small[j] for j in near[k][:VIEWS]], sparse) for k, own in enumerate(small)]
-    found = [
+    agreed = [
         _agreeing(small[k], depths[k], [(small[j], depths[j]) for j in near[k]]) for k in range(len(small))
     ]
-    xyz, rgb = _thinned(small, found, most, TOLERANCE)
+    xyz, rgb = _thinned(small, agreed, most, TOLERANCE)
     return xyz, np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
 
 
@@ -117,9 +117,9 @@ def _small(
     share = min(1.0, side / max(photo.shape[:2]))
     size = tuple(max(round(n * share), 8) for n in photo.shape[1::-1])
     rgb = cv2.resize(np.ascontiguousarray(photo, np.float32), size, interpolation=cv2.INTER_AREA)
-    judged = np.ones(rgb.shape[:2], bool)
+    static = np.ones(rgb.shape[:2], bool)
     if keep is not None:
-        judged = cv2.resize(np.ascontiguousarray(keep, np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+        static = cv2.resize(np.ascontiguousarray(keep, np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
     shrunk = camera.resized(*size)
     seen = np.asarray(track, np.int64)
     if len(seen) < _LEAST_POINTS:  # a model without tracks: all points in the frame
@@ -127,11 +127,11 @@ def _small(
         pixels, z = _projected(shrunk, xyz[some])
         seen = some[_inside(pixels, z, rgb.shape[:2])]
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    return _Photo(shrunk, rgb, grey, np.where(judged, grey, np.float32(-1.0)), judged, seen)
+    return _Photo(shrunk, rgb, grey, np.where(static, grey, np.float32(-1.0)), static, seen)
 
 
 def _neighbours(small: Sequence[_Photo], at: int, xyz: np.ndarray, most: int) -> list[int]:
-    """The photos with most sparse points in common under good angles, the best first (as MVSNet chooses)."""
+    """Return the photos with most common sparse points under good angles, best first (as MVSNet)."""
     own, scores = small[at], []
     for k, other in enumerate(small):
         both = np.intersect1d(own.seen, other.seen, assume_unique=True) if k != at else own.seen[:0]
@@ -147,7 +147,7 @@ def _neighbours(small: Sequence[_Photo], at: int, xyz: np.ndarray, most: int) ->
 
 
 def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray) -> np.ndarray:
-    """Depth [h, w] float32 of a photo; 0 where it is not known."""
+    """Return the depth [h, w] float32 of a photo; 0 where it is unknown."""
     shape = photo.grey.shape
     z = _projected(photo.camera, xyz[photo.seen])[1]
     z = z[z > 0]
@@ -174,15 +174,17 @@ def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray) -> np.ndarr
     below, top, above = (np.take_along_axis(scores, (inner + d)[None], axis=0)[0] for d in (-1, 0, 1))
     away = np.abs(np.arange(PLANES)[:, None, None] - best[None]) > _PEAK
     rival = np.where(away, scores, -1.0).max(axis=0)
-    bend = below - 2.0 * top + above  # of a parabola through the three scores around the best one
-    offset = np.where(bend < 0, 0.5 * (below - above) / np.where(bend < 0, bend, -1.0), 0.0).clip(-0.5, 0.5)
+    curve = below - 2.0 * top + above  # that of a parabola through the three scores around the best
+    offset = np.where(curve < 0, 0.5 * (below - above) / np.where(curve < 0, curve, -1.0), 0.0).clip(
+        -0.5, 0.5
+    )
     depth = 1.0 / (inverse[0] + (inner + offset) * (inverse[1] - inverse[0]))
     sure = (inner == best) & (top > CORRELATION) & (rival < top - ALONE)
-    return np.where(sure & photo.judged & (variance > 10 * _NOISE), depth, 0.0).astype(np.float32)
+    return np.where(sure & photo.static & (variance > 10 * _NOISE), depth, 0.0).astype(np.float32)
 
 
 def _plane_warp(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B), [3, 3] each: A + B / z takes pixels of a camera, on the plane of depth z, to the other's."""
+    """Return A, B [3, 3]: A + B / z maps pixels of a camera, on the plane of depth z, to the other camera."""
     to_other = other.cam_from_world @ np.linalg.inv(camera.cam_from_world)
     inner = _intrinsics(other)
     turn = inner @ to_other[:3, :3] @ np.linalg.inv(_intrinsics(camera))
@@ -192,12 +194,12 @@ def _plane_warp(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
 def _correlation(
     grey: np.ndarray, mean: np.ndarray, variance: np.ndarray, other: np.ndarray, warp: np.ndarray, window: int
 ) -> np.ndarray:
-    """ZNCC [h, w] of windows around each pixel and where `warp` takes them in `other`; -1 outside of it."""
+    """Return ZNCC [h, w] of windows around pixels and around their images by `warp`; -1 outside `other`."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     drawn = cv2.warpPerspective(other, warp, grey.shape[::-1], flags=flags, borderValue=-1.0)
     height, width = grey.shape
     ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ warp[2]
-    if ends.min() <= 0:  # a part of the plane lies behind the other camera
+    if ends.min() <= 0:  # part of the plane lies behind the other camera
         return np.full(grey.shape, -1.0, np.float32)
     outside = drawn < 0
     drawn[outside] = 0.0
@@ -218,43 +220,43 @@ def _box(x: np.ndarray, window: int) -> np.ndarray:
 
 
 def _agreeing(photo: _Photo, depth: np.ndarray, others: Sequence[tuple[_Photo, np.ndarray]]) -> np.ndarray:
-    """The depths [h, w] that enough others agree with; 0 elsewhere."""
+    """Keep the depths [h, w] that enough other photos agree with; 0 elsewhere."""
     rows, columns = np.nonzero(depth > 0)
     world = _world(photo.camera, columns, rows, depth[rows, columns])
     votes = np.zeros(len(world), np.int64)
     for other, theirs in others:
         votes += _same_surface(other.camera, theirs, world, TOLERANCE)
-    found = np.zeros_like(depth)
+    agreed = np.zeros_like(depth)
     sure = votes >= AGREEING
-    found[rows[sure], columns[sure]] = depth[rows[sure], columns[sure]]
-    return found
+    agreed[rows[sure], columns[sure]] = depth[rows[sure], columns[sure]]
+    return agreed
 
 
 def _same_surface(camera: Camera, depth: np.ndarray, world: np.ndarray, tolerance: float) -> np.ndarray:
-    """Which world points [N, 3] lie at the depth [h, w] of a camera's map, [N] bool."""
+    """Return which world points [N, 3] lie at the depth that a camera's map [h, w] has there, [N] bool."""
     pixels, z = _projected(camera, world)
     same = _inside(pixels, z, depth.shape)
     at = np.clip(np.rint(np.nan_to_num(pixels[same])).astype(np.int64), 0, np.array(depth.shape[::-1]) - 1)
-    there = depth[at[:, 1], at[:, 0]]
-    same[same] = (there > 0) & (np.abs(there - z[same]) < tolerance * z[same])
+    map_depth = depth[at[:, 1], at[:, 0]]
+    same[same] = (map_depth > 0) & (np.abs(map_depth - z[same]) < tolerance * z[same])
     return same
 
 
 def _thinned(
     small: Sequence[_Photo], depths: Sequence[np.ndarray], most: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Evenly over the photos, each surface once: xyz [M, 3] and rgb [M, 3] in [0, 1], at most `most`.
+    """Choose points evenly over the photos, each surface once: xyz [M, 3], rgb [M, 3] in [0, 1], M <= most.
 
-    Cells of the photos are as large as needed: a close surface gets closer points than a far one.
+    One point is taken per cell of a photo, so a close surface gets denser points than a far one.
     """
     cell, longest = 2, max(max(photo.grey.shape) for photo in small)
     while True:
         xyz, rgb = _one_a_cell(small, depths, cell, tolerance)
         if len(xyz) <= most or cell > longest:
-            # more photos than points: evenly chosen
+            # there are more photos than points: choose evenly
             some = np.arange(min(len(xyz), most)) * len(xyz) // max(min(len(xyz), most), 1)
             return xyz[some], rgb[some]
-        # points fall with the square of the cell
+        # the number of points falls with the square of the cell
         cell = max(cell + 1, math.floor(cell * math.sqrt(len(xyz) / most)))
 
 
@@ -268,13 +270,13 @@ def _one_a_cell(
         pixels, z = _projected(photo.camera, xyz)
         at = np.flatnonzero(_inside(pixels, z, shape))
         x, y = np.clip(np.rint(pixels[at]).astype(np.int64), 0, np.array(shape[::-1]) - 1).T
-        # a point that this photo does not see, because something is before it, takes no cell
+        # a point that is hidden in this photo takes no cell
         shown = (depth[y, x] == 0) | (z[at] < (1.0 + 2 * tolerance) * depth[y, x])
         taken[y[shown] // cell, x[shown] // cell] = True
         rows, columns = np.nonzero(depth > 0)
         free = ~taken[rows // cell, columns // cell]
         rows, columns = rows[free], columns[free]
-        # of a free cell the pixel that is nearest to its centre
+        # take the pixel nearest to the centre of each free cell
         away = np.hypot(rows % cell - (cell - 1) / 2, columns % cell - (cell - 1) / 2)
         order = np.lexsort((columns, rows, away))
         cells = rows // cell * taken.shape[1] + columns // cell
@@ -286,14 +288,14 @@ def _one_a_cell(
 
 
 def _intrinsics(camera: Camera) -> np.ndarray:
-    """[3, 3] for pixels whose centres are whole numbers, as OpenCV's are."""
-    found = camera.intrinsics
-    found[:2, 2] -= 0.5
-    return found
+    """Return K [3, 3] for OpenCV, whose pixel centres are whole numbers."""
+    k = camera.intrinsics
+    k[:2, 2] -= 0.5
+    return k
 
 
 def _projected(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (x, y) [N, 2], whole at their centres, and depths [N] of world points."""
+    """Project world points to pixels (x, y) [N, 2], with whole numbers at centres, and depths [N]."""
     local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     z = local[:, 2]
     safe = np.where(z > 0, z, 1.0)
@@ -306,7 +308,7 @@ def _inside(pixels: np.ndarray, z: np.ndarray, shape: tuple[int, ...]) -> np.nda
 
 
 def _world(camera: Camera, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """World points [N, 3] of pixels at depths z."""
+    """Return the world points [N, 3] of pixels at depths z."""
     local = np.stack(
         [(x + 0.5 - camera.cx) / camera.fx * z, (y + 0.5 - camera.cy) / camera.fy * z, z], axis=1
     ).astype(np.float64)

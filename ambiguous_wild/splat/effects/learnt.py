@@ -1,8 +1,8 @@
-"""Base of effects that a recipe writes as a forward in torch.
+"""Base of effects that a recipe writes as a forward function in torch.
 
-A recipe says what is learnt (`leaves`, `rows`) and how colours come of it (`forward`, over the visible
-Gaussians; `change`, over all of them; `tone`, over the picture). Adam, the row of a test photo, checkpoints
-and the pulls by autograd are done here.
+A recipe declares what is learnt (`leaves`, `rows`) and how colours follow from it: `forward` over the visible
+Gaussians, `change` over all of them, `tone` over the picture. Adam, the row of a test photo, checkpoints and
+the pulls by autograd are here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, rate_for_run_length
+from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, rate_for_run_length
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.rendered import (
     Cotangents,
@@ -36,51 +37,49 @@ from ambiguous_wild.splat.step import Shot, TrainData
 class Leaf:
     """A tensor that an effect learns."""
 
-    values: Tensor  # of any shape; with `per_photo` [train photos, ...]
-    rate: float  # Adam's
-    final: float = 1.0  # it decays exponentially to this share
+    values: Tensor  # any shape; [train photos, ...] if `per_photo`
+    rate: float  # learning rate of Adam
+    final: float = 1.0  # the rate decays exponentially to this share
     per_photo: bool = False  # a row for every photo, and one for a test photo
-    fit_rate: float = 0.1  # Adam's while a test photo's row is fitted (WildGaussians)
-    made_for: int | None = (
-        None  # iterations that the rate is for: shorter runs get more, see `rate_for_run_length`
-    )
+    fit_rate: float = 0.1  # learning rate while a test photo's row is fitted (WildGaussians)
+    made_for: int | None = None  # run length that the rate is for, see `rate_for_run_length`
 
 
 @dataclass(frozen=True)
 class Visible:
-    """The Gaussians that a picture shows."""
+    """What `Learnt.forward` gets of the visible Gaussians."""
 
     base: Tensor  # [M, 3] colours of the harmonics in this direction, SH + 0.5, not clamped
     means: Tensor  # [M, 3] world
-    extra: Mapping[str, Tensor] = field(default_factory=dict)  # [M, ...] rows of `Gaussians.extra`
+    attributes: Mapping[str, Tensor] = field(default_factory=dict)  # [M, ...] rows of `Gaussians.attributes`
 
 
 class Learnt(Effect):
-    """Override `leaves`, and one or more of `forward`, `change` and `tone`.
+    """An effect with parameters. Override `leaves`, and one or more of `forward`, `change` and `tone`.
 
-    Each gets `leaf`: the leaves by name, those per photo as the row of the shot's photo.
+    Each gets `leaf`, the leaves by name; of a leaf per photo it gets the row of the shot's photo.
     """
 
-    # row of a photo that was not trained on: where a fit starts, and what a picture without a photo gets
+    # row of a photo that was not trained on: the start of a fit, and the row of a picture without a photo
     unseen: ClassVar[Literal["zero", "mean"]] = "zero"
 
     def leaves(self, data: TrainData, rng: np.random.Generator) -> Mapping[str, Leaf]:
-        """What is learnt beside the Gaussians' own rows (`Effect.rows`)."""
+        """Return what is learnt beside the attributes of Gaussians (`Effect.rows`)."""
         return {}
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        """Colours [M, 3] of the visible Gaussians; the renderer clamps them below at 0."""
+        """Return colours [M, 3] of the visible Gaussians; the renderer clamps them at 0."""
         return visible.base
 
     def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
-        """Raw parameters as they are drawn, [N, ...] each by name: those that differ from the given ones."""
+        """Return by name those raw parameters [N, ...] that are drawn with other values."""
         return {}
 
     def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        """The picture [H, W, 3] as it is compared with the photo."""
+        """Return the picture [H, W, 3] as it is compared with the photo."""
         return image
 
-    # -- what a recipe need not know ----------------------------------------------------------------
+    # -- recipes override nothing below ------------------------------------------------------------
 
     def setup(self, data: TrainData) -> None:
         self.photos = len(data.photos)
@@ -89,7 +88,7 @@ class Learnt(Effect):
         self._adam = {name: RowAdam(self._table(leaf).to(data.device)) for name, leaf in self._leaves.items()}
 
     def require_setup(self) -> None:
-        """Raise AwError where the run lacks this effect: a mask policy that reads it was grafted alone."""
+        """Raise AwError if the run lacks this effect: a mask policy that reads it was grafted alone."""
         if not hasattr(self, "_adam"):
             raise AwError(f"the masks of {self.name} need its effects: use both, or masks of another method")
 
@@ -100,7 +99,7 @@ class Learnt(Effect):
         return torch.cat([values, torch.zeros_like(values[:1])])
 
     def _leaf(self, shot: Shot) -> dict[str, Tensor]:
-        """Copies to differentiate, and to read after the optimiser moved on."""
+        """Return copies of the leaves, to differentiate and to read after the optimiser's step."""
         return {name: self._row(name, shot).detach().clone() for name in self._leaves}
 
     def _row(self, name: str, shot: Shot) -> Tensor:
@@ -115,34 +114,35 @@ class Learnt(Effect):
         return rows.mean(dim=0) if self.unseen == "mean" else torch.zeros_like(rows[0])
 
     def acts(self, hook: str) -> bool:
-        written = _WRITTEN.get(hook)
+        function = _FILLED_BY.get(hook)
         return (
             super().acts(hook)
-            if written is None
-            else getattr(type(self), written) is not getattr(Learnt, written)
+            if function is None
+            else getattr(type(self), function) is not getattr(Learnt, function)
         )
 
     def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
         leaf = self._leaf(shot)
-        given: dict[str, Any] = {name: tensor.detach().clone() for name, tensor in gaussians.rows()}
+        given = {name: tensor.detach().clone() for name, tensor in gaussians.rows()}
         graph = _Graph(leaf, given)
         with torch.enable_grad():
-            extra = {name: given[name] for name in gaussians.extra}
-            inputs = Gaussians(**{name: given[name] for name in PARAMETERS}, extra=extra)
+            attributes = {name: given[name] for name in gaussians.attributes}
+            inputs = Gaussians(*(given[name] for name in PARAMETERS), attributes=attributes)
             changed = dict(self.change(inputs, leaf, shot))
 
         def pull(gradients: Gradients) -> Gradients:
             d = {name: getattr(gradients, name) for name in changed}
-            found = graph.pull([changed[name] for name in changed], [d[name] for name in changed])
+            gradients_of = graph.pull([changed[name] for name in changed], [d[name] for name in changed])
             sums: dict[str, Any] = {}
             for name in PARAMETERS:
                 unchanged = None if name in changed else getattr(gradients, name)
-                sums[name] = _sum(unchanged, found.get(name), given[name])
-            extra = {
-                name: _sum(gradients.extra.get(name), found.get(name), given[name]) for name in inputs.extra
+                sums[name] = _sum(unchanged, gradients_of.get(name), given[name])
+            attributes = {
+                name: _sum(gradients.attributes.get(name), gradients_of.get(name), given[name])
+                for name in inputs.attributes
             }
-            own = {name: found[name] for name in leaf if name in found}
-            return replace(gradients, **sums, extra=extra).with_own(self.name, own)
+            own = {name: gradients_of[name] for name in leaf if name in gradients_of}
+            return replace(gradients, **sums, attributes=attributes).with_own(self.name, own)
 
         drawn: dict[str, Any] = {name: value.detach().contiguous() for name, value in changed.items()}
         return replace(gaussians, **drawn), pull
@@ -151,20 +151,20 @@ class Learnt(Effect):
         self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: Shot
     ) -> tuple[Tensor, ShadePull]:
         leaf = self._leaf(shot)
-        extra = {name: values[rows].detach() for name, values in gaussians.extra.items()}
+        attributes = {name: values[rows].detach() for name, values in gaussians.attributes.items()}
         means, base = gaussians.means[rows].detach(), base.detach()
-        graph = _Graph(leaf, {"base": base, "means": means}, extra)
+        graph = _Graph(leaf, {"base": base, "means": means}, attributes)
         with torch.enable_grad():
-            colours = self.forward(Visible(base, means, extra), leaf, shot)
+            colours = self.forward(Visible(base, means, attributes), leaf, shot)
 
         def pull(d_colours: Tensor) -> ShadeGradients:
-            found = graph.pull([colours], [d_colours])
-            through = found.get("base")
+            gradients_of = graph.pull([colours], [d_colours])
+            through = gradients_of.get("base")
             return ShadeGradients(
                 torch.zeros_like(base) if through is None else through.contiguous(),
-                {name: found[name] for name in extra if name in found},
-                found.get("means"),
-                {self.name: {name: found[name] for name in leaf if name in found}},
+                {name: gradients_of[name] for name in attributes if name in gradients_of},
+                gradients_of.get("means"),
+                {self.name: {name: gradients_of[name] for name in leaf if name in gradients_of}},
             )
 
         return colours.detach(), pull
@@ -210,7 +210,7 @@ class Learnt(Effect):
             if self._leaves[name].per_photo:
                 self._adam[name].step(self.photos, gradient, self._leaves[name].fit_rate)
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         tables = {
             n: self._adam[n].values[: self.photos] for n, leaf in self._leaves.items() if leaf.per_photo
         }
@@ -225,11 +225,11 @@ class Learnt(Effect):
 
 
 # which function of a recipe fills which hook
-_WRITTEN = {"model": "change", "shade": "forward", "image": "tone"}
+_FILLED_BY = {"model": "change", "shade": "forward", "image": "tone"}
 
 
 class _Graph:
-    """Inputs of one forward, and their gradients; may be pulled more than once."""
+    """The inputs of one forward pass; gradients can be pulled to them more than once."""
 
     def __init__(self, *named: dict[str, Tensor]) -> None:
         self.inputs: dict[str, Tensor] = {}
@@ -237,45 +237,43 @@ class _Graph:
         for group in named:
             for name, tensor in group.items():
                 if name in self.inputs:
-                    raise AwError(
-                        f"{name!r} names two inputs of an effect: call its leaf or its row otherwise"
-                    )
+                    raise AwError(f"{name!r} names two inputs of an effect: rename its leaf or its attribute")
                 group[name] = tensor.requires_grad_(self.recorded)
                 self.inputs[name] = group[name]
 
     def pull(self, outputs: Sequence[Tensor], cotangents: Sequence[Tensor]) -> dict[str, Tensor]:
-        """By name, of those inputs that the outputs depend on.
+        """Return the gradients, by name, of those inputs that the outputs depend on.
 
         Raises:
-            RuntimeError: the forward ran under `torch.no_grad`.
+            RuntimeError: the forward pass ran under `torch.no_grad`.
         """
         if not self.recorded:
             raise RuntimeError("drawn under torch.no_grad: there is no backward pass")
         pairs = [(o, c.to(o)) for o, c in zip(outputs, cotangents) if o.requires_grad]
         if not pairs:
             return {}
-        found = torch.autograd.grad(
+        gradients = torch.autograd.grad(
             [o for o, _ in pairs], list(self.inputs.values()), [c for _, c in pairs], retain_graph=True,
             allow_unused=True,
         )  # fmt: skip
-        return {name: gradient for name, gradient in zip(self.inputs, found) if gradient is not None}
+        return {name: gradient for name, gradient in zip(self.inputs, gradients) if gradient is not None}
 
 
 def _sum(a: Tensor | None, b: Tensor | None, like: Tensor) -> Tensor:
     if a is None or b is None:
-        known = b if a is None else a
-        return torch.zeros_like(like) if known is None else known.contiguous()
+        one = b if a is None else a
+        return torch.zeros_like(like) if one is None else one.contiguous()
     return (a + b).contiguous()
 
 
 def mlp_leaves(name: str, widths: Sequence[int], rng: np.random.Generator, rate: float) -> dict[str, Leaf]:
-    """Weights and biases of a net with these widths, uniform in +-1/sqrt(inputs) as torch.nn.Linear's."""
-    found = {}
+    """Return weights and biases of a net with these widths, initialised as by torch.nn.Linear."""
+    leaves = {}
     for i, (inputs, outputs) in enumerate(pairwise(widths)):
         for kind, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
             values = rng.uniform(-1, 1, shape) / np.sqrt(inputs)
-            found[f"{name}_{kind}{i}"] = Leaf(torch.tensor(values, dtype=torch.float32), rate)
-    return found
+            leaves[f"{name}_{kind}{i}"] = Leaf(torch.tensor(values, dtype=torch.float32), rate)
+    return leaves
 
 
 def mlp(
@@ -284,7 +282,7 @@ def mlp(
     name: str,
     activation: Callable[[Tensor], Tensor] = torch.relu,
 ) -> Tensor:
-    """The net of `mlp_leaves`, [M, outputs]; no activation after the last layer."""
+    """Apply the net of `mlp_leaves`, [M, outputs]; the last layer has no activation."""
     layers = sum(key.startswith(f"{name}_weight") for key in leaf)
     for i in range(layers):
         x = torch.addmm(leaf[f"{name}_bias{i}"], x, leaf[f"{name}_weight{i}"])

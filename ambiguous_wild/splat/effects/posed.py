@@ -1,7 +1,7 @@
-"""Cameras where tensors lie: their matrices, copied once, and poses that were learnt there.
+"""Matrices of cameras on a device, copied once, and cameras whose poses are learnt on the device.
 
-The renderer takes `pose`, `intrinsics_there` and `centre` of a learnt pose as they lie. Whoever asks for
-the numpy pose of `Camera` gets it too, and makes the host of an accelerator wait for it.
+The renderer reads `pose`, `intrinsics_there` and `centre` of a learnt pose on its device. Reading the numpy
+pose of `Camera` also works, but makes the host of an accelerator wait.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 
-_REMEMBERED = 8192  # cameras; a thousand photos at three sizes, and their test views
+_REMEMBERED = 8192  # cameras: enough for a thousand photos at three sizes and for test views
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,15 @@ _cameras: OrderedDict[tuple[int, torch.device, torch.dtype], tuple[Camera, OnDev
 
 
 def on_device(camera: Camera, device: torch.device, dtype: torch.dtype = torch.float32) -> OnDevice:
-    """The camera's matrices there, copied once: a copy from the host in every step would make it wait."""
-    if isinstance(camera, PosedCamera):  # of pose refinement: another one in every step, made there
+    """Return the camera's matrices on the device, copied once, so that the host need not wait in a step."""
+    if isinstance(camera, PosedCamera):  # made by pose refinement on the device, anew in every step
         matrices = camera.pose[None], camera.intrinsics_there[None], camera.centre
         return OnDevice(*(matrix.to(device, dtype) for matrix in matrices))
     key = (id(camera), device, dtype)
     if key not in _cameras:
         host = camera.cam_from_world[None], camera.intrinsics[None], camera.center
         there = OnDevice(*(torch.tensor(matrix).to(dtype).to(device) for matrix in host))
-        _cameras[key] = (camera, there)  # the camera itself too: as long as it lives, its id is its own
+        _cameras[key] = (camera, there)  # holds the camera too, so that no other object gets its id
         if len(_cameras) > _REMEMBERED:
             _cameras.popitem(last=False)
     _cameras.move_to_end(key)
@@ -48,14 +48,14 @@ def on_device(camera: Camera, device: torch.device, dtype: torch.dtype = torch.f
 
 
 class PosedCamera(Camera):
-    """`base` with another pose."""
+    """The camera `base` with another pose, a tensor."""
 
     def __init__(self, base: Camera, pose: Tensor, intrinsics: Tensor) -> None:
         """
         Args:
-            base: its size and focal lengths.
+            base: camera that gives size and focal lengths.
             pose: cam_from_world [4, 4] float64, rigid.
-            intrinsics: K [3, 3] float64 of `base`, beside the pose.
+            intrinsics: K [3, 3] float64 of `base`, on the device of the pose.
         """
         for name in ("width", "height", "fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, getattr(base, name))
@@ -68,7 +68,7 @@ class PosedCamera(Camera):
 
     @functools.cached_property
     def cam_from_world(self) -> np.ndarray:
-        """[4, 4] float64; read from the device when it is first asked for."""
+        """[4, 4] float64; read from the device at the first access."""
         return self.pose.detach().cpu().numpy()
 
     @functools.cached_property
@@ -77,7 +77,7 @@ class PosedCamera(Camera):
         return -self.pose[:3, 3] @ self.pose[:3, :3]
 
     def resized(self, width: int, height: int) -> Camera:
-        """As `Camera.resized`, with the same pose."""
+        """Return what `Camera.resized` does, with the same pose."""
         return PosedCamera(
             self.base.resized(width, height),
             self.pose,
@@ -86,7 +86,7 @@ class PosedCamera(Camera):
 
 
 def scaled(intrinsics: Tensor, x: float, y: float) -> Tensor:
-    """K [3, 3] of a picture x times as wide and y times as high."""
+    """Return K [3, 3] of a picture x times as wide and y times as high."""
     if x == 1.0 and y == 1.0:
         return intrinsics
     out = intrinsics.clone()

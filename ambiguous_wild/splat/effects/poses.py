@@ -1,33 +1,34 @@
-"""Pose refinement: a small rigid motion per train camera, learnt with the scene, held near zero.
+"""Pose refinement: a small rigid motion per train camera, learnt with the scene and pulled towards zero.
 
-The renderer has no gradient for the camera and needs none: moving the camera is moving all Gaussians the
-other way, except that the *world* direction in which a colour is looked up does not turn with the camera. So
-the camera's gradient is a sum over the Gaussians' own gradients, less the part that went through direction.
+The renderer has no gradient for the camera and needs none: to move the camera is to move all Gaussians the
+other way. Only the world direction in which a colour is looked up does not turn with the camera. So the
+camera's gradient is a sum over the gradients of the Gaussians, less the part that went through this
+direction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, State, decayed, share_of
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, share_of
 from ambiguous_wild.splat.effects.placing import higher_harmonics
 from ambiguous_wild.splat.effects.posed import PosedCamera, on_device, scaled
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Shot, TrainData
 
-RATE_PX, FINAL = 0.2, 0.01  # px a step of what a turn moves in the picture; decays to this share
-BEGIN = 0.05  # of the run: before it the render is no evidence of where a camera stood
-PULL = 1e-2  # a visit, towards the pose of the sparse model
+RATE_PX, FINAL = 0.2, 0.01  # motion of a step in the picture, px, and the share that it decays to
+BEGIN = 0.05  # share of the run before which renders are too poor to correct cameras
+PULL = 1e-2  # share of the motion that each step with the photo takes back
 
-Rows = Tensor | slice  # of the Gaussians: those that learnt, or on an accelerator all
+Rows = Tensor | slice  # Gaussians that have a gradient; on an accelerator all
 
 
 class PoseRefinement(Effect):
@@ -42,11 +43,11 @@ class PoseRefinement(Effect):
         self.depth = float(np.median(distance)) if len(distance) else 1.0
         self.adam = RowAdam(torch.zeros(self.views, 6, dtype=torch.float64, device=data.device))
         self.cameras = data.cameras
-        self.rate = RATE_PX / float(np.median([camera.fx for camera in data.cameras]))  # rad, and of depth
+        self.rate = RATE_PX / float(np.median([camera.fx for camera in data.cameras]))  # rad, and depths
 
     def camera(self, shot: Shot) -> Camera:
         assert shot.view is not None
-        if not self.adam.steps[shot.view]:  # never moved; known without a look at its row
+        if not self.adam.steps[shot.view]:  # never moved: its row need not be read
             return shot.camera
         full, row = self.cameras[shot.view], self.adam.values[shot.view]
         base = on_device(full, row.device, row.dtype)
@@ -60,7 +61,7 @@ class PoseRefinement(Effect):
         assert shot.view is not None
         row = self.adam.values[shot.view]
         left = left_gradient(gaussians, shot.camera, gradients)
-        # the motion is exp(w) then the shift: about the present pose, the shift part of w is subtracted
+        # the motion is exp(w), then the shift, so the shift's part of the gradient of w is subtracted
         turn = left[:3] - torch.linalg.cross(self.depth * row[3:], left[3:])
         return {"motion": torch.cat([left_jacobian(row[:3]).T @ turn, self.depth * left[3:]])}
 
@@ -73,7 +74,7 @@ class PoseRefinement(Effect):
         pull = PULL * share if called_off is None else PULL * share * share_of(called_off, row)
         row *= 1 - pull  # decoupled from Adam's scaling, as weight decay is in AdamW
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         angle = torch.rad2deg(self.adam.values[:, :3].norm(dim=1))
         return {
             "turned_deg_median": float(angle.median()),
@@ -89,31 +90,31 @@ class PoseRefinement(Effect):
 
 @torch.no_grad()
 def left_gradient(gaussians: Gaussians, camera: Camera, gradients: Gradients) -> Tensor:
-    """dL/d(turn, shift) [6] float64 of a further small motion of the camera frame: x_cam + w x x_cam + v.
+    """Return dL/d(w, v) [6] float64 of a small further motion of the camera, x_cam + w x x_cam + v.
 
     Args:
-        gaussians: as rendered.
-        camera: as rendered.
-        gradients: of that render; Gaussians without one add nothing.
+        gaussians: Gaussians that were rendered.
+        camera: camera that was rendered.
+        gradients: gradients of that render; Gaussians without a gradient add nothing.
     """
     rows = backend_of(gaussians.device).rows(
         lambda: (gradients.means.abs().sum(dim=1) + gradients.quats.abs().sum(dim=1)) > 0
     )
     means, d_means = gaussians.means[rows].double(), gradients.means[rows].double()
-    if not len(means):  # nothing in the picture learns from it
+    if not len(means):  # no Gaussian has a gradient
         return torch.zeros(6, dtype=torch.float64, device=gaussians.device)
     there = on_device(camera, gaussians.device, torch.float64)
     rotation, move = there.viewmat[0, :3, :3], there.viewmat[0, :3, 3]
     geometric = d_means - _through_direction(gaussians, there.centre, gradients, rows)
     local = means @ rotation.T + move
     d_local = geometric @ rotation.T
-    shift = (d_means @ rotation.T).sum(dim=0)  # a shift does move the direction, as a mean would
+    shift = (d_means @ rotation.T).sum(dim=0)  # a shift changes the direction too, like a shift of the means
     turn = torch.linalg.cross(local, d_local).sum(dim=0)
-    return torch.cat([turn + rotation @ _of_quats(gaussians, gradients, rows), shift])
+    return torch.cat([turn + rotation @ _turn_of_quats(gaussians, gradients, rows), shift])
 
 
-def _of_quats(gaussians: Gaussians, gradients: Gradients, rows: Rows) -> Tensor:
-    """dL/dw [3] of turning every Gaussian by w in world axes: dq = (0, w) q / 2."""
+def _turn_of_quats(gaussians: Gaussians, gradients: Gradients, rows: Rows) -> Tensor:
+    """Return dL/dw [3] of a rotation of every Gaussian by w in world axes: dq = (0, w) q / 2."""
     q, d = gaussians.quats[rows].double(), gradients.quats[rows].double()
     v, dv = q[:, 1:], d[:, 1:]
     # <d, (0, w) q> with (0, w)(a, v) = (-w.v, a w + w x v)
@@ -122,7 +123,7 @@ def _of_quats(gaussians: Gaussians, gradients: Gradients, rows: Rows) -> Tensor:
 
 
 def _through_direction(gaussians: Gaussians, centre: Tensor, gradients: Gradients, rows: Rows) -> Tensor:
-    """The part of dL/dmeans [rows, 3] that went through the direction of the harmonics."""
+    """Return the part of dL/dmeans [rows, 3] that went through the direction of the harmonics."""
     means = gaussians.means[rows]
     if gaussians.sh_degree == 0:
         return torch.zeros(means.shape, dtype=torch.float64, device=gaussians.device)
@@ -139,13 +140,13 @@ def _through_direction(gaussians: Gaussians, centre: Tensor, gradients: Gradient
 
 
 def _hat(vector: Tensor) -> Tensor:
-    """[3, 3] matrix of x -> vector x x."""
+    """Return the matrix [3, 3] of x -> vector x x."""
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
     return torch.linalg.cross(vector.expand(3, 3), eye).T
 
 
 def turned(rotation: Tensor) -> Tensor:
-    """exp(w) [3, 3] of a rotation vector [3], rad; smooth at zero and without a look at its length."""
+    """Return exp(w) [3, 3] of a rotation vector [3], rad; smooth at zero, without reading values."""
     a, b, _ = _coefficients(rotation)
     cross = _hat(rotation)
     eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
@@ -153,7 +154,7 @@ def turned(rotation: Tensor) -> Tensor:
 
 
 def left_jacobian(rotation: Tensor) -> Tensor:
-    """J [3, 3] of exp(w + dw) = exp(J dw) exp(w)."""
+    """Return J [3, 3] with exp(w + dw) = exp(J dw) exp(w)."""
     _, b, c = _coefficients(rotation)
     cross = _hat(rotation)
     eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
@@ -161,12 +162,12 @@ def left_jacobian(rotation: Tensor) -> Tensor:
 
 
 def _coefficients(rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 of the angle t, 0-d each."""
+    """Return sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 of the angle t, 0-d each."""
     squared = (rotation * rotation).sum()
     angle = squared.sqrt()
     a = torch.sinc(angle / torch.pi)
     b = 0.5 * torch.sinc(angle / (2 * torch.pi)) ** 2
-    # below 0.01 rad the difference loses digits that two terms of the series have
+    # below 0.01 rad the difference loses digits; two terms of the series do not
     series = 1.0 / 6.0 - squared / 120.0
     c = torch.where(squared < 1e-4, series, (1.0 - a) / squared.clamp(min=1e-8))
     return a, b, c

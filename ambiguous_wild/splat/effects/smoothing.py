@@ -7,21 +7,21 @@ Source: Mip-Splatting (Yu et al., CVPR 2024), constants of its code. The screen 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat.effects.base import Effect, State
+from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.placing import pose_like
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients, Pull
 from ambiguous_wild.splat.step import Shot, TrainData
 
-VARIANCE = 0.2  # of the filter, in squared sampling intervals
-MARGIN = 0.15  # of the picture on each side still counts as seen
-NEAR = 0.2
+VARIANCE = 0.2  # variance of the filter, in squared sampling intervals
+MARGIN = 0.15  # share of the picture by which it is widened on each side when points count as seen
+NEAR = 0.2  # least depth that counts as seen
 EVERY = 100  # iterations between filter sizes
 
 
@@ -34,22 +34,22 @@ class SmoothingFilter(Effect):
     def setup(self, data: TrainData) -> None:
         self.cameras = data.cameras
         self.size = torch.zeros(0, device=data.device)  # [N] f, world units
-        self._stale = True  # rows changed since
-        self._at = 0
+        self._stale = True  # whether rows have changed since the sizes were computed
+        self._at = 0  # iteration of the sizes
 
     def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
         size = self.size
         due = self._stale or (not shot.neutral and shot.iteration - self._at >= EVERY)
         if due or shot.other_gaussians:
             size = filter_sizes(gaussians.means, self.cameras)
-            if not shot.neutral and not shot.other_gaussians:  # a probe changes no state
+            if not shot.neutral and not shot.other_gaussians:  # a probe must not change the state
                 self.size, self._at, self._stale = size, shot.iteration, False
         variance = (2 * gaussians.log_scales).exp()
         wide = variance + size.to(variance)[:, None] ** 2
         share = variance / wide  # [N, 3]
         plain = torch.sigmoid(gaussians.opacity_logits)
         opacity = plain * share.prod(dim=1).sqrt()
-        # an opaque Gaussian that is not widened has logit infinity otherwise
+        # the logit of an opaque Gaussian that is not widened would be infinite
         opacity = opacity.clamp(1e-7, 1 - 1e-6)
 
         def pull(gradients: Gradients) -> Gradients:
@@ -66,7 +66,7 @@ class SmoothingFilter(Effect):
     def rows_changed(self) -> None:
         self._stale = True
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {"filter_size_median": float(self.size.median()) if len(self.size) else None}
 
     def state_dict(self) -> State:
@@ -79,11 +79,13 @@ class SmoothingFilter(Effect):
 
 @torch.no_grad()
 def filter_sizes(means: Tensor, cameras: list[Camera]) -> Tensor:
-    """f [N] in world units: sqrt(0.2) z / F, z to the nearest camera that sees it, F the longest focal.
+    """Return f [N] in world units: sqrt(0.2) z / F, with z to the nearest camera that sees the Gaussian.
+
+    F is the longest focal length.
 
     Args:
-        means: [N, 3] world.
-        cameras: of the train photos, at full size.
+        means: [N, 3] in the world.
+        cameras: cameras of the train photos, at full size.
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
     for camera in cameras:
@@ -94,8 +96,8 @@ def filter_sizes(means: Tensor, cameras: list[Camera]) -> Tensor:
         v = (camera.fy * y / depth + camera.cy) / camera.height
         seen = (z > NEAR) & ((u - 0.5).abs() <= 0.5 + MARGIN) & ((v - 0.5).abs() <= 0.5 + MARGIN)
         nearest = torch.where(seen, torch.minimum(nearest, z), nearest)
-    known = torch.isfinite(nearest)
-    if len(means):  # the farthest of what is seen; what is seen lies before the camera, so 0 is none
-        far = nearest.masked_fill(~known, 0.0).amax()
-        nearest = torch.where(known, nearest, far)
+    any_sees = torch.isfinite(nearest)
+    if len(means):  # unseen Gaussians get the largest seen depth; seen depths are positive, so 0 = none
+        far = nearest.masked_fill(~any_sees, 0.0).amax()
+        nearest = torch.where(any_sees, nearest, far)
     return nearest * (VARIANCE**0.5 / max(camera.fx for camera in cameras))

@@ -1,4 +1,4 @@
-"""What the photos say of the same SfM points: colours along tracks, and exposure gains from them."""
+"""Colours of SfM points in the photos along their tracks, and exposure gains from them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from scipy.ndimage import map_coordinates, uniform_filter
 
 from ambiguous_wild.core import Scene
 
-DARK, BRIGHT = 0.04, 0.96  # outside, a ratio of codes is noise or clipping
-ROUNDS = 12
+DARK, BRIGHT = 0.04, 0.96  # colours outside of this range are noisy or clipped
+ROUNDS = 12  # alternations of medians
 
 
 @dataclass(frozen=True)
 class TrackColours:
-    """Observations of SfM points in the train photos, those that are neither black nor clipped."""
+    """Observations of SfM points in the train photos that are neither black nor clipped."""
 
     point: np.ndarray  # [L] int64, index into Scene.points
     view: np.ndarray  # [L] int64, index into Scene.train
@@ -24,7 +24,7 @@ class TrackColours:
 
 
 def tracks_of(scene: Scene) -> list[np.ndarray]:
-    """Of each train photo the indices of the points that were found in it, sorted."""
+    """Return for each train photo the sorted indices of its sparse points."""
     points = scene.points
     owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
@@ -32,16 +32,16 @@ def tracks_of(scene: Scene) -> list[np.ndarray]:
 
 
 def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
-    """Read every train photo where its SfM points were found.
+    """Read the colours of SfM points in every train photo.
 
     Args:
-        scene: with tracks.
-        photos: of the train views, [H, W, 3] in [0, 1], of any size.
+        scene: scene with tracks.
+        photos: photos of the train views, [H, W, 3] in [0, 1], of any size.
     """
     points = scene.points
     of_point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
     train = {index: k for k, index in enumerate(i for i, v in enumerate(scene.views) if v.split == "train")}
-    found = []
+    observed = []
     for index, k in train.items():
         rows = np.flatnonzero(points.track_views == index)
         if not len(rows):
@@ -56,17 +56,17 @@ def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
             [map_coordinates(smooth[..., c], where, order=1, mode="nearest") for c in range(3)], axis=1
         )
         usable = ((rgb > DARK) & (rgb < BRIGHT)).all(axis=1)
-        found.append((of_point[rows][usable], np.full(usable.sum(), k), rgb[usable]))
-    if not found:
+        observed.append((of_point[rows][usable], np.full(usable.sum(), k), rgb[usable]))
+    if not observed:
         return TrackColours(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
-    return TrackColours(*(np.concatenate(parts) for parts in zip(*found)))
+    return TrackColours(*(np.concatenate(parts) for parts in zip(*observed)))
 
 
 def log_gains(colours: TrackColours, views: int) -> np.ndarray:
-    """[views, 3] log gain of each photo and channel against the mean photo; 0 where nothing is known.
+    """Return the log gain [views, 3] of each photo and channel against the mean photo; 0 where unknown.
 
-    Alternates medians: of a point over its photos, then of a photo over its points. Medians, because a
-    distractor before a point is no exposure.
+    Medians of a point over its photos and of a photo over its points alternate; medians ignore distractors in
+    front of points.
     """
     gains = np.zeros((views, 3))
     counts = np.bincount(colours.point) if len(colours.point) else np.zeros(0, int)
@@ -91,7 +91,7 @@ def _by_view(values: np.ndarray, view: np.ndarray, views: int) -> np.ndarray:
 
 
 def grouped_median(values: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Each row's group median, [L, C]: rows of one group get the same value."""
+    """Return for each row the median of its group, [L, C]."""
     out = np.empty_like(values)
     for c in range(values.shape[1]):
         order = np.lexsort((values[:, c], group))
@@ -104,5 +104,5 @@ def grouped_median(values: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 def photo_gains(scene: Scene, photos: Sequence[np.ndarray]) -> np.ndarray:
-    """[V, 3] factor of each train photo's sRGB codes against the mean photo; 1 where nothing is known."""
+    """Return factors [V, 3] of the train photos' sRGB codes against the mean photo; 1 where unknown."""
     return np.exp(log_gains(track_colours(scene, photos), len(photos)))

@@ -297,9 +297,10 @@ class Description:
     ply: str = ""  # splats, for counting and size
     cwd: str = ""  # relative to the file; empty = the file's folder
     prefix: str | tuple[str, ...] = ()  # before every command, e.g. conda run --no-capture-output -n theirs
-    environment: Facts = field(default_factory=dict)
-    options: Facts = field(default_factory=dict)  # placeholders of your own; --set NAME.KEY=VALUE
-    scene_files: Facts = field(default_factory=dict)  # text files that the program needs in {scene}
+    # `from_plain` reads these types at run time, where a recursive type cannot be evaluated
+    environment: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)  # placeholders of your own; --set NAME.KEY=VALUE
+    scene_files: dict[str, Any] = field(default_factory=dict)  # text files that the program needs in {scene}
     photos: Photos = "all"  # what {scene} holds: "all", "train" alone, or as "nerf-w"
     drawn_by: Literal["program", "us"] = "program"  # "us": our renderer draws the test views from `ply`
     timeout_h: float = 0.0  # limit of each command; 0 = none

@@ -144,7 +144,7 @@ class Matched:
             camera.params = [focals[camera.camera_id] * side, *camera.params[1:]]
 
     def find_motions(self, jobs: int) -> dict[Pair, tuple[int, int]]:
-        """Find the motions of all pairs; return motion number and way of each pair that agrees with others."""
+        """Find the motions of all pairs; return motion and way, by number, of pairs that agree."""
         focals_px = [self.focal_px(k) for k in range(len(self.ids))]
         self.motions = motions_of_pairs(self.rays(), focals_px, self.matches, jobs)
         return agreed_motions(self.motions, cycle_votes(self.motions))

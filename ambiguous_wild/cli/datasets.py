@@ -8,12 +8,15 @@ import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from ambiguous_wild.cli.options import PathName, threads_option
 from ambiguous_wild.core.errors import AwError, shortlist
+
+if TYPE_CHECKING:
+    from ambiguous_wild.datasets.write import ImportRecord
 
 KINDS = (
     "on-the-go", "robustnerf", "photo-tourism", "drone", "dualsplat", "nerfbaselines", "nerfstudio",
@@ -92,8 +95,8 @@ def import_command(
     click.echo(f"next: aw bench --method refinesplat --scene {shlex.quote(str(output))} -o runs")
 
 
-def summary(info: dict[str, Any], why: str) -> list[str]:
-    """What was recognised, counted and decided."""
+def summary(info: ImportRecord, why: str) -> list[str]:
+    """Return lines on what was recognised, counted and decided."""
     counts, imported = info["counts"], info["imported"]
     protocol = info.get("evaluation", {}).get("protocol", "full")
     measured = {"full": "whole test photos", "half": "right halves of test photos"}[protocol]

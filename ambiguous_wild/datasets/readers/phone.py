@@ -1,7 +1,7 @@
-"""Poses of ARKit as phone apps export them: Polycam's keyframes, Record3D's metadata.
+"""Read ARKit poses that phone apps export: Polycam's keyframes and Record3D's metadata.
 
 Both state camera to world with OpenGL's axes. Sources: PolyCam/polyform, and Record3D's author in
-marek-simonik/record3d, issues 27, 33 and 83. NeRFCapture writes a transforms.json.
+marek-simonik/record3d, issues 27, 33 and 83. NeRFCapture writes a transforms.json instead.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
 def read_polycam(root: Path) -> ForeignScene:
-    """keyframes/ of Polycam's raw data: its corrected cameras and images where they are there."""
+    """Read keyframes/ of Polycam's raw data: corrected cameras and images if present, else ARKit's."""
     base, notes = root / "keyframes", []
     cameras, photos = base / "corrected_cameras", base / "corrected_images"
     if not (any(cameras.glob("*.json")) and photos.is_dir()):
@@ -41,7 +41,7 @@ def read_polycam(root: Path) -> ForeignScene:
 
 
 def find_metadata(root: Path) -> Path | None:
-    """Record3D's file in an exported folder or an unpacked .r3d; None where there is none."""
+    """Find Record3D's metadata in an exported folder or an unpacked .r3d; None without it."""
     for path in (root / "metadata.json", root / "metadata"):
         with suppress(AwError):
             if {"poses", "K"} <= set(read_json(path)):
@@ -50,7 +50,7 @@ def find_metadata(root: Path) -> Path | None:
 
 
 def read_record3d(root: Path) -> ForeignScene:
-    """metadata.json or metadata, and the numbered photos of rgb/ or rgbd/."""
+    """Read metadata.json or metadata, and the numbered photos of rgb/ or rgbd/."""
     path = find_metadata(root)
     if path is None:
         raise AwError(f"{root} has no metadata.json of Record3D, with poses and K")

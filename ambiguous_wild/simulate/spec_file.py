@@ -114,9 +114,9 @@ def dump_spec(spec: CaptureSpec) -> str:
     return yaml.dump(plain_spec(spec), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
-def plain_spec(spec: CaptureSpec) -> dict[str, object]:
+def plain_spec(spec: CaptureSpec) -> dict[str, Any]:
     """Convert the spec to dicts, lists and scalars; effects that are None are left out."""
-    data = to_plain(spec)
+    data: dict[str, Any] = to_plain(spec)
     data["effects"] = {name: value for name, value in data["effects"].items() if value is not None}
     return data
 

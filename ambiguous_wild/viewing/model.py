@@ -180,7 +180,9 @@ class Renderer:
 
         if not len(gaussians["means"]):
             raise AwError("the model has no Gaussian: there is nothing to draw")
-        tensors = {name: torch.from_numpy(np.array(gaussians[name], np.float32)) for name in PARAMETERS}
+        tensors: dict[str, Any] = {
+            name: torch.from_numpy(np.array(gaussians[name], np.float32)) for name in PARAMETERS
+        }
         self._gaussians = Gaussians(**tensors)
         self._look = look
 

@@ -150,10 +150,10 @@ def motion_points(
         fx, fy, cx, cy = camera.pinhole()
         xy = (rays[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
         # Only features that got votes and that undistortion leaves inside the photo are kept.
-        voters_of = (votes.static + votes.moving) * (votes.fitting >= LEAST_FITTING * votes.partners)
-        some = np.flatnonzero((voters_of > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
+        vote_counts = (votes.static + votes.moving) * (votes.fitting >= LEAST_FITTING * votes.partners)
+        some = np.flatnonzero((vote_counts > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
         # Features at one position that differ in orientation become one point: the one with most votes.
-        some = some[np.argsort(-voters_of[some], kind="stable")]
+        some = some[np.argsort(-vote_counts[some], kind="stable")]
         some = np.sort(some[np.unique(matched.features[photo][some], axis=0, return_index=True)[1]])
         static, moving = (x.clip(max=255).astype(np.uint8) for x in (votes.static, votes.moving))
         motion = _together(votes, moving > static)

@@ -304,7 +304,7 @@ def _open(source: Path | int) -> cv2.VideoCapture:
     )
 
 
-def _opened(video: Path) -> cv2.VideoCapture:
+def _open_video(video: Path) -> cv2.VideoCapture:
     if video.stat().st_size == 0:
         raise AwError(f"{video} is empty (0 bytes); copy it again")
     # OpenCV takes "%d.png" for a pattern, which is refused, and "http:x" for an address: hence resolve().
@@ -320,7 +320,7 @@ def _opened(video: Path) -> cv2.VideoCapture:
 
 def _times(video: Path, bar: Bar) -> tuple[list[float], int | None]:
     """Return the time of each decodable frame, seconds from the first, and the header's number of frames."""
-    reader = _opened(video)
+    reader = _open_video(video)
     announced, fps = reader.get(cv2.CAP_PROP_FRAME_COUNT), reader.get(cv2.CAP_PROP_FPS)
     bar.start("counting frames", None)
     stamps = []
@@ -339,7 +339,7 @@ def _times(video: Path, bar: Bar) -> tuple[list[float], int | None]:
 
 
 def _read(video: Path, times: Sequence[float], bar: Bar) -> Iterator[tuple[int, float, np.ndarray]]:
-    reader = _opened(video)
+    reader = _open_video(video)
     yield from _frames(reader, times, bar)
     reader.release()
 

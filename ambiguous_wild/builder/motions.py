@@ -98,7 +98,7 @@ def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]
             break
         inside = mask.ravel() > 0
         _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
-        ways = [(rotation, translation.ravel()), *_twins(a[inside], b[inside], error)][:WAYS]
+        ways = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:WAYS]
         ways = [_refined(way, a[inside], b[inside]) for way in ways]
         models.append(Motion(left[inside], np.array([r for r, _ in ways]), np.array([t for _, t in ways])))
         left = left[~inside]
@@ -120,7 +120,7 @@ def _refined(
     return pose[:, :3], pose[:, 3]
 
 
-def _twins(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def _plane_poses(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the poses that explain matches on one plane; none where they lie on no plane."""
     try:
         plane, mask = cv2.findHomography(a, b, cv2.USAC_MAGSAC, error, maxIters=TRIALS, confidence=CONFIDENCE)
@@ -315,12 +315,12 @@ def agreed_motions(
     for start in sorted(ends, key=lambda k: -sum(weight.max() for _, _, weight in ends[k])):
         if start not in rotations:
             rotations[start] = np.eye(3)
-            _grow(start, ends, rotations)
+            _propagate_rotations(start, ends, rotations)
     for _ in range(SWEEPS):
         changed = 0
         for photo in ends:
             before = rotations[photo]
-            rotations[photo] = _turned(ends[photo], rotations, before)
+            rotations[photo] = _agreed_rotation(ends[photo], rotations, before)
             changed += not _alike(before[None], rotations[photo], CLOSED_DEG)[0]
         if not changed:
             break
@@ -339,7 +339,9 @@ def agreed_motions(
     return agreed
 
 
-def _grow(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]) -> None:
+def _propagate_rotations(
+    start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]
+) -> None:
     """Choose the rotations of the photos that pairs connect with `start`, those with most votes first."""
     gain: dict[int, float] = {}
     photo = start
@@ -351,10 +353,12 @@ def _grow(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.nd
             return
         photo = max(gain, key=lambda k: (gain[k], -k))
         del gain[photo]
-        rotations[photo] = _turned(ends[photo], rotations, np.eye(3))
+        rotations[photo] = _agreed_rotation(ends[photo], rotations, np.eye(3))
 
 
-def _turned(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
+def _agreed_rotation(
+    ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray
+) -> np.ndarray:
     """Return the rotation of a photo on which most partners agree; each partner counts with one motion."""
     turns, weights, owners = [], [], []
     for other, forth, weight in ends:

@@ -143,7 +143,7 @@ def motion_points(
     rays, points = matched.rays(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
         reach = NEIGHBOURS * max(matched.cameras[photo].width, matched.cameras[photo].height)
-        for thing in _things(matched.features[photo], through.get(photo, np.zeros(0)), reach):
+        for thing in _group_features(matched.features[photo], through.get(photo, np.zeros(0)), reach):
             votes.moving[thing] += through[photo][thing]
             votes.motions.append(thing)
         camera = pinholes[voters[photo]]
@@ -156,14 +156,14 @@ def motion_points(
         some = some[np.argsort(-vote_counts[some], kind="stable")]
         some = np.sort(some[np.unique(matched.features[photo][some], axis=0, return_index=True)[1]])
         static, moving = (x.clip(max=255).astype(np.uint8) for x in (votes.static, votes.moving))
-        motion = _together(votes, moving > static)
+        motion = _number_motions(votes, moving > static)
         points[voters[photo]] = MotionPoints(
             xy[some].astype(np.float32), static[some], moving[some], motion[some]
         )
     return points
 
 
-def _things(features: np.ndarray, through: np.ndarray, reach: float) -> list[np.ndarray]:
+def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> list[np.ndarray]:
     """Group the features that photos see through into things; a lone one is likely a point at a wrong depth.
 
     Args:
@@ -216,7 +216,7 @@ def write_motion(
     }
 
 
-def _together(votes: Votes, moves: np.ndarray) -> np.ndarray:
+def _number_motions(votes: Votes, moves: np.ndarray) -> np.ndarray:
     """Number the motions by size from 1: [N] int16, 0 for features that do not move, by `moves` [N] bool."""
     count = len(moves)
     chains = [features[moves[features]] for features in votes.motions]

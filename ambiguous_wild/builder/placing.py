@@ -70,7 +70,7 @@ class Placement:
         self.poses: dict[int, np.ndarray] = {}  # photo -> [3, 4] camera from world
         self.places: dict[int, Place] = {}  # of the placed photos
         self.left_out: dict[int, str] = {}  # photo -> reason
-        self._take_over(model)
+        self._use_model(model)
 
     def run(self) -> None:
         """Place all photos anew, one after another, until none moves."""
@@ -78,11 +78,11 @@ class Placement:
         turn, moved = 0, True
         while moved and turn <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
             before = set(self.poses)
-            self._settle(final=False)
-            moved = self._look(outs, only_out=turn == ROUNDS)
+            self._triangulate_and_adjust(final=False)
+            moved = self._place_all(outs, only_out=turn == ROUNDS)
             turn += not set(self.poses) > before
         if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
-            self._settle(final=True)
+            self._triangulate_and_adjust(final=True)
         for photo in range(len(outs)):
             if photo not in self.poses:
                 self.left_out.setdefault(photo, "too few of its points are left")
@@ -119,7 +119,7 @@ class Placement:
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
         return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
 
-    def _look(self, outs: list[int], only_out: bool) -> bool:
+    def _place_all(self, outs: list[int], only_out: bool) -> bool:
         """Place all photos, and tell whether one moved, was added or was taken out."""
         rays, points = self.matched.rays(), _Points.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
@@ -164,7 +164,7 @@ class Placement:
                 evidence = {k: rows for k, rows in evidence.items() if k not in best.evidence}
             elsewhere.append(self._place(photo, place.pose, evidence))
         elsewhere = [place for place in elsewhere if len(place.partners) >= AGREE]
-        dissent = self._dissent(photo, best.partners)
+        dissent = self._rival_by_motions(photo, best.partners)
         if len(dissent.partners) >= AGREE:
             elsewhere.append(dissent)
         return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
@@ -190,7 +190,7 @@ class Placement:
         partners = frozenset(a + b - photo for (a, b), _ in evidence)
         return Place(pose, partners, self._area(photo, list(evidence.values())), evidence)
 
-    def _dissent(self, photo: int, agree: frozenset[int]) -> Place:
+    def _rival_by_motions(self, photo: int, agree: frozenset[int]) -> Place:
         """Return the place that most other placed partners imply, by motions that turn the photo alike."""
         owners, turns, rows = [], [], []
         for pair in self.pairs[photo]:
@@ -244,7 +244,7 @@ class Placement:
             left = left[~np.asarray(answer["inlier_mask"])]
         return poses
 
-    def _settle(self, *, final: bool) -> None:
+    def _triangulate_and_adjust(self, *, final: bool) -> None:
         """Triangulate all matches that fit the poses, then adjust jointly; `final`: until nothing changes."""
         matched = self.matched
         matched.write_verified(self.database, matched.fitting(self.poses))
@@ -284,11 +284,11 @@ class Placement:
             self.matched.distorted = False
             for camera in self.matched.cameras:
                 camera.params = [*camera.params[:3], 0.0]
-            self._settle(final=final)
+            self._triangulate_and_adjust(final=final)
             return
-        self._take_over(model)
+        self._use_model(model)
 
-    def _take_over(self, model: Any) -> None:
+    def _use_model(self, model: Any) -> None:
         """Use the cameras and poses of a model."""
         self.model = model
         self.matched.take_cameras(model)

@@ -140,7 +140,7 @@ def import_scene(
                 f"{root} has no {side} photo: {counted(len(foreign.split), 'photo')} in the split; add "
                 "photos, or write train_list.txt and test_list.txt"
             )
-    foreign = _sized(foreign, settings)
+    foreign = _at_photo_size(foreign, settings)
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)
     target = check_output(target)
@@ -151,7 +151,7 @@ def import_scene(
         work = target.parent / f".{target.name}.import-{key[:16]}"
         bar = Bar(progress)
         try:
-            _fill(work, foreign, plans, settings, name, key, jobs or os.cpu_count() or 1, bar)
+            _write_scene(work, foreign, plans, settings, name, key, jobs or os.cpu_count() or 1, bar)
         except AwError:
             shutil.rmtree(work, ignore_errors=True)
             raise
@@ -170,7 +170,7 @@ def import_scene(
     return ImportResult(target, info, why, False)
 
 
-def _sized(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
+def _at_photo_size(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
     """Return the scene with cameras at the size of its photos, and with the factor that then remains."""
     alone = not foreign.photos.is_dir()  # there is images_N without images/, so N must stay
     foreign, times = at_photo_size(foreign)
@@ -217,7 +217,7 @@ def _existing(target: Path, key: str, overwrite: bool) -> ImportRecord | None:
     return None
 
 
-def _fill(
+def _write_scene(
     work: Path,
     foreign: ForeignScene,
     plans: list[PhotoPlan],

@@ -16,11 +16,11 @@ from ambiguous_wild.io.ply import place_comments
 from ambiguous_wild.io.splat_arrays import (
     SH_C0,
     Arrays,
-    along_curve,
     finite,
     from_largest,
     largest_first,
     logit,
+    morton_order,
     read_bytes,
     rounded,
     sigmoid,
@@ -49,7 +49,7 @@ def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: Place = 
         place: place of their scene, written as comments.
     """
     kept = finite(gaussians)
-    order = along_curve(kept["means"])
+    order = morton_order(kept["means"])
     kept = {name: value[order] for name, value in kept.items()}
     n, rest = kept["sh_rest"].shape[:2]
     colour = kept["sh0"] * SH_C0 + 0.5

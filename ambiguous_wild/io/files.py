@@ -196,7 +196,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)
         if into:
-            _pour(temporary, target)
+            _write_into(temporary, target)
             temporary.unlink()
         else:
             os.replace(temporary, target)
@@ -211,7 +211,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         raise
 
 
-def _pour(source: Path, target: Path) -> None:
+def _write_into(source: Path, target: Path) -> None:
     """Write the bytes of a file into a device or a pipe."""
     try:
         handle = os.open(target, os.O_WRONLY | os.O_NONBLOCK)  # a pipe without a reader would block for ever

@@ -19,11 +19,11 @@ from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
-    along_curve,
     finite,
     from_largest,
     largest_first,
     logit,
+    morton_order,
     place_facts,
     place_from,
     read_bytes,
@@ -50,7 +50,7 @@ def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) ->
         place: place of their scene, written to meta.json.
     """
     kept = finite(gaussians)
-    order = along_curve(kept["means"])
+    order = morton_order(kept["means"])
     kept = {name: value[order] for name, value in kept.items()}
     n, rest = kept["sh_rest"].shape[:2]
     if not n:

@@ -48,7 +48,7 @@ def rounded(
     return np.clip(np.floor(values.astype(np.float64) + 0.5), 0, most).astype(np.int64)
 
 
-def along_curve(means: np.ndarray) -> np.ndarray:
+def morton_order(means: np.ndarray) -> np.ndarray:
     """Order rows along a Morton curve of 10 bits an axis: neighbours in space become neighbours in the file.
 
     The scene comes first, then Gaussians more than 4, 16, 64 times as far out as the median: a format with

@@ -20,11 +20,11 @@ from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
-    along_curve,
     finite,
     from_largest,
     largest_first,
     logit,
+    morton_order,
     place_facts,
     place_from,
     read_bytes,
@@ -69,7 +69,7 @@ def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False, p
 def spz_bytes(gaussians: Arrays, *, antialias: bool = False) -> tuple[bytes, int]:
     """Return the file's bytes and how many Gaussians it holds; see `write_spz`."""
     kept = finite(gaussians)
-    order = along_curve(kept["means"])
+    order = morton_order(kept["means"])
     kept = {name: value[order] for name, value in kept.items()}
     n, rest = kept["sh_rest"].shape[:2]
     furthest = float(np.abs(kept["means"]).max(initial=1e-6))

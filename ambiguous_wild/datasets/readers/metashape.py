@@ -23,7 +23,7 @@ LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "
 
 def find_cameras(root: Path) -> Path | None:
     """Find the folder's XML of cameras; None without one."""
-    return posed.the_one(root, "*.xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
+    return posed.only_file(root, "*.xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
 
 
 def read_metashape(root: Path) -> ForeignScene:
@@ -34,7 +34,7 @@ def read_metashape(root: Path) -> ForeignScene:
     text = read_text(path)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may expand without limit
         raise AwError(f"{path} has a DOCTYPE or entities, which Metashape does not write; do not use it")
-    with posed.written_by("Metashape", path):
+    with posed.tool_errors("Metashape", path):
         chunks = [c for c in ElementTree.fromstring(text).iter("chunk") if c.find("cameras") is not None]
         if len(chunks) != 1:
             raise AwError(f"{path} holds {counted(len(chunks), 'chunk')} with cameras; export one")

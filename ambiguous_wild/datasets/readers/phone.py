@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.datasets.foreign import ForeignScene
-from ambiguous_wild.datasets.readers.posed import find_posed, posed_scene, written_by
+from ambiguous_wild.datasets.readers.posed import find_posed, posed_scene, tool_errors
 from ambiguous_wild.datasets.readers.transforms import frame_camera, read_json
 
 LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -33,7 +33,7 @@ def read_polycam(root: Path) -> ForeignScene:
     rows = []
     for path, name in zip(files, find_posed(photos, [f.stem for f in files], cameras)):
         data = read_json(path)
-        with written_by("Polycam", path):
+        with tool_errors("Polycam", path):
             pose = [[data[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
             lens = {k: data[v] for k, v in zip(LENS, ("fx", "fy", "cx", "cy", "width", "height"))}
         rows.append((name, pose, frame_camera(1, lens, {}, photos / name, path)))
@@ -55,7 +55,7 @@ def read_record3d(root: Path) -> ForeignScene:
     if path is None:
         raise AwError(f"{root} has no metadata.json of Record3D, with poses and K")
     data = read_json(path)
-    with written_by("Record3D", path):
+    with tool_errors("Record3D", path):
         poses = np.array(data["poses"], np.float64).reshape(-1, 7)  # quaternion (x, y, z, w), position
         turns = Rotation.from_quat(poses[:, :4]).as_matrix()
         k = np.array(data["K"], np.float64).reshape(9)[[0, 4, 6, 7]]  # column by column

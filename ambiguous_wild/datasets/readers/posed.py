@@ -29,7 +29,7 @@ Row = tuple[str, Any, ModelCamera]  # photo; [3 or 4, 4] camera to world with Op
 
 
 @contextmanager
-def written_by(tool: str, path: Path) -> Iterator[None]:
+def tool_errors(tool: str, path: Path) -> Iterator[None]:
     """Turn errors on a file that lacks what the tool writes into an AwError."""
     try:
         yield
@@ -38,7 +38,7 @@ def written_by(tool: str, path: Path) -> Iterator[None]:
         raise AwError(f"{path} is not as {tool} writes it ({reason}); export it again") from error
 
 
-def the_one(root: Path, pattern: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
+def only_file(root: Path, pattern: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
     """Return the folder's only file of this kind; None without one.
 
     Raises:
@@ -147,7 +147,7 @@ def posed_scene(
     """Make a scene of photos below a folder; `points`: a PLY in `root` has the coordinates of the poses."""
     model = model_of_poses(rows)
     split, missing, all_notes = sides(sorted(name for name, _, _ in rows), root)
-    cloud = the_one(root, "*.ply") if points else None
+    cloud = only_file(root, "*.ply") if points else None
     if cloud is None:
         return ForeignScene(
             kind,

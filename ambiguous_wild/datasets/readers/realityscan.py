@@ -27,7 +27,7 @@ ORIENTATION = 274  # tag of EXIF
 
 def find_table(root: Path) -> Path | None:
     """Find the folder's CSV with a pose and a focal length for each photo; None without one."""
-    return posed.the_one(root, "*.csv", lambda path: bool(_table(path)))
+    return posed.only_file(root, "*.csv", lambda path: bool(_table(path)))
 
 
 def _table(path: Path) -> list[list[str]]:
@@ -48,7 +48,7 @@ def read_realityscan(root: Path) -> ForeignScene:
     if path is None:
         raise AwError(f"{root} has no CSV of RealityScan's export 'Internal/External camera parameters'")
     columns, *lines = _table(path)
-    with posed.written_by("RealityScan", path):
+    with posed.tool_errors("RealityScan", path):
         stated = [dict(zip(columns, line, strict=True)) for line in lines]
         numbers = [{key: float(row[key]) for key in (*POSE, "f", *LENS) if key in row} for row in stated]
     photos = root / "images" if (root / "images").is_dir() else root

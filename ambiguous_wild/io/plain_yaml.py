@@ -33,7 +33,9 @@ class PlainLoader(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value:
             if not isinstance(key.value, str):
-                raise AwError(f"the key in line {key.start_mark.line + 1} is no text, which is not supported")
+                raise AwError(
+                    f"not YAML that is supported: the key in line {key.start_mark.line + 1} is no text"
+                )
             if key.tag == "tag:yaml.org,2002:merge":
                 raise AwError(f"line {key.start_mark.line + 1}: merged keys (<<) are not supported")
             if key.value in seen:

@@ -77,7 +77,7 @@ class Model:
 
     label: str  # unique among the models that are shown together
     ply: Path
-    look: RenderSettings = field(default_factory=RenderSettings)
+    render_settings: RenderSettings = field(default_factory=RenderSettings)
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
     masks: Path | None = None  # folder of keep maps of train views, white = keep
     reference: bool = False  # trained with exact masks or clean photos, so it does not compete
@@ -166,11 +166,11 @@ def _turned_harmonics(rest: np.ndarray, turn: np.ndarray) -> np.ndarray:
 class Renderer:
     """Renders one model on the CPU, with the kernels it was trained with."""
 
-    def __init__(self, gaussians: Arrays, look: RenderSettings) -> None:
+    def __init__(self, gaussians: Arrays, render_settings: RenderSettings) -> None:
         """
         Args:
             gaussians: raw parameters of at least one Gaussian.
-            look: how they are drawn.
+            render_settings: how they are drawn.
 
         Raises:
             AwError: there is no Gaussian.
@@ -185,7 +185,7 @@ class Renderer:
             name: torch.from_numpy(np.array(gaussians[name], np.float32)) for name in PARAMETERS
         }
         self._gaussians = Gaussians(**tensors)
-        self._look = look
+        self._render_settings = render_settings
 
     def __call__(self, camera: Camera) -> np.ndarray:  # [H, W, 3] uint8
         """Render the picture that a camera sees, as a run writes it to PNG."""
@@ -193,15 +193,15 @@ class Renderer:
 
         from ambiguous_wild.splat.render import render
 
-        look = self._look
+        settings = self._render_settings
         with torch.no_grad():
             drawn = render(
                 self._gaussians,
                 camera,
-                sh_degree=min(look.sh_degree, self._gaussians.sh_degree),
-                background=look.background,
-                antialias=look.antialias,
-                blur=look.blur,
+                sh_degree=min(settings.sh_degree, self._gaussians.sh_degree),
+                background=settings.background,
+                antialias=settings.antialias,
+                blur=settings.blur,
             )
         return to_uint8(drawn.image.numpy())
 
@@ -294,7 +294,7 @@ def export(
     place = model.place
     plain = model.ply.stat().st_size
     photos = [read_png_rgb(view.image_path) for view in views]
-    before = _renders(gaussians, model.look, views)
+    before = _renders(gaussians, model.render_settings, views)
     exported = []
     for wanted in dict.fromkeys(formats):
         if up is not None and space is not None:
@@ -307,11 +307,11 @@ def export(
         if wanted == "spz" or (wanted == "sog" and units < 1):
             units = 1.0
         left = replace(place, scale=place.scale / units)
-        count = _write(wanted, path, rescaled(gaussians, 1 / units), model.look, left)
+        count = _write(wanted, path, rescaled(gaussians, 1 / units), model.render_settings, left)
         if not count:
             raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
         there = moved(rescaled(read(path), units), place, model.place)
-        after = _renders(there, model.look, views)
+        after = _renders(there, model.render_settings, views)
         old, new = _mean(before, photos), _mean(after, photos)
         size = path.stat().st_size
         exported.append(
@@ -331,9 +331,9 @@ def export(
     return exported
 
 
-def _write(wanted: str, path: Path, gaussians: Arrays, look: RenderSettings, place: Place) -> int:
+def _write(wanted: str, path: Path, gaussians: Arrays, render_settings: RenderSettings, place: Place) -> int:
     if wanted == "spz":
-        return spz.write_spz(path, gaussians, antialias=look.antialias, place=place)
+        return spz.write_spz(path, gaussians, antialias=render_settings.antialias, place=place)
     if wanted == "ply":
         kept = finite(gaussians)
         if len(kept["means"]):
@@ -348,11 +348,11 @@ def _write(wanted: str, path: Path, gaussians: Arrays, look: RenderSettings, pla
 
 
 def _renders(
-    gaussians: Mapping[str, np.ndarray], look: RenderSettings, views: Sequence[View]
+    gaussians: Mapping[str, np.ndarray], render_settings: RenderSettings, views: Sequence[View]
 ) -> list[np.ndarray]:
     if not views:
         return []
-    renderer = Renderer(gaussians, look)
+    renderer = Renderer(gaussians, render_settings)
     return [renderer(view.camera) for view in views]
 
 

@@ -116,7 +116,7 @@ def page_text(
                 f"{model.label}: reduced from {given:,} to {shown:,} Gaussians for this page; "
                 "its PSNR is that of the whole model"
             )
-        packed, _ = spz_bytes(fewer, antialias=model.look.antialias)
+        packed, _ = spz_bytes(fewer, antialias=model.render_settings.antialias)
         page_notes += [cost] if (cost := _rounding_cost(model, fewer, packed, cameras[0])) else []
         element = f"model-{number}"
         elements.append(
@@ -127,7 +127,7 @@ def page_text(
         say(line)
     space = space_of(scene)
     if views[0].image_path == NO_PHOTO:
-        drawn = Renderer(models[0].read(), models[0].look)
+        drawn = Renderer(models[0].read(), models[0].render_settings)
         uris = [data_uri("jpeg", jpeg_bytes(narrowed(drawn(v.camera), WIDTHS[1]), _QUALITY)) for v in views]
     else:
         uris = photo_uris(views, MOST_PHOTO_BYTES)
@@ -152,7 +152,7 @@ def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: by
     held = np.exp(stored["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
     if not len(sizes) or (sizes.max() < 1.1 * held.max() and np.median(sizes) > 0.9 * np.median(held)):
         return ""
-    pictures = [Renderer(arrays, model.look)(camera) for arrays in (gaussians, stored)]
+    pictures = [Renderer(arrays, model.render_settings)(camera) for arrays in (gaussians, stored)]
     return (
         f"{model.label}: some of its Gaussians are larger or smaller than the page's format (SPZ) holds: the "
         f"first photo's view is {psnr(*pictures):.1f} dB to the model; 'aw export --format gltf' holds them"
@@ -167,9 +167,9 @@ def _model_facts(
         "label": model.label,
         "reference": model.reference,
         "element": element,
-        "antialias": model.look.antialias,
-        "blur": model.look.blur,
-        "background": list(model.look.background),
+        "antialias": model.render_settings.antialias,
+        "blur": model.render_settings.blur,
+        "background": list(model.render_settings.background),
         "psnr": psnr,
         "mean": sum(psnr.values()) / len(psnr) if psnr else None,
         "masks": {} if model.masks is None else mask_uris(model.masks, train, most_mask_bytes),

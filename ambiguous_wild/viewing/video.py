@@ -251,7 +251,7 @@ def draw_frames(
         raise AwError(
             f"a frame would be {size[1]}x{size[0]} px, at most {_MOST_SIDE}; give a smaller --width"
         )
-    renderers = [Renderer(model.read(), model.look) for model in models]
+    renderers = [Renderer(model.read(), model.render_settings) for model in models]
     for number, camera in enumerate(cameras):
         frame = np.zeros(
             (size[0] + size[0] % 2, size[1] + size[1] % 2, 3), np.uint8

@@ -126,19 +126,17 @@ class Matched:
         finally:
             db.close()
 
-    def find_focals(self, exif_focals: Mapping[str, float], jobs: int) -> None:
+    def find_focals(self, by_exif: Mapping[str, float], jobs: int) -> None:
         """Set the focal lengths of the cameras by votes of pairs.
 
         Args:
-            exif_focals: name -> focal length over the longer side, of photos whose EXIF has it.
+            by_exif: name -> focal length over the longer side, of photos whose EXIF has it.
             jobs: threads.
         """
         sides = [max(camera.width, camera.height) for camera in self.cameras]
         numbers = [camera.camera_id for camera in self.cameras]
         centred = [f - [c.width / 2, c.height / 2] for f, c in zip(self.features, self.cameras)]
-        stated = {
-            number: exif_focals[name] for number, name in zip(numbers, self.names) if name in exif_focals
-        }
+        stated = {number: by_exif[name] for number, name in zip(numbers, self.names) if name in by_exif}
         focals = focal_votes(centred, sides, numbers, stated, self.matches, jobs)
         for camera, side in zip(self.cameras, sides):
             camera.params = [focals[camera.camera_id] * side, *camera.params[1:]]

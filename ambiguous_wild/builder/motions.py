@@ -189,10 +189,7 @@ def focal_votes(
 def _fundamentals(
     features: Sequence[np.ndarray], sides_px: Sequence[int], matches: Mapping[Pair, np.ndarray], jobs: int
 ) -> tuple[list[Pair], np.ndarray, np.ndarray]:
-    """Return pairs, their fundamental matrices [N, 3, 3] in units of the longer sides, and weights [N].
-
-    A pair may have several.
-    """
+    """Return pairs, some twice, fundamental matrices [N, 3, 3] in units of the longer sides, weights [N]."""
 
     def one(pair: Pair) -> list[tuple[Pair, np.ndarray, int]]:
         (a, b), rows = pair, matches[pair]
@@ -262,10 +259,8 @@ def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
     after: dict[int, set[int]] = {}
     for a, b in pairs:
         after.setdefault(a, set()).add(b)
-    triplets = [
-        (at[a, b], at[b, c], at[a, c]) for a, b in pairs for c in sorted(after[a] & after.get(b, set()))
-    ]
-    return np.array(triplets, np.intp).reshape(-1, 3)
+    edges = [(at[a, b], at[b, c], at[a, c]) for a, b in pairs for c in sorted(after[a] & after.get(b, set()))]
+    return np.array(edges, np.intp).reshape(-1, 3)
 
 
 def _closed(rotations: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -315,12 +310,12 @@ def agreed_motions(
     for start in sorted(ends, key=lambda k: -sum(weight.max() for _, _, weight in ends[k])):
         if start not in rotations:
             rotations[start] = np.eye(3)
-            _propagate_rotations(start, ends, rotations)
+            _spread_rotations(start, ends, rotations)
     for _ in range(SWEEPS):
         changed = 0
         for photo in ends:
             before = rotations[photo]
-            rotations[photo] = _agreed_rotation(ends[photo], rotations, before)
+            rotations[photo] = _rotation(ends[photo], rotations, before)
             changed += not _alike(before[None], rotations[photo], CLOSED_DEG)[0]
         if not changed:
             break
@@ -339,9 +334,7 @@ def agreed_motions(
     return agreed
 
 
-def _propagate_rotations(
-    start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]
-) -> None:
+def _spread_rotations(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]) -> None:
     """Choose the rotations of the photos that pairs connect with `start`, those with most votes first."""
     gain: dict[int, float] = {}
     photo = start
@@ -353,12 +346,10 @@ def _propagate_rotations(
             return
         photo = max(gain, key=lambda k: (gain[k], -k))
         del gain[photo]
-        rotations[photo] = _agreed_rotation(ends[photo], rotations, np.eye(3))
+        rotations[photo] = _rotation(ends[photo], rotations, np.eye(3))
 
 
-def _agreed_rotation(
-    ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray
-) -> np.ndarray:
+def _rotation(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
     """Return the rotation of a photo on which most partners agree; each partner counts with one motion."""
     turns, weights, owners = [], [], []
     for other, forth, weight in ends:

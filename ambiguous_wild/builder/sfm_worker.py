@@ -76,11 +76,9 @@ def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[n
     keypoints = [k for k in finder.detect(gray, mask) if (k.octave + 1 & 255) < OCTAVES]
     if not keypoints:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
-    sizes_and_positions = np.array([(k.size, *k.pt) for k in keypoints], np.float32)
-    order = np.lexsort(
-        (sizes_and_positions[:, 1], sizes_and_positions[:, 2], -sizes_and_positions[:, 0])
-    )  # by size, then position: always the same
-    next_place = np.any(np.diff(sizes_and_positions[order], axis=0) != 0.0, axis=1)
+    places = np.array([(k.size, *k.pt) for k in keypoints], np.float32)
+    order = np.lexsort((places[:, 1], places[:, 2], -places[:, 0]))  # by size, then position
+    next_place = np.any(np.diff(places[order], axis=0) != 0.0, axis=1)
     kept = order[np.concatenate([[0], np.cumsum(next_place)]) < most]
     described, words = finder.compute(gray, [keypoints[i] for i in kept])
     points = np.array([(*k.pt, k.size / 2, np.radians(k.angle)) for k in described], np.float32)
@@ -200,17 +198,13 @@ def run_matches(job: MatchJob) -> None:
     if job["matcher"] == "exhaustive":
         pycolmap.match_exhaustive(job["database"], matching_options=options)
     else:
-        pair_list = database.with_name(PAIRS)
-        earlier_pairs = (
-            Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
-        )
-        likely_pairs = [f"{a} {b}" for a, b in _likely_pairs(job)]
+        path = database.with_name(PAIRS)
+        earlier = Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
+        likely = [f"{a} {b}" for a, b in _likely_pairs(job)]
         # COLMAP skips pairs that are matched already.
-        pair_list.write_text(
-            "".join(f"{line}\n" for line in dict.fromkeys(earlier_pairs + likely_pairs)), encoding="utf-8"
-        )
+        path.write_text("".join(f"{line}\n" for line in dict.fromkeys(earlier + likely)), encoding="utf-8")
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(pair_list)
+        pairing.match_list_path = str(path)
         pycolmap.match_image_pairs(job["database"], matching_options=options, pairing_options=pairing)
     if job["focals"] is None:  # poses are known: triangulation takes the matches that fit them
         return
@@ -300,9 +294,8 @@ def run_mapping(job: MappingJob) -> None:
     if placement is not None:
         left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
     if placement is None or len(placement.poses) < LEAST_PHOTOS:
-        write_json(
-            output / "mapping.json", {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
-        )
+        empty = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
+        write_json(output / "mapping.json", empty)
         return
     placement.matched.save_motions(output / MOTIONS)
     model = placement.model

@@ -21,9 +21,7 @@ from ambiguous_wild.cli.options import PathName
     "[default: the first available]",
 )
 @click.option(
-    "--keep-masks",
-    type=PathName(),
-    help="Folder of masks instead: <stem>.png, white = keep, black = distractor.",
+    "--keep-masks", type=PathName(), help="Folder of <stem>.png instead, white = keep, black = distractor."
 )
 @click.option(
     "--background",

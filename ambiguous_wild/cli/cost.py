@@ -100,9 +100,7 @@ def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> 
     speed = speed_here(cost_runs) if cost_runs.reference else 1.0
     advice = recommend(cost_runs.runs, opened.name, seconds, speed=speed, scene_hash=scene_identity(opened))
     if not cost_runs.reference:
-        click.echo(
-            "the runs have wall times only, so this machine is assumed to be as fast as theirs", err=True
-        )
+        click.echo("the runs have wall times only: this machine is assumed to be as fast as theirs", err=True)
     if as_json:
         facts = dataclasses.asdict(advice) | {"command": advice.command(str(scene))}
         click.echo(json.dumps(finite(facts), indent=2))

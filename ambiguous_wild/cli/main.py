@@ -221,10 +221,8 @@ def main() -> None:
         _fail(_click_message(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click wraps the exception that says what was kept.
-        message = (
-            str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
-        )
-        click.secho(message, fg="yellow", err=True)
+        text = str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
+        click.secho(text, fg="yellow", err=True)
         sys.exit(130)
     except BrokenPipeError:
         # The reader closed our output (`aw table | head`); this is not an error.

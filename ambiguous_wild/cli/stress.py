@@ -13,10 +13,7 @@ from ambiguous_wild.cli.options import PathName
 
 @click.command("stress")
 @click.option(
-    "--only",
-    multiple=True,
-    metavar="CASE",
-    help="Only this case: its number, name or part of it; repeatable.",
+    "--only", multiple=True, metavar="CASE", help="Only this case: number or part of its name; repeatable."
 )
 @click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
 @click.option(

@@ -131,11 +131,11 @@ def fetch(
     check_output(folder / "file")
     archive = folder / _file_name(data)
     with build_lock(archive):
-        first_download = _read_record(folder).get(data.name)
-        digest = data.sha256 or (first_download["sha256"] if first_download is not None else "")
+        prior = _read_record(folder).get(data.name)
+        digest = data.sha256 or (prior["sha256"] if prior is not None else "")
         moved, first = 0, False
         if not archive.is_file():
-            moved = _download(data, archive, first_download, tries, wait_s, tick, say)
+            moved = _download(data, archive, prior, tries, wait_s, tick, say)
         actual = sha256_file(archive)
         if digest and actual != digest:
             os.replace(archive, archive.with_suffix(archive.suffix + ".refused"))
@@ -146,7 +146,7 @@ def fetch(
                 "server serves another file, or it was changed here; it is kept as .refused, remove "
                 "it to try again"
             )
-        if first_download is None:
+        if prior is None:
             first = not data.sha256
             _record(folder, data, archive, actual)
         target = output / data.name if unpack else None
@@ -165,7 +165,7 @@ def _file_name(data: PublicData) -> str:
 def _download(
     data: PublicData,
     archive: Path,
-    first_download: Download | None,
+    prior: Download | None,
     tries: int,
     wait_s: float,
     tick: Callable[[int, int | None], None],
@@ -180,7 +180,7 @@ def _download(
             time.sleep(wait_s * 2 ** (attempt - 1))
         before = part.stat().st_size if part.is_file() else 0
         try:
-            _transfer(data, part, state, first_download, tick)
+            _transfer(data, part, state, prior, tick)
             moved += part.stat().st_size - before
             os.replace(part, archive)
             state.unlink(missing_ok=True)
@@ -198,11 +198,7 @@ def _download(
 
 
 def _transfer(
-    data: PublicData,
-    part: Path,
-    state: Path,
-    first_download: Download | None,
-    tick: Callable[[int, int | None], None],
+    data: PublicData, part: Path, state: Path, prior: Download | None, tick: Callable[[int, int | None], None]
 ) -> None:
     """Make one request, and append its bytes to `part`.
 
@@ -224,10 +220,10 @@ def _transfer(
             length = reply.headers.get("Content-Length")
             total = start + int(length) if length and length.isdigit() else None
             etag = reply.headers.get("ETag") or ""
-            if first_download is not None and total is not None and total != first_download["bytes"]:
+            if prior is not None and total is not None and total != prior["bytes"]:
                 raise AwError(
                     f"{data.name}: the server now announces {total} bytes, the first download had "
-                    f"{first_download['bytes']}: "
+                    f"{prior['bytes']}: "
                     f"it is another file; remove the entry in {RECORD} if you trust it"
                 )
             write_json(state, {"etag": "" if etag.startswith("W/") else etag})

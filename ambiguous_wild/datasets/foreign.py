@@ -148,9 +148,7 @@ def _index(names: Iterable[str], key: Callable[[str], str]) -> dict[str, list[st
 def every_nth(names: Iterable[str]) -> tuple[dict[str, Split], str]:
     """Split a dataset without a split, every 8th photo into the test set; also return a note about it."""
     sides: dict[str, Split] = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(sorted(names))}
-    note = (
-        f"no test set given: every {TEST_EVERY}th photo is a test photo, and distractors in it count as truth"
-    )
+    note = f"no test set given: every {TEST_EVERY}th is a test photo; distractors in it count as truth"
     return sides, note
 
 

@@ -108,10 +108,8 @@ def package_scenes(
         people = [f"{r[0]}/{r[1]}" for r in photo_rows if r[6]] if look_for_people else None
         facts = [_facts(name, scene_info) for _, name, scene_info in opened]
         lines = [ambiguity_line(f["name"], f["ambiguity"]) for f in facts]
-        metadata = croissant(info, names, packed, {"files.csv": FILES, "photos.csv": PHOTOS}, lines)
-        (folder / "croissant.json").write_text(
-            json.dumps(metadata, indent=2, ensure_ascii=False) + "\n", "utf-8"
-        )
+        data = croissant(info, names, packed, {"files.csv": FILES, "photos.csv": PHOTOS}, lines)
+        (folder / "croissant.json").write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", "utf-8")
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):
             every = [*packed, *(_described(folder / n, "") for n in ("croissant.json", "README.md"))]

@@ -25,9 +25,7 @@ from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoi
 
 RANDOM_POINTS = 100_000  # as in 3DGS for Blender scenes and in gsplat's random start
 BLENDER_SIDE = 1.3  # half the side of 3DGS's cube for Blender scenes
-CAMERA_SIDE = (
-    3.0  # half the side of gsplat's cube, relative to the largest distance of a camera from the mean
-)
+CAMERA_SIDE = 3.0  # half the side of gsplat's cube over the largest distance of a camera from their mean
 LEAST_POINTS = 100  # smallest number of triangulated points to start from
 
 
@@ -159,15 +157,13 @@ def find_motion(
     run_job(job, scratch, lambda: None)
     bar.finish()
     names = {name: name for name in train}
-    counts = write_motion(
-        scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names
-    )
-    if 2 * counts["silent"] > len(names):
+    stats = write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
+    if 2 * stats["silent"] > len(names):
         raise AwError(
-            f"in {counts['silent']} of {len(names)} train photos no matches fit the given poses, so it is "
+            f"in {stats['silent']} of {len(names)} train photos no matches fit the given poses, so it is "
             "unknown what moves; import without --motion, or place the photos anew with 'aw build-scene'"
         )
-    return counts
+    return stats
 
 
 def _match_posed(

@@ -204,9 +204,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno and error.filename in (None, name, temporary):
             raise _named(error, target) from error
-        if full := re.search(
-            r"Os \{ code: (\d+)", str(error)
-        ):  # safetensors raises its own class for OSError
+        if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' class for OSError
             raise OSError(int(full[1]), os.strerror(int(full[1])), str(target)) from error
         raise
 

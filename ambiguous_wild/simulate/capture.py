@@ -422,12 +422,12 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> CaptureTruth | None:
     try:
         facts = json.loads(record.read_text(encoding="utf-8"))
         same = facts["identity"] == identity
-        description = f"preset {facts['preset']!r}, seed {facts['seed']}"
+        kind = f"preset {facts['preset']!r}, seed {facts['seed']}"
         files = {str(n): h for n, h in facts["files"].items()}
         if any(PurePosixPath(n).is_absolute() or ".." in PurePosixPath(n).parts for n in files):
             raise ValueError("a file outside the capture")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        facts, same, description, files = {}, False, "an unreadable truth/capture.json", {}
+        facts, same, kind, files = {}, False, "an unreadable truth/capture.json", {}
     if same and all((out / n).is_file() and sha256_file(out / n) == h for n, h in files.items()):
         return cast(CaptureTruth, facts)
     if overwrite:
@@ -435,6 +435,4 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> CaptureTruth | None:
             refuse_foreign_files(out, {record.relative_to(out).as_posix(), *files})
         return None
     why = "with files changed since" if same else "of other settings or another version"
-    raise AwError(
-        f"{out} holds a capture ({description}) {why}; add --overwrite to replace it or choose another -o"
-    )
+    raise AwError(f"{out} holds a capture ({kind}) {why}; add --overwrite to replace it or choose another -o")

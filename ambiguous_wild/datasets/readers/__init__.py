@@ -37,9 +37,7 @@ READERS: dict[str, Callable[..., ForeignScene]] = {
     "record3d": phone.read_record3d,
     "colmap": colmap.read_plain,
 }
-FINDERS: dict[
-    str, Callable[[Path], Path | None]
-] = {  # find files with poses in folders without a COLMAP model
+FINDERS: dict[str, Callable[[Path], Path | None]] = {  # find poses in folders without a COLMAP model
     "realityscan": realityscan.find_table,
     "metashape": metashape.find_cameras,
     "polycam": lambda root: next(root.glob("keyframes/*cameras"), None),

@@ -146,19 +146,12 @@ def posed_scene(
 ) -> ForeignScene:
     """Make a scene of photos below a folder; `points`: a PLY in `root` has the coordinates of the poses."""
     model = model_of_poses(rows)
-    split, missing, all_notes = sides(sorted(name for name, _, _ in rows), root)
+    split, missing, more = sides(sorted(name for name, _, _ in rows), root)
     cloud = only_file(root, "*.ply") if points else None
     if cloud is None:
         return ForeignScene(
-            kind,
-            root,
-            model,
-            photos,
-            split,
-            missing=missing,
-            notes=(*notes, *all_notes),
-            points="triangulate",
+            kind, root, model, photos, split, missing=missing, notes=(*notes, *more), points="triangulate"
         )
     model = Model(model.cameras, model.images, points_without_tracks(*read_point_ply(cloud)))
-    all_notes.append(f"points from {cloud.name}, without the photos that see them")
-    return ForeignScene(kind, root, model, photos, split, missing=missing, notes=(*notes, *all_notes))
+    more.append(f"points from {cloud.name}, without the photos that see them")
+    return ForeignScene(kind, root, model, photos, split, missing=missing, notes=(*notes, *more))

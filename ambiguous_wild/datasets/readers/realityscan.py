@@ -71,14 +71,12 @@ def _camera(row: dict[str, float], photo: Path, path: Path) -> ModelCamera:
     with pillow().open(photo) as image:
         turned = image.getexif().get(ORIENTATION, 1) != 1
     if turned:
-        problem = f"{photo} is turned by its EXIF, and {path.name} does not say whether its pose is"
-        raise AwError(f"{problem}: export undistorted photos, or COLMAP")
+        fault = f"{photo} is turned by its EXIF, and {path.name} does not say whether its pose is"
+        raise AwError(f"{fault}: export undistorted photos, or COLMAP")
     px, py, k1, k2, k3, k4, t1, t2 = (row.get(key, 0.0) for key in LENS)
     if k1 and not any((k2, k3, k4, t1, t2)):
-        problem = (
-            f"{path}: {photo.name} has k1 alone, as of the lens 'division', which the file does not name"
-        )
-        raise AwError(f"{problem}: export with a Brown lens, or undistorted photos")
+        fault = f"{path}: {photo.name} has only k1, as of the lens 'division', which the file does not name"
+        raise AwError(f"{fault}: export with a Brown lens, or undistorted photos")
     longer = max(size)
     f, cx, cy = row["f"] * longer / 36, px * longer + size[0] / 2, py * longer + size[1] / 2
     return posed.brown_camera(size, (f, f, cx, cy), (k1, k2, k3, k4), (t2, t1), str(path))

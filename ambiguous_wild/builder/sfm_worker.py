@@ -294,7 +294,7 @@ def run_mapping(job: MappingJob) -> None:
     if placement is not None:
         left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
     if placement is None or len(placement.poses) < LEAST_PHOTOS:
-        empty = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
+        empty: dict[str, object] = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
         write_json(output / "mapping.json", empty)
         return
     placement.matched.save_motions(output / MOTIONS)

@@ -22,14 +22,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
-from ambiguous_wild.datasets.release_facts import (
-    PackedFile,
-    ReleaseInfo,
-    SceneFacts,
-    ambiguity_line,
-    card,
-    croissant,
-)
+from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
 from ambiguous_wild.io.files import atomic_dir, check_output, list_names, refuse_foreign_files
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
 
@@ -107,8 +100,7 @@ def package_scenes(
             packed.append(_described(folder / table, "text/csv"))
         people = [f"{r[0]}/{r[1]}" for r in photo_rows if r[6]] if look_for_people else None
         facts = [_facts(name, scene_info) for _, name, scene_info in opened]
-        lines = [ambiguity_line(f["name"], f["ambiguity"]) for f in facts]
-        data = croissant(info, names, packed, {"files.csv": FILES, "photos.csv": PHOTOS}, lines)
+        data = croissant(info, facts, packed, {"files.csv": FILES, "photos.csv": PHOTOS})
         (folder / "croissant.json").write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", "utf-8")
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):

@@ -132,22 +132,21 @@ class PackedFile:
 
 def croissant(
     info: ReleaseInfo,
-    scenes: Sequence[str],
+    scenes: Sequence[SceneFacts],
     files: Sequence[PackedFile],
     tables: dict[str, tuple[str, ...]],
-    ambiguity: Sequence[str],
 ) -> dict[str, object]:
     """Return the content of croissant.json.
 
     Args:
         info: facts that a person stated.
-        scenes: names.
+        scenes: facts of each scene.
         files: the archives and tables.
         tables: CSV file -> columns; each becomes a record set.
-        ambiguity: a sentence for each scene.
     """
     title = info.title or "Untitled scenes"
     lacking = f"{NOT_FOR_RELEASE}: {', '.join(info.lacking)} not stated. " if info.lacking else ""
+    ambiguity = " ".join(ambiguity_line(scene["name"], scene["ambiguity"]) for scene in scenes)
     data: dict[str, object] = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
@@ -164,8 +163,8 @@ def croissant(
         "rai:personalSensitiveInformation": f"Consent: {info.consent or 'not stated'}. {HOW_WEAK}",
         "rai:dataLimitations": info.limitations or "not stated",
         "rai:dataUseCases": "Training and measuring novel view synthesis with moving distractors.",
-        "rai:dataAnnotationAnalysis": " ".join(ambiguity) or "ambiguity was not measured",
-        "distribution": [_file_object(f) for f in files] + [_photos(scene) for scene in scenes],
+        "rai:dataAnnotationAnalysis": ambiguity or "ambiguity was not measured",
+        "distribution": [_file_object(f) for f in files] + [_photos(scene["name"]) for scene in scenes],
         "recordSet": [_record_set(name, columns) for name, columns in tables.items()],
     }
     if info.date:

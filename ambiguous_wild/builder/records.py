@@ -159,7 +159,7 @@ class LostPhoto(TypedDict):
 
 
 class ChosenMethods(TypedDict):
-    """What the settings "auto" were resolved to."""
+    """The choices that the settings "auto" led to."""
 
     camera: str
     sfm: str  # "fast", "wider" or "thorough"

@@ -55,7 +55,7 @@ from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.motion_points import FILE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-MIN_SHARE = 0.3  # of the readable photos; with fewer, most of the place is missing
+MIN_SHARE = 0.3  # share of the readable photos that must be placed, or most of the scene is missing
 MIN_POINTS = 10  # per placed photo; fewer determine neither poses nor surfaces
 _STRONG_PAIRS = 60  # pairs with the most inliers, used for the diagnosis
 _MAX_PAIR_ID = 2147483647  # COLMAP: pair id = id1 * this + id2
@@ -437,7 +437,7 @@ class Stages:
 
 
 def _file_hashes(folder: Path | None) -> list[list[str]] | None:
-    """[path, sha256] of every file below a folder; None without a folder."""
+    """Return [path, sha256] of every file below a folder; None without a folder."""
     if folder is None or not folder.is_dir():
         return None
     paths = sorted(p for p in folder.rglob("*") if p.is_file())

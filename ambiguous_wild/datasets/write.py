@@ -61,7 +61,7 @@ class ImportSettings:
 
 
 class Imported(TypedDict):
-    """What was read."""
+    """Layout and folder of the dataset, and notes on reading it."""
 
     layout: str
     folder: str

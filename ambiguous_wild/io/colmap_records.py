@@ -51,7 +51,7 @@ class ModelCamera:
     shear: float = 0.0  # px that x moves right per px below cy, after the lens; Metashape's b2, not COLMAP's
 
     def pinhole(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) in px.
+        """Return (fx, fy, cx, cy) in px.
 
         Raises:
             AwError: the camera has lens distortion; training needs undistorted photos.
@@ -81,7 +81,7 @@ class ModelImage:
     point_ids: np.ndarray  # [K] int64, -1 = no point
 
     def cam_from_world(self) -> np.ndarray:
-        """[4, 4] float64, rigid."""
+        """Return the rigid transform [4, 4] float64."""
         pose = np.eye(4)
         pose[:3, :3] = rotation_from_quaternion(self.qvec)
         pose[:3, 3] = self.tvec

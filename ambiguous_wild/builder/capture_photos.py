@@ -1,6 +1,6 @@
-"""`aw capture`: sharp frames of videos or a camera, or copies of the photos in folders.
+"""`aw capture`: save sharp frames of videos or of a camera, or copy the photos of folders.
 
-RAW/<stem>.jpg ...   frames, or byte-for-byte copies with their EXIF; of several sources, in folders
+RAW/<stem>.jpg ...   frames, or byte-for-byte copies with their EXIF; in a folder each for several sources
 RAW/capture.json     origin, time and sharpness of each photo; files left out, and why
 
 The folder appears complete or not at all.
@@ -45,9 +45,9 @@ _WARM_UP = 10  # frames until a camera's exposure and colour are stable
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """A frame that was chosen."""
+    """A chosen frame of a video or a camera."""
 
-    index: int  # of the frame in the video, or since the camera started
+    index: int  # number of the frame in the video, or since the camera started
     time_s: float
     sharpness: float
     pixels: np.ndarray  # [H, W, 3] uint8, BGR
@@ -58,14 +58,14 @@ def photos_from(
 ) -> CaptureRecord:
     """Copy the readable photos of folders, each once, and save sharp frames of videos.
 
-    A frame is the sharpest of one of `frames` stretches of a video that are equally long, by the frames' time
-    stamps; a video with fewer frames gives all it has. Photos of several sources go to a folder each. One
+    A video is divided by its time stamps into `frames` equally long stretches, and the sharpest frame of each
+    is saved; a video with fewer frames gives all it has. Photos of several sources go to a folder each. One
     frame is in memory at a time.
 
     Args:
-        sources: folders and videos; a folder stands for all in it but videos beside photos.
-        out: the folder to make.
-        frames: of each video.
+        sources: folders and videos; a folder stands for everything in it except videos beside photos.
+        out: the folder to create.
+        frames: number of frames of each video.
         jobs: threads.
         bar: progress.
 
@@ -83,10 +83,10 @@ def photos_from(
         bar.say(note)
     groups = dict.fromkeys(s.folder for s in capture.sources) if capture else {}
     several = len(groups) + len(videos) > 1
-    taken_names = {"images", "train", "test", *NO_PHOTOS}  # mean something to `collect`
+    taken_names = {"images", "train", "test", *NO_PHOTOS}  # `collect` gives these names a meaning
 
     def place(name: str) -> str:
-        """A folder of that name that no other source has, the photos' own folder for a single source."""
+        """Return an unused name of a folder for a source; "" for a single source."""
         number, free = 2, clean_stem(name)
         while free.casefold() in taken_names:
             free, number = f"{clean_stem(name)}_{number}", number + 1
@@ -125,7 +125,7 @@ def photos_from(
 def _copy(
     capture: Capture, places: dict[str, str], folder: Path, bar: Bar
 ) -> tuple[list[CapturedPhoto], list[LeftOut]]:
-    """Copy each photo byte for byte, once, to the place of its folder."""
+    """Copy each photo byte for byte, once, to the target of its folder."""
     sources, copies = without_copies(capture)
     left: list[LeftOut] = [{"source": c, "why": f"the same file as {kept}"} for c, kept in copies.items()]
     photos: list[CapturedPhoto] = []
@@ -138,11 +138,11 @@ def _copy(
             left.append({"source": source.relative, "why": error.reason})
             continue
         side = source.side or ("train" if capture.has_sides else "")
-        # its folder tells it apart from now on
+        # The stem need not start with the folder's name, as the copy lies in a folder of that name.
         name = source.work_name.removeprefix(f"{source.folder}_" if source.folder else "")
         target = folder / side / places[source.folder] / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.exists():  # `train_a.jpg` of train/ and the like
+        if target.exists():  # `train_a.jpg` beside train/a.jpg, for example
             target = target.with_name(source.work_name)
         shutil.copyfile(source.path, target)
         relative = target.relative_to(folder).as_posix()
@@ -179,11 +179,11 @@ def _frames_of(video: Path, folder: Path, frames: int, bar: Bar) -> tuple[list[C
 
 
 def stretches(times: Sequence[float], frames: int) -> list[float]:
-    """Limits in seconds of `frames` equally long stretches of a video; of fewer frames, one a stretch.
+    """Return the limits in seconds of equally long stretches of a video; few frames get a stretch each.
 
     Args:
-        times: of its frames, seconds, ascending.
-        frames: wanted.
+        times: time stamps of its frames, seconds, ascending.
+        frames: number of stretches.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     first, end = times[0] - step / 2, times[-1] + step / 2
@@ -193,9 +193,9 @@ def stretches(times: Sequence[float], frames: int) -> list[float]:
 
 
 def hdr_curve(video: Path) -> str | None:
-    """ "PQ" or "HLG" where the container (MP4, MOV, Matroska) states it; the picture data are not searched.
+    """Return "PQ" or "HLG" where the container (MP4, MOV, Matroska) states it, without reading picture data.
 
-    OpenCV reduces such frames to 8 bits without their transfer curve: flat and pale.
+    OpenCV reduces such frames to 8 bits without their transfer curve, which makes them flat and pale.
     """
     with open(video, "rb") as f:
         head = f.read(1 << 20)
@@ -210,9 +210,9 @@ def hdr_curve(video: Path) -> str | None:
                 size, header = int.from_bytes(f.read(8), "big"), 16
             if box[4:] == b"moov":
                 inner = f.read(min(size - header, 1 << 26)) if size else f.read(1 << 26)
-                found = inner.find(b"colrncl")  # nclx, in MOV nclc: primaries, transfer, matrix
-                curve = int.from_bytes(inner[found + 10 : found + 12], "big")
-                return _HDR.get(curve) if found >= 0 else None
+                box_start = inner.find(b"colrncl")  # nclx, in MOV nclc: primaries, transfer, matrix
+                curve = int.from_bytes(inner[box_start + 10 : box_start + 12], "big")
+                return _HDR.get(curve) if box_start >= 0 else None
             if size < header:
                 return None
             f.seek(size - header, os.SEEK_CUR)
@@ -222,7 +222,7 @@ def hdr_curve(video: Path) -> str | None:
 def photos_from_camera(
     number: int, out: Path, *, frames: int, every_s: float, bar: Bar | None = None
 ) -> CaptureRecord:
-    """Save `frames` photos of a camera, the sharpest frame of every `every_s` seconds.
+    """Save `frames` photos of a camera: the sharpest frame of every `every_s` seconds.
 
     Raises:
         AwError: there is no such camera, it stops, or `out` exists.
@@ -259,9 +259,9 @@ def sharpest(
     frames: Iterator[tuple[int, float, np.ndarray]],  # index, seconds, BGR
     parts: Sequence[float],  # seconds: where each part begins, and the end
 ) -> Iterator[VideoFrame]:
-    """The sharpest frame in the middle half of each part; of equally sharp frames the first.
+    """Yield the sharpest frame in the middle half of each part, the first of equally sharp ones.
 
-    So neighbours are never closer than half a part. A part without a frame is passed over.
+    The middle half keeps neighbours at least half a part apart. A part without a frame is skipped.
     """
     best: VideoFrame | None = None
     k = 0
@@ -296,7 +296,7 @@ def check_free(out: Path) -> None:
 
 
 def _open(source: Path | int) -> cv2.VideoCapture:
-    # Errors are ours, in one line: OpenCV and FFmpeg would print several.
+    # We report an error in one line, so the several lines of OpenCV and FFmpeg are silenced.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     return (
@@ -304,10 +304,10 @@ def _open(source: Path | int) -> cv2.VideoCapture:
     )
 
 
-def _opened(video: Path) -> cv2.VideoCapture:
+def _open_video(video: Path) -> cv2.VideoCapture:
     if video.stat().st_size == 0:
         raise AwError(f"{video} is empty (0 bytes); copy it again")
-    # OpenCV opens "http:x" as an address and "%d.png" as a pattern: refused, or made absolute.
+    # OpenCV takes "%d.png" for a pattern, which is refused, and "http:x" for an address: hence resolve().
     if "%" in video.name:
         raise AwError(
             f"{str(video)!a} has a '%' in its name, which video readers take for a pattern; rename it"
@@ -319,8 +319,8 @@ def _opened(video: Path) -> cv2.VideoCapture:
 
 
 def _times(video: Path, bar: Bar) -> tuple[list[float], int | None]:
-    """When each frame that can be decoded is shown, seconds from the first; the header's number of them."""
-    reader = _opened(video)
+    """Return the time of each decodable frame, seconds from the first, and the header's number of frames."""
+    reader = _open_video(video)
     announced, fps = reader.get(cv2.CAP_PROP_FRAME_COUNT), reader.get(cv2.CAP_PROP_FPS)
     bar.start("counting frames", None)
     stamps = []
@@ -339,7 +339,7 @@ def _times(video: Path, bar: Bar) -> tuple[list[float], int | None]:
 
 
 def _read(video: Path, times: Sequence[float], bar: Bar) -> Iterator[tuple[int, float, np.ndarray]]:
-    reader = _opened(video)
+    reader = _open_video(video)
     yield from _frames(reader, times, bar)
     reader.release()
 

@@ -1,9 +1,8 @@
-"""`aw screen`: which camera settings drifted, which photos to leave out, what to do about it.
+"""`aw screen`: check a capture for drifting camera settings and photos to leave out, and advise.
 
-Reads a capture and writes nothing; one photo a thread is in memory.
-
-A check uses EXIF where the camera wrote it, else the pixels of surfaces that several photos show; where
-neither decides, its state is "unknown". Limits were set on captures that reconstruct well: docs/capture.md.
+It reads a capture and writes nothing; one photo a thread is in memory. A check uses EXIF where the camera
+wrote it, else the pixels of surfaces that several photos show; where neither decides, its state is "unknown".
+The limits were set on captures that reconstruct well: docs/capture.md.
 """
 
 from __future__ import annotations
@@ -54,9 +53,9 @@ class Check:
     name: str
     state: State
     basis: str  # EXIF, pixels, or what is missing
-    finding: str  # with its figure
+    finding: str  # what was measured, with its figure
     advice: str = ""  # empty where nothing is to be done
-    photos: tuple[str, ...] = ()  # those that fail
+    photos: tuple[str, ...] = ()  # photos that fail
 
 
 def run_checks(
@@ -64,7 +63,7 @@ def run_checks(
     thumbnails: np.ndarray,  # [N, 1024], see `screen.thumbnail`
     compared: PhotoComparison,
 ) -> list[Check]:
-    """All checks, in the order of the table."""
+    """Run all checks, in the order of the table."""
     return [
         exposure(facts, compared),
         white_balance(facts, compared),
@@ -79,7 +78,7 @@ def run_checks(
 
 
 def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
-    """Exposure settings in stops, and the brightness of the same surfaces."""
+    """Compare exposure settings in stops, and the brightness of the same surfaces."""
     advice = "lock exposure (hold the finger on the screen: AE/AF lock), or train with an appearance model"
     stops = [exposure_stops(f["exif"]) for f in facts]
     spread = _spread(compared, 0)
@@ -89,7 +88,7 @@ def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
             return Check("exposure", "ok", "EXIF", f"locked: settings span {span:.1f} stops")
         if spread is None:
             return Check("exposure", "warning", "EXIF", f"drifts: settings span {span:.1f} stops", advice)
-        # Settings may follow the light, as under clouds; harmful is a surface that changes its brightness.
+        # Settings may follow the light, as under clouds; only a surface that changes brightness is harmful.
         finding = f"automatic: settings span {span:.1f} stops, the same surfaces differ by {spread:.1f}"
         return _row("exposure", "EXIF and pixels", spread > PIXEL_STOPS, finding, advice)
     if spread is None:
@@ -101,45 +100,45 @@ def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
 
 
 def white_balance(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
-    """Locked where EXIF says manual in every photo; else measured on the same surfaces."""
+    """Check that white balance is locked: by EXIF if manual in every photo, else on the same surfaces."""
     advice = "lock white balance (manual, or a fixed preset), or train with an appearance model"
     modes = [f["exif"].get("white_balance") for f in facts]
     if all(m == 1 for m in modes):
         return Check("white balance", "ok", "EXIF", "manual in every photo")
-    said = "EXIF: automatic" if any(m == 0 for m in modes) else "EXIF silent"
+    source = "EXIF: automatic" if any(m == 0 for m in modes) else "EXIF silent"
     red, blue = _spread(compared, 1), _spread(compared, 2)
     if red is None or blue is None:
         return Check(
-            "white balance", "unknown", said, "no two photos share enough surface to measure it", advice
+            "white balance", "unknown", source, "no two photos share enough surface to measure it", advice
         )
     worst = 100 * (2 ** max(red, blue) - 1)
     finding = f"red or blue of the same surfaces differs by {worst:.0f} %"
-    return _row("white balance", f"pixels ({said})", max(red, blue) > PIXEL_BALANCE, finding, advice)
+    return _row("white balance", f"pixels ({source})", max(red, blue) > PIXEL_BALANCE, finding, advice)
 
 
 def iso(facts: Sequence[CheckedPhoto]) -> Check:
-    """ISO from EXIF; without EXIF the noise of flat areas."""
+    """Compare ISO by EXIF; without EXIF report the noise of flat areas."""
     advice = "fix ISO (pro mode), as low as the light allows"
     values = [f["exif"].get("iso") for f in facts]
-    known = [v for v in values if v is not None]
-    if len(known) == len(values):
+    recorded = [v for v in values if v is not None]
+    if len(recorded) == len(values):
         finding = (
-            f"{min(known):.0f} to {max(known):.0f}"
-            if max(known) > min(known)
-            else f"{known[0]:.0f} throughout"
+            f"{min(recorded):.0f} to {max(recorded):.0f}"
+            if max(recorded) > min(recorded)
+            else f"{recorded[0]:.0f} throughout"
         )
-        return _row("ISO", "EXIF", max(known) > ISO_RATIO * min(known), finding, advice)
+        return _row("ISO", "EXIF", max(recorded) > ISO_RATIO * min(recorded), finding, advice)
     noise = np.array([f["noise"] for f in facts])
     if not np.isfinite(noise).any() or np.nanmedian(noise) <= 0:
         return Check("ISO", "unknown", _silent(facts, values), "no flat areas in which to measure noise")
     low, high = np.nanpercentile(noise, [5, 95])
     finding = f"not recorded; noise of flat areas {low:.1f} to {high:.1f} of 255"
-    # Texture and compression look like noise: not certain enough for a warning.
+    # Texture and compression look like noise, so this is not certain enough for a warning.
     return Check("ISO", "unknown", "pixels (EXIF silent)", finding, "")
 
 
 def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
-    """Fine detail of the same surfaces across photos; EXIF does not record the focus."""
+    """Compare fine detail of the same surfaces across photos; EXIF does not record the focus."""
     spread = _spread(compared, 3)
     if spread is None:
         return Check("focus", "unknown", "pixels", "no two photos share enough surface to measure it")
@@ -150,7 +149,7 @@ def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
 
 
 def focal_length(facts: Sequence[CheckedPhoto]) -> Check:
-    """One focal length per camera and one picture size, as a single-camera model assumes."""
+    """Check for one focal length per camera and one picture size, as a single-camera model assumes."""
     if wide := panorama_warnings(facts):
         return Check("focal length", "warning", "picture size", wide[0])
     advice = "do not zoom; or build with --camera per-image"
@@ -177,7 +176,7 @@ def focal_length(facts: Sequence[CheckedPhoto]) -> Check:
 
 
 def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
-    """Photos much softer than the median, or softer than others on the same surfaces."""
+    """Find photos much softer than the median, or softer than others on the same surfaces."""
     sharp = np.array([f["blur"] for f in facts])
     soft = sharp < BLUR_RATIO * np.median(sharp)
     soft |= np.nan_to_num(compared.offsets[:, 3], nan=0.0) < SOFT
@@ -194,7 +193,7 @@ def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
 
 
 def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Check:
-    """Pairs of photos that are nearly the same picture."""
+    """Find pairs of photos that are nearly the same picture."""
     close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
     pairs = [(facts[i]["source"], facts[j]["source"]) for i, j in np.argwhere(close)]
     names = tuple(b for _, b in pairs)
@@ -211,7 +210,7 @@ def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Ch
 
 
 def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
-    """Photos that do not overlap with the rest, and photos that overlap with few others."""
+    """Find photos that do not overlap with the rest, and photos that overlap with few others."""
     count = len(facts)
     apart = [f["source"] for f, g in zip(facts, compared.group) if g != 0]
     advice = "take more photos between these, each sharing two thirds of the picture with the next"
@@ -231,7 +230,7 @@ def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
 
 
 def motion(compared: PhotoComparison) -> Check:
-    """Motion along the viewing direction: such photos overlap but give no depth."""
+    """Find motion along the viewing direction: such photos overlap but give no depth."""
     if math.isnan(compared.forward):
         return Check("motion", "unknown", "pixels", "no two photos overlap enough to measure it")
     finding = f"{100 * compared.forward:.0f} % of overlapping pairs differ by motion along the line of sight"
@@ -244,7 +243,7 @@ def _row(name: str, basis: str, bad: bool, finding: str, advice: str, photos: tu
 
 
 def _spread(compared: PhotoComparison, quantity: int) -> float | None:
-    """Log2 between the 5th and the 95th percentile photo; None for fewer than three compared photos."""
+    """Return log2 between 5th and 95th percentile photo; None for fewer than three compared photos."""
     values = compared.offsets[:, quantity]
     values = values[np.isfinite(values)]
     if len(values) < 3:
@@ -267,7 +266,7 @@ class CaptureReport:
     """Result of the checks."""
 
     root: Path
-    photos: int  # that can be read
+    photos: int  # readable photos
     skipped: list[SkippedPhoto]  # unreadable files and copies
     checks: list[Check]
 
@@ -310,7 +309,7 @@ def check_capture(
 
 
 def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:
-    """The failed check of a capture with photos that are left out."""
+    """Return the failed check of a capture with photos that are left out."""
     first = f"{skipped[0]['source']} ({skipped[0]['skipped']})"
     finding = f"{len(skipped)} of {total} photos are left out: {first}"
     finding += f" and {len(skipped) - 1} more" if len(skipped) > 1 else ""
@@ -331,7 +330,7 @@ def noise(
     rgb: np.ndarray,  # [H, W, 3] uint8
     block: int = 16,
 ) -> float:
-    """Noise in the flattest tenth of the blocks, of 255; NaN where the photo is too small or clipped.
+    """Estimate noise in the flattest tenth of the blocks, of 255; NaN if the photo is too small or clipped.
 
     Source: Immerkaer, CVIU 1996. His mask gives 0 on planes; clipped blocks are left out.
     """

@@ -1,6 +1,6 @@
 """First stage: list the photos of a capture and name them; find the truth of a simulated capture.
 
-And the split of those that are placed into training and test photos, as lists of names.
+Once photos are placed, they are split here into training and test photos.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
 Side = Literal["train", "test"] | None
-NO_PHOTOS = ("masks", "truth")  # folders beside those of photos
+NO_PHOTOS = ("masks", "truth")  # folders whose images are no photos
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp")
 _MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the usual 255
 
@@ -39,7 +39,7 @@ class Source:
     stem: str  # unique in the scene; its files are <stem>.png
     side: Side  # from the sub-folder, if the capture has them
     sha256: str
-    folder: str = ""  # of several, a name that no other has; its stem starts with it
+    folder: str = ""  # unique name of its folder if there are several; the stem starts with it
 
     @property
     def work_name(self) -> str:
@@ -51,7 +51,7 @@ class Source:
 class Capture:
     """The user's folders of photos; they are not changed."""
 
-    root: Path  # of several folders the one that holds them
+    root: Path  # the folder, or the parent of several folders
     sources: tuple[Source, ...]  # natural order of their relative names
     has_sides: bool  # the photos are in train/ and test/
     truth: Path | None  # truth/ of a simulated capture
@@ -69,8 +69,8 @@ def collect(
     Args:
         raw: one folder, or several that become one capture.
         jobs: threads.
-        masks: the user's folder of masks, which is not one of photos.
-        least: photos that are enough.
+        masks: the user's folder of masks, which is skipped.
+        least: smallest number of photos.
 
     Raises:
         AwError: no folder, no photo, too few photos, or only one of train/ and test/.
@@ -91,7 +91,7 @@ def collect(
                 labels.append(label)
             else:
                 ignored.append(path.name)
-    # Python keeps other bytes as surrogates, which no list and no other program can hold.
+    # Python keeps other bytes as surrogates, which text files and other programs cannot hold.
     if odd := [ascii(p.name) for p, _ in files if str(p) != str(p).encode(errors="ignore").decode()]:
         raise AwError(f"names of photos in {root} are not UTF-8: {shortlist(odd)}; rename them")
     if len(files) < least:
@@ -134,7 +134,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def identical(capture: Capture) -> list[list[str]]:
-    """Groups of photos with the same bytes."""
+    """Return the groups of photos with the same bytes."""
     groups: dict[str, list[str]] = {}
     for source in capture.sources:
         groups.setdefault(source.sha256, []).append(source.relative)
@@ -148,12 +148,12 @@ def _photo_folders(root: Path, masks: Path | None) -> list[tuple[Path, Side]]:
         other = sides[there[0] == "train"]
         raise AwError(f"{root} has {there[0]}/ but no {other}/: add it, or give one flat folder of photos")
     bases: list[tuple[Path, Side]] = [(root / side, side) for side in sides if side and there]
-    found = [(f, side) for base, side in bases or [(root, None)] for f in _folders_in(base, masks)]
-    return found or [(root, None)]
+    folders = [(f, side) for base, side in bases or [(root, None)] for f in _folders_in(base, masks)]
+    return folders or [(root, None)]
 
 
 def _folders_in(base: Path, masks: Path | None) -> Iterator[Path]:
-    """The folder, if it holds photos; else those in images/; else those of all folders below."""
+    """Yield the folder if it holds photos, else those in images/, else those of all folders below."""
     if _has_photos(base):
         yield base
         return
@@ -165,7 +165,7 @@ def _folders_in(base: Path, masks: Path | None) -> Iterator[Path]:
 
 
 def videos_in(base: Path) -> Iterator[Path]:
-    """Videos of a folder and those in it, but none beside photos: of live photos, or their source."""
+    """Yield the videos below a folder, except beside photos, where they are live photos or their source."""
     inner = sorted(base.iterdir(), key=lambda p: natural_key(p.name))
     beside = _has_photos(base) or _has_photos(base / "images")
     for path in () if beside else inner:
@@ -177,7 +177,7 @@ def videos_in(base: Path) -> Iterator[Path]:
 
 
 def _labels(root: Path, folders: Sequence[tuple[Path, Side]]) -> list[str]:
-    """Of several folders the end of the path that tells them apart, joined by "_"; of one, nothing."""
+    """Label several folders by the end of the path that tells them apart, joined by "_"; a single one "" ."""
     paths = [
         [p for p in folder.relative_to(root).parts if p not in ("images", side)] for folder, side in folders
     ]
@@ -211,17 +211,19 @@ def _has_photos(folder: Path) -> bool:
 
 
 def _too_few(root: Path, count: int, ignored: list[str]) -> str:
-    known = ", ".join(s.lstrip(".") for s in PHOTO_SUFFIXES)
-    found = f"; it holds {shortlist(ignored)}" if ignored else ""
+    suffixes = ", ".join(s.lstrip(".") for s in PHOTO_SUFFIXES)
+    others = f"; it holds {shortlist(ignored)}" if ignored else ""
     if count == 0:
-        return f"{root} holds no photos ({known}){found}"
+        return f"{root} holds no photos ({suffixes}){others}"
     what = "one photo" if count == 1 else f"{count} photos"
     return f"{root} holds {what}; at least {MIN_PHOTOS} that overlap are needed, 20 or more are better"
 
 
 def _unique_stems(files: list[tuple[Path, Side]], labels: Sequence[str]) -> list[str]:
-    """Names in the scene, without spaces: of several folders with the folder's first; equal names get the
-    side, then the format, then a number."""
+    """Return names in the scene, without spaces; with several folders the folder's name comes first.
+
+    Equal names get the side in front, then the format, then a number.
+    """
     stems = [
         clean_stem("_".join(filter(None, (k, path.stem)))) for (path, _), k in zip(files, labels, strict=True)
     ]
@@ -244,7 +246,7 @@ def _unique_stems(files: list[tuple[Path, Side]], labels: Sequence[str]) -> list
 
 
 def clean_stem(stem: str) -> str:
-    """The name without white space (COLMAP's text models split on it) and control characters, shortened."""
+    """Replace white space (COLMAP's text models split on it) and control characters, and shorten the name."""
     text = unicodedata.normalize("NFC", stem)
     text = "".join("_" if c.isspace() or not c.isprintable() or c in '\\:*?"<>|' else c for c in text)
     data = text.encode("utf-8", errors="surrogateescape")
@@ -257,7 +259,7 @@ def clean_stem(stem: str) -> str:
 def split_photos(
     facts: list[ScreenedPhoto], registered: set[str], test_stems: set[str] | None
 ) -> tuple[list[str], list[str], str, list[str]]:
-    """Names of the training and the test photos.
+    """Split the placed photos into training and test photos.
 
     Args:
         facts: screened photos.
@@ -283,7 +285,7 @@ def split_photos(
         how, test = f"every-{TEST_EVERY}", inside[::TEST_EVERY]
         wanted = len(test)
         warnings.append(
-            f"no test set given, so every {TEST_EVERY}th photo tests: distractors in these photos count "
+            f"no test set given, so every {TEST_EVERY}th photo is a test photo: distractors in it count "
             "as truth in the scores; give clean photos in test/, or --test-list FILE"
         )
     train = sorted(set(inside) - set(test))
@@ -300,7 +302,9 @@ def split_photos(
 
 
 def read_test_list(path: Path, facts: list[ScreenedPhoto]) -> set[str]:
-    """Stems of the photos in a test list, which names them by path, by file name or without extension.
+    """Return the stems of the photos in a test list.
+
+    The list names photos by path, by file name or without extension.
 
     Raises:
         AwError: the file cannot be read or is empty, names an unknown photo, or names all photos.
@@ -309,39 +313,39 @@ def read_test_list(path: Path, facts: list[ScreenedPhoto]) -> set[str]:
         names = read_list(path)
     except (OSError, UnicodeDecodeError) as error:
         raise AwError(f"cannot read the test list {path}: {error}") from error
-    known: dict[str, str] = {}
-    meant: dict[str, set[str]] = {}
+    stem_of: dict[str, str] = {}
+    stems_by_ending: dict[str, set[str]] = {}
     for fact in facts:
         source = PurePosixPath(fact["source"])
         for key in (str(source), fact["stem"], fact["stem"] + ".png", *fact.get("copies", ())):
-            known.setdefault(key, fact["stem"])
+            stem_of.setdefault(key, fact["stem"])
         for i in range(len(source.parts)):
             end = PurePosixPath(*source.parts[i:])
             for key in (str(end), str(end.with_suffix(""))):
-                meant.setdefault(key, set()).add(fact["stem"])
-    if twice := [n for n in names if n not in known and len(meant.get(n, ())) > 1]:
+                stems_by_ending.setdefault(key, set()).add(fact["stem"])
+    if twice := [n for n in names if n not in stem_of and len(stems_by_ending.get(n, ())) > 1]:
         raise AwError(
             f"{path}: {shortlist(map(repr, twice), 3)} is the name of several photos "
-            f"({shortlist(sorted(meant[twice[0]]), 3)}); write their folders too"
+            f"({shortlist(sorted(stems_by_ending[twice[0]]), 3)}); write their folders too"
         )
-    known = {key: next(iter(stems)) for key, stems in meant.items()} | known
-    unknown = [n for n in names if n not in known]
+    stem_of = {key: next(iter(stems)) for key, stems in stems_by_ending.items()} | stem_of
+    unknown = [n for n in names if n not in stem_of]
     if unknown:
         what = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
         sources = {f["stem"]: f["source"] for f in facts}
         raise AwError(
             f"{path} names {what} not in the capture: "
-            + shortlist((_with_nearest(n, known, sources) for n in unknown), 3)
+            + shortlist((_with_nearest(n, stem_of, sources) for n in unknown), 3)
         )
     if not names:
         raise AwError(f"{path} is empty; list test photos one a line, or leave out --test-list")
-    tests = {known[n] for n in names}
+    tests = {stem_of[n] for n in names}
     if len(tests) == len(facts):
         raise AwError(f"{path} names all {len(facts)} photos: no training photo would be left; list fewer")
     return tests
 
 
-def _with_nearest(name: str, known: dict[str, str], sources: dict[str, str]) -> str:
-    """The unknown name, and the photo whose name is nearest to it."""
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"{name!r} (did you mean {sources[known[near[0]]]!r}?)" if near else repr(name)
+def _with_nearest(name: str, stem_of: dict[str, str], sources: dict[str, str]) -> str:
+    """Quote the unknown name and add the photo whose name is nearest to it."""
+    near = difflib.get_close_matches(name, stem_of, n=1, cutoff=0.5)
+    return f"{name!r} (did you mean {sources[stem_of[near[0]]]!r}?)" if near else repr(name)

@@ -1,8 +1,8 @@
-"""Downsampled photos, masks and truth: antialiased, in linear light.
+"""Downsample photos, masks and truth: antialiased, in linear light.
 
 Averaging sRGB values darkens fine bright detail (a black and white grid becomes 128 instead of 188), so
-pixels are decoded (IEC 61966-2-1), resampled by Pillow and encoded again. Away from the border that is
-OpenImageIO's result to one level of 255, six times as fast.
+pixels are decoded (IEC 61966-2-1), resampled by Pillow and encoded again. Away from the border the result
+equals OpenImageIO's to one level of 255, six times as fast.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ _TO_LINEAR, _TO_SRGB = _decode_table(), _encode_table()
 
 
 def auto_factor(sizes: list[tuple[int, int]]) -> int:
-    """The largest of 1, 2, 4, 8 that leaves a median longer side of 480 px or more; else 1."""
+    """Return the largest of 1, 2, 4, 8 that leaves a median longer side of 480 px or more; else 1."""
     side = float(np.median([max(size) for size in sizes]))
     return max((f for f in FACTORS if side / f >= TARGET_SIDE), default=1)
 
 
 def downsampled_size(width: int, height: int, factor: int) -> tuple[int, int]:
-    """(width, height) / factor, rounded; intrinsics follow the actual size."""
+    """Return (width, height) / factor, rounded; the scene's intrinsics follow this size."""
     return max(1, round(width / factor)), max(1, round(height / factor))
 
 
@@ -81,7 +81,7 @@ def downsample_mask(
     width: int,  # px
     height: int,  # px
 ) -> np.ndarray:  # [height, width] uint8 in {0, 255}
-    """White where at least half of the pixel's area is white."""
+    """Reduce a mask: a pixel is white where at least half of its area is."""
     share = cv2.resize((mask >= 128).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     return np.where(share >= 0.5, 255, 0).astype(np.uint8)
 

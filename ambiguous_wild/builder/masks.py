@@ -1,7 +1,7 @@
 """The user's keep masks, checked before structure from motion.
 
 COLMAP drops a photo without a mask, without a message, and a mask of the wrong size removes most features.
-Both are refused here, by name. White = keep, black = ignore, as in COLMAP.
+Missing masks and wrong sizes are refused here, by name. White = keep, black = ignore, as in COLMAP.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the re
 
 
 def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[str, Path]:
-    """Mask file of each photo, by stem.
+    """Find the mask file of each photo, by stem.
 
-    Names: see `io.scene_folder.find_masks`; paths are those in the capture.
+    How files are named: see `io.scene_folder.find_masks`.
 
     Args:
         folder: the user's mask folder.
@@ -32,12 +32,12 @@ def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[s
         missing: "error", or "keep": a photo without a mask is used whole.
 
     Raises:
-        AwError: no such folder, photos without a mask, masks of another size, or what is no mask.
+        AwError: no such folder, photos without a mask, masks of another size, or a file that is no mask.
     """
     if not folder.is_dir():
         what = "is a file; give the folder that holds the masks" if folder.exists() else "does not exist"
         raise AwError(f"mask folder {folder} {what}")
-    found: dict[str, Path] = {}
+    mask_files: dict[str, Path] = {}
     unmasked, misfits = [], []
     sources = [fact["source"] for fact in facts]
     named = by_name(folder, sources) or by_name(folder, (s.removeprefix("images/") for s in sources))
@@ -49,37 +49,37 @@ def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[s
         height, width = upright(read_mask(path), orientation(path)).shape
         if (width, height) != (fact["width"], fact["height"]):
             misfits.append(f"{path.name} is {width}x{height} but its photo {fact['width']}x{fact['height']}")
-        found[fact["stem"]] = path
+        mask_files[fact["stem"]] = path
     if misfits:
         raise AwError(
-            f"{len(misfits)} of {len(found)} masks in {folder} have another size than their photo: "
+            f"{len(misfits)} of {len(mask_files)} masks in {folder} have another size than their photo: "
             f"{shortlist(misfits, 3)}; resize them with nearest-neighbour sampling"
         )
-    if unmasked and (missing == "error" or not found):
+    if unmasked and (missing == "error" or not mask_files):
         raise AwError(
             f"{len(unmasked)} of {len(facts)} photos have no mask: {shortlist(unmasked)}; add them under "
             f"{folder} as NAME.png, or pass --masks-missing keep to use those photos whole"
         )
-    return found
+    return mask_files
 
 
 def alphas(capture: Path, facts: list[ScreenedPhoto]) -> dict[str, np.ndarray]:
-    """What the photos' own alpha keeps, [H, W] uint8 in {0, 255}, by stem; opaque photos are absent."""
-    found = {}
+    """Read the photos' alpha as keep masks, [H, W] uint8 in {0, 255}, by stem; opaque photos are absent."""
+    masks = {}
     for fact in facts:
         if TRANSPARENT in fact["notes"] and (alpha := read_alpha(capture / fact["source"])) is not None:
-            found[fact["stem"]] = upright(alpha, fact["exif"].get("orientation", 1))
-    return found
+            masks[fact["stem"]] = upright(alpha, fact["exif"].get("orientation", 1))
+    return masks
 
 
 def lay_out_masks(
-    folder: Path, found: dict[str, Path], facts: list[ScreenedPhoto], alpha: Mapping[str, np.ndarray]
+    folder: Path, mask_files: dict[str, Path], facts: list[ScreenedPhoto], alpha: Mapping[str, np.ndarray]
 ) -> MaskResult:
-    """Write every photo's mask, times its alpha, for COLMAP, `folder/masks/<work name>.png`, 0 and 255."""
+    """Write every photo's mask times its alpha, 0 or 255, to `folder/masks/<work name>.png` for COLMAP."""
     (folder / "masks").mkdir()
     shares = {}
     for fact in facts:
-        path = found.get(fact["stem"])
+        path = mask_files.get(fact["stem"])
         if path is None:
             mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
         else:
@@ -93,7 +93,7 @@ def lay_out_masks(
 
 
 def alpha_warning(photos: int) -> str:
-    """What is said where the alpha of so many photos hides pixels."""
+    """Return the warning for photos whose alpha hides pixels."""
     return (
         f"alpha of {counted(photos, 'photo')} hides pixels: nothing is learnt from them, and psnr_valid of "
         "test photos leaves them out"
@@ -101,7 +101,7 @@ def alpha_warning(photos: int) -> str:
 
 
 def mask_warnings(facts: MaskResult | None) -> list[str]:
-    """Warnings: alpha that hides pixels; masks that keep so little that they may be inverted."""
+    """Warn of alpha that hides pixels, and of masks that keep so little that they may be inverted."""
     shares = list(facts["kept_share"].values()) if facts else []
     hidden = len(facts.get("alpha", ())) if facts else 0
     warnings = [alpha_warning(hidden)] if hidden else []
@@ -114,6 +114,6 @@ def mask_warnings(facts: MaskResult | None) -> list[str]:
     ]
 
 
-def mask_hashes(found: dict[str, Path]) -> dict[str, str]:
-    """sha256 of each mask file, by stem."""
-    return {stem: sha256_file(path) for stem, path in sorted(found.items())}
+def mask_hashes(mask_files: dict[str, Path]) -> dict[str, str]:
+    """Return the sha256 of each mask file, by stem."""
+    return {stem: sha256_file(path) for stem, path in sorted(mask_files.items())}

@@ -1,4 +1,4 @@
-"""Matched photos before any pose: focal lengths, motions of every pair, matches that fit given poses."""
+"""Matched photos: their focal lengths, the motions of every pair, and matches that fit given poses."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from ambiguous_wild.builder.motions import (
 )
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-FITS_PX, FITS_SHARE = (1.5, 3.0), 0.003  # of a match to its epipolar line: share of the longer side, bounded
+# A match fits within this distance of its epipolar line: a share of the longer side, between bounds in px.
+FITS_PX, FITS_SHARE = (1.5, 3.0), 0.003
 
 
 @dataclass
 class Matched:
-    """Photos with features and matched pairs, before any pose; photos are numbered as in `ids`."""
+    """Photos with features and matched pairs, without poses; a photo's number is its index in `ids`."""
 
-    ids: list[int]  # COLMAP's
+    ids: list[int]  # image ids of COLMAP
     names: list[str]
     cameras: list[Any]  # pycolmap.Camera of every photo
-    features: list[np.ndarray]  # [N, 2] px
-    matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with `LEAST` at least
+    features: list[np.ndarray]  # a photo each: [N, 2] px
+    matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with at least `LEAST`
     motions: dict[Pair, list[Motion]] = field(default_factory=dict)
     distorted: bool = True  # whether the lens's distortion is estimated; else there is none
 
     @classmethod
     def read(cls, database: Path) -> Matched:
-        """From COLMAP's database, without motions."""
+        """Read COLMAP's database; motions are not in it."""
         db = pycolmap.Database.open(str(database))
         try:
             images = sorted(db.read_all_images(), key=lambda image: image.image_id)
@@ -59,26 +60,26 @@ class Matched:
             db.close()
 
     def rays(self) -> list[np.ndarray]:
-        """Of every photo: [N, 2] its features as x / z and y / z, through its camera as it is now."""
+        """Return the features of every photo as x / z and y / z, [N, 2], by its present camera."""
         return [
             np.asarray(camera.cam_from_img(points)) if len(points) else points
             for camera, points in zip(self.cameras, self.features)
         ]
 
     def focal_px(self, photo: int) -> float:
-        """Focal length of its camera."""
+        """Return the focal length of a photo's camera."""
         return float(self.cameras[photo].mean_focal_length())
 
     def misfit(
         self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
     ) -> np.ndarray:
-        """[K] distances of a pair's matches from their epipolar lines (Sampson), in units of `FITS_PX`.
+        """Return the distances [K] of a pair's matches from their epipolar lines (Sampson); 1 = just fits.
 
         Args:
-            pair: of photos.
-            first: [3, 4] pose of its first photo, camera from world.
-            second: of its second.
-            rays: of all photos.
+            pair: two photos.
+            first: [3, 4] pose of the first photo, camera from world.
+            second: [3, 4] pose of the second photo.
+            rays: result of `rays`.
         """
         rows = self.matches[pair]
         essential = _essential(relative_pose(first, second))
@@ -94,21 +95,21 @@ class Matched:
     def fit(
         self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
     ) -> np.ndarray:
-        """[K] bool: matches of a pair that fit two poses, as in `misfit`."""
+        """Tell which matches of a pair fit two poses, [K] bool; arguments as in `misfit`."""
         return self.misfit(pair, first, second, rays) <= 1.0
 
     def fitting(self, poses: Mapping[int, np.ndarray]) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
-        """Of every placed pair its pose, second from first [3, 4], and the matches that fit it."""
-        rays, found = self.rays(), {}
+        """Return of every placed pair its pose, second from first [3, 4], and the matches that fit it."""
+        rays, fitting_pairs = self.rays(), {}
         for a, b in self.matches:
             if a in poses and b in poses:
                 rows = np.flatnonzero(self.fit((a, b), poses[a], poses[b], rays))
                 if len(rows) >= LEAST:
-                    found[a, b] = relative_pose(poses[a], poses[b]), rows
-        return found
+                    fitting_pairs[a, b] = relative_pose(poses[a], poses[b]), rows
+        return fitting_pairs
 
     def write_verified(self, database: Path, verified: Mapping[Pair, tuple[np.ndarray, np.ndarray]]) -> None:
-        """Replace the verified pairs of the database: pose, second from first [3, 4], and matches."""
+        """Replace the database's verified pairs: their poses, second from first [3, 4], and matches."""
         db = pycolmap.Database.open(str(database))
         try:
             db.clear_two_view_geometries()
@@ -125,29 +126,29 @@ class Matched:
         finally:
             db.close()
 
-    def find_focals(self, usual: Mapping[str, float], jobs: int) -> None:
-        """Focal lengths of the cameras, by votes of pairs.
+    def find_focals(self, by_exif: Mapping[str, float], jobs: int) -> None:
+        """Set the focal lengths of the cameras by votes of pairs.
 
         Args:
-            usual: name -> focal length over the longer side, of photos whose EXIF tells it.
+            by_exif: name -> focal length over the longer side, of photos whose EXIF has it.
             jobs: threads.
         """
         sides = [max(camera.width, camera.height) for camera in self.cameras]
         numbers = [camera.camera_id for camera in self.cameras]
         centred = [f - [c.width / 2, c.height / 2] for f, c in zip(self.features, self.cameras)]
-        stated = {number: usual[name] for number, name in zip(numbers, self.names) if name in usual}
+        stated = {number: by_exif[name] for number, name in zip(numbers, self.names) if name in by_exif}
         focals = focal_votes(centred, sides, numbers, stated, self.matches, jobs)
         for camera, side in zip(self.cameras, sides):
             camera.params = [focals[camera.camera_id] * side, *camera.params[1:]]
 
     def find_motions(self, jobs: int) -> dict[Pair, tuple[int, int]]:
-        """The motions of all pairs; where a pair agrees with others, the number of its motion and way."""
+        """Find the motions of all pairs; return motion and way, by number, of pairs that agree."""
         focals_px = [self.focal_px(k) for k in range(len(self.ids))]
         self.motions = motions_of_pairs(self.rays(), focals_px, self.matches, jobs)
         return agreed_motions(self.motions, cycle_votes(self.motions))
 
     def poses(self, model: Any) -> dict[int, np.ndarray]:
-        """Of the photos that a model places: [3, 4] camera from world."""
+        """Return the poses [3, 4], camera from world, of the photos that a model places."""
         return {
             k: np.asarray(model.images[i].cam_from_world().matrix())
             for k, i in enumerate(self.ids)
@@ -155,7 +156,7 @@ class Matched:
         }
 
     def take_cameras(self, model: Any) -> float:
-        """Cameras of a model; how much focal lengths change, relative, in the median over photos."""
+        """Use the cameras of a model; return the median relative change of focal length over photos."""
         before = np.array([self.focal_px(k) for k in range(len(self.ids))])
         for camera in self.cameras:
             if camera.camera_id in model.cameras:
@@ -164,7 +165,7 @@ class Matched:
         return float(np.median(np.abs(after / before - 1.0)))
 
     def write_agreed(self, database: Path, agreed: Mapping[Pair, tuple[int, int]]) -> None:
-        """Cameras, and one motion of every pair that agrees, for COLMAP's mapper."""
+        """Write cameras and one motion of every pair that agrees to the database, for COLMAP's mapper."""
         db = pycolmap.Database.open(str(database))
         try:
             for camera in {camera.camera_id: camera for camera in self.cameras}.values():
@@ -179,8 +180,8 @@ class Matched:
         self.write_verified(database, verified)
 
     def save_motions(self, path: Path) -> None:
-        """As .npz: of every motion its pair, matches and ways."""
-        every = [(pair, motion) for pair, found in self.motions.items() for motion in found]
+        """Save pair, matches and ways of every motion as .npz."""
+        every = [(pair, motion) for pair, motions in self.motions.items() for motion in motions]
         np.savez(
             path,
             pairs=np.array([pair for pair, _ in every], int).reshape(-1, 2),
@@ -191,7 +192,7 @@ class Matched:
         )
 
     def load_motions(self, path: Path) -> None:
-        """What `save_motions` wrote."""
+        """Load the motions that `save_motions` wrote."""
         with np.load(path, allow_pickle=False) as file:
             cuts = np.cumsum(file["counts"], axis=0)[:-1]
             matches = np.split(file["matches"], cuts[:, 0])
@@ -202,12 +203,12 @@ class Matched:
 
 
 def relative_pose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[3, 4] second camera from the first, of their poses [3, 4] from world."""
+    """Return the pose [3, 4] of the second camera from the first, given their poses [3, 4] from world."""
     rotation = second[:, :3] @ first[:, :3].T
     return np.column_stack([rotation, second[:, 3] - rotation @ first[:, 3]])
 
 
 def _essential(pose: np.ndarray) -> np.ndarray:
-    """[3, 3] of a pose, second from first [3, 4]; its scale does not count."""
+    """Return the essential matrix [3, 3] of a pose, second from first [3, 4], whose scale is ignored."""
     x, y, z = pose[:, 3] / max(float(np.linalg.norm(pose[:, 3])), 1e-12)
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:, :3]

@@ -1,12 +1,12 @@
-"""Motions between two photos, and which of them is the place's.
+"""Find the motions between two photos, and which of them is that of the static scene.
 
-A pair of photos may show several rigid motions: the place's, and one of every distractor that both show,
-which may have most of the matches. But photos of the place agree with each other: the rotation from a photo
-to a second, and on to a third, is that from the first to the third. A motion counts by the triplets of
+A pair of photos may show several rigid motions: that of the static scene, and one of every distractor in both
+photos, which may have most of the matches. But the static scene is consistent: the rotation from a photo to a
+second, and on to a third, equals that from the first to the third. A motion gets votes from the triplets of
 photos that it closes, each weighted by the votes of its other two motions.
 
 Several motions a pair, made consistent over all pairs: Arrigoni and Pajdla, "Robust motion segmentation from
-pairwise matches" (ICCV 2019), which labels points; here the motions place the photos.
+pairwise matches" (ICCV 2019). They label points; here the motions place the photos.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ import numpy as np
 
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-LEAST = 15  # matches of a motion
-MOTIONS = 3  # of a pair, at most
+LEAST = 15  # smallest number of matches of a motion
+MOTIONS = 3  # largest number of motions of a pair
 WAYS = 3  # poses that explain one motion: a plane allows two more
-ERROR_PX = 2.0  # of a match to its motion
-CLOSED_DEG = 4.0  # rotation left over around a triplet
-ROUNDS = 4  # of voting
-AGREED_DEG = 5.0  # between a motion and the rotations of its photos
-SWEEPS = 10  # over all photos, at most
+ERROR_PX = 2.0  # largest distance of a match from its motion
+CLOSED_DEG = 4.0  # largest rotation left over around a closed triplet
+ROUNDS = 4  # rounds of voting
+AGREED_DEG = 5.0  # largest angle between a motion and the rotations of its photos
+SWEEPS = 10  # largest number of sweeps over all photos
 CONFIDENCE, TRIALS = 0.9999, 1000  # of RANSAC
-PLANE_SHARE = 0.7  # of a motion's matches on one plane: its pose has a twin
-FUNDAMENTAL_PX = 1.5  # of a match to its fundamental matrix
+PLANE_SHARE = 0.7  # share of a motion's matches on one plane above which its pose is ambiguous
+FUNDAMENTAL_PX = 1.5  # largest distance of a match from its epipolar line
 FOCALS = 0.3 * 1.02 ** np.arange(116)  # over the longer side: 118 to 20 degrees of view
-FOCAL_USUAL = 0.8  # of phones and drones about 0.7, of other cameras 0.8 to 1.4
-FOCAL_PAIRS = 10  # a photo, those with most matches
-FOCAL_LEAST = 10  # fundamental matrices that determine a focal length
-FOCAL_MATCHES = 100  # beyond which a matrix does not count more
+FOCAL_USUAL = 0.8  # default; phones and drones have about 0.7, other cameras 0.8 to 1.4
+FOCAL_PAIRS = 10  # pairs used a photo, those with most matches
+FOCAL_LEAST = 10  # fundamental matrices needed to determine a focal length
+FOCAL_MATCHES = 100  # matches above which a matrix gets no more weight
 FOCAL_UNEQUAL = 0.1  # relative difference of singular values that counts as wrong
-FOCAL_CLEAR = 0.75  # cost of the best focal length over that of the median one
-FOCAL_BETTER = 0.85  # or over that of the one it would replace
-FOCAL_TURNS = 3  # in which each camera looks for its focal length among the others'
+FOCAL_CLEAR = 0.75  # largest cost of the best focal length, relative to the median cost
+FOCAL_BETTER = 0.85  # the same, relative to the cost of the focal length it would replace
+FOCAL_TURNS = 3  # rounds in which each camera's focal length is chosen given the others
 _CHUNK = 20_000  # triplets voted on at a time
 
 
@@ -63,30 +63,30 @@ def motions_of_pairs(
     matches: Mapping[Pair, np.ndarray],  # (a, b) -> [K, 2] indices of features
     jobs: int,
 ) -> dict[Pair, list[Motion]]:
-    """The motions of every pair, the one with most matches first; the same for any number of jobs."""
+    """Find the motions of every pair, the one with most matches first, for any number of jobs the same."""
 
     def one(item: tuple[Pair, np.ndarray]) -> list[Motion]:
         (a, b), rows = item
         error = ERROR_PX / float(np.sqrt(focals_px[a] * focals_px[b]))
         return motions(rays[a][rows[:, 0]], rays[b][rows[:, 1]], error)
 
-    cv2.setNumThreads(1)  # a pair a thread
+    cv2.setNumThreads(1)  # each thread works on one pair
     todo = sorted(matches.items(), key=lambda item: item[0])
     with ThreadPoolExecutor(jobs) as pool:
         return dict(zip((pair for pair, _ in todo), pool.map(one, todo)))
 
 
 def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]:
-    """Motions of matched features, one after another.
+    """Find the motions of matched features, one after another.
 
     Args:
         first: [K, 2] rays in the first photo.
         second: [K, 2] their matches in the second.
-        error: of a match, in the same units.
+        error: largest distance of a match from its motion, in the same units.
     """
     left = np.arange(len(first))
-    found: list[Motion] = []
-    while len(found) < MOTIONS and len(left) >= LEAST:
+    models: list[Motion] = []
+    while len(models) < MOTIONS and len(left) >= LEAST:
         a, b = first[left], second[left]
         try:
             essential, mask = cv2.findEssentialMat(
@@ -98,30 +98,30 @@ def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]
             break
         inside = mask.ravel() > 0
         _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
-        ways = [(rotation, translation.ravel()), *_twins(a[inside], b[inside], error)][:WAYS]
+        ways = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:WAYS]
         ways = [_refined(way, a[inside], b[inside]) for way in ways]
-        found.append(Motion(left[inside], np.array([r for r, _ in ways]), np.array([t for _, t in ways])))
+        models.append(Motion(left[inside], np.array([r for r, _ in ways]), np.array([t for _, t in ways])))
         left = left[~inside]
-    return found
+    return models
 
 
 def _refined(
     way: tuple[np.ndarray, np.ndarray], a: np.ndarray, b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pose with the least error: with a long lens, RANSAC's is off by several degrees."""
+    """Refine a pose to the least error: with a long lens, RANSAC's is off by several degrees."""
     first, second = (np.column_stack([x, np.ones(len(x))]) for x in (a, b))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second /= np.linalg.norm(second, axis=1, keepdims=True)
     start = pycolmap.Rigid3d(np.column_stack(way))
-    found = pycolmap.refine_relative_pose(start, first, second, np.ones(len(a), bool))
-    if found is None:
+    refined = pycolmap.refine_relative_pose(start, first, second, np.ones(len(a), bool))
+    if refined is None:
         return way
-    pose = np.asarray(found["cam2_from_cam1"].matrix())
+    pose = np.asarray(refined["cam2_from_cam1"].matrix())
     return pose[:, :3], pose[:, 3]
 
 
-def _twins(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The poses that explain matches on one plane; empty where they lie on none."""
+def _plane_poses(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the poses that explain matches on one plane; none where they lie on no plane."""
     try:
         plane, mask = cv2.findHomography(a, b, cv2.USAC_MAGSAC, error, maxIters=TRIALS, confidence=CONFIDENCE)
     except cv2.error:
@@ -140,24 +140,24 @@ def _twins(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray,
 
 
 def focal_votes(
-    features: Sequence[np.ndarray],  # of every photo: [N, 2] px from the principal point
-    sides_px: Sequence[int],  # longer sides
-    cameras: Sequence[int],  # of every photo the number of its camera
-    usual: Mapping[int, float],  # camera -> focal length over the longer side, as EXIF has it
+    features: Sequence[np.ndarray],  # a photo each: [N, 2] px from the principal point
+    sides_px: Sequence[int],  # longer side of each photo
+    cameras: Sequence[int],  # camera number of each photo
+    exif_focals: Mapping[int, float],  # camera -> focal length over the longer side, by EXIF
     matches: Mapping[Pair, np.ndarray],
     jobs: int,
 ) -> dict[int, float]:
-    """Focal length over the longer side of every camera, as the pairs' fundamental matrices have it.
+    """Estimate the focal length over the longer side of every camera from pairs' fundamental matrices.
 
-    An essential matrix has two equal singular values. Of F with the right focal lengths that is true for
-    whatever is rigid; of one fitted to anything else for no focal length in particular. A camera of which the
-    matrices say little, as of a plane, keeps what EXIF says, else has that of the others, or `FOCAL_USUAL`.
+    An essential matrix has two equal singular values. A fundamental matrix of a rigid motion becomes one with
+    the right focal lengths; one fitted to anything else favours no focal length. A camera whose matrices do
+    not decide, as on a plane, keeps the focal length of EXIF, else gets that of the others or `FOCAL_USUAL`.
     """
     pairs, matrices, weights = _fundamentals(features, sides_px, matches, jobs)
     ends = np.array([[cameras[a], cameras[b]] for a, b in pairs], int).reshape(-1, 2)
-    others = float(np.median(list(usual.values()))) if usual else FOCAL_USUAL
-    focals = {c: usual.get(c, others) for c in sorted(set(cameras))}
-    unknown = [c for c in focals if c not in usual]
+    others = float(np.median(list(exif_focals.values()))) if exif_focals else FOCAL_USUAL
+    focals = {c: exif_focals.get(c, others) for c in sorted(set(cameras))}
+    unknown = [c for c in focals if c not in exif_focals]
 
     def best(rows: np.ndarray, moving: Sequence[int]) -> float | None:
         if len(rows) < FOCAL_LEAST:
@@ -189,13 +189,13 @@ def focal_votes(
 def _fundamentals(
     features: Sequence[np.ndarray], sides_px: Sequence[int], matches: Mapping[Pair, np.ndarray], jobs: int
 ) -> tuple[list[Pair], np.ndarray, np.ndarray]:
-    """Pairs, fundamental matrices [N, 3, 3] in units of the longer sides, weights [N]; some pairs twice."""
+    """Return pairs, some twice, fundamental matrices [N, 3, 3] in units of the longer sides, weights [N]."""
 
     def one(pair: Pair) -> list[tuple[Pair, np.ndarray, int]]:
         (a, b), rows = pair, matches[pair]
         first, second = features[a][rows[:, 0]], features[b][rows[:, 1]]
-        found: list[tuple[Pair, np.ndarray, int]] = []
-        while len(found) < MOTIONS - 1 and len(first) >= LEAST:
+        fitted: list[tuple[Pair, np.ndarray, int]] = []
+        while len(fitted) < MOTIONS - 1 and len(first) >= LEAST:
             try:
                 matrix, mask = cv2.findFundamentalMat(
                     first, second, cv2.USAC_MAGSAC, FUNDAMENTAL_PX, CONFIDENCE, TRIALS
@@ -205,15 +205,15 @@ def _fundamentals(
             if matrix is None or matrix.shape != (3, 3) or np.count_nonzero(mask) < LEAST:
                 break
             scaled = np.diag([sides_px[b]] * 2 + [1]) @ matrix @ np.diag([sides_px[a]] * 2 + [1])
-            found.append((pair, scaled, int(np.count_nonzero(mask))))
+            fitted.append((pair, scaled, int(np.count_nonzero(mask))))
             outside = mask.ravel() == 0
             first, second = first[outside], second[outside]
-        return found
+        return fitted
 
-    cv2.setNumThreads(1)  # a pair a thread
+    cv2.setNumThreads(1)  # each thread works on one pair
     strongest = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[: FOCAL_PAIRS * len(features)]
     with ThreadPoolExecutor(jobs) as pool:
-        votes = [vote for found in pool.map(one, strongest) for vote in found]
+        votes = [vote for fitted in pool.map(one, strongest) for vote in fitted]
     return (
         [pair for pair, _, _ in votes],
         np.array([matrix for _, matrix, _ in votes]).reshape(-1, 3, 3),
@@ -222,7 +222,7 @@ def _fundamentals(
 
 
 def _inequality(matrices: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(s1 - s2) / (s1 + s2) of the singular values of K2' F K1, a matrix of rank two each: [N]."""
+    """Return (s1 - s2) / (s1 + s2), [N], of the singular values of each K2' F K1, a matrix of rank two."""
     ones = np.ones_like(first)
     essential = matrices * np.stack([first, first, ones], -1)[:, None, :]
     essential = essential * np.stack([second, second, ones], -1)[:, :, None]
@@ -233,19 +233,19 @@ def _inequality(matrices: np.ndarray, first: np.ndarray, second: np.ndarray) -> 
 
 
 def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray]:
-    """Of every motion's ways the share of triplets that it closes: (a, b) -> [M, W] in 0 to 1.
+    """Return the share of triplets that each motion and way of a pair closes: (a, b) -> [M, W], 0 to 1.
 
-    0 where no triplet can tell. Triplets are weighted by the votes of the other two motions.
+    It is 0 where there is no triplet. Triplets are weighted by the votes of the other two motions.
     """
-    known = sorted(pair for pair, found in pairs.items() if found)
-    at = {pair: k for k, pair in enumerate(known)}
-    rotations = np.full((len(known), MOTIONS * WAYS, 3, 3), np.nan)
+    connected = sorted(pair for pair, found in pairs.items() if found)
+    at = {pair: k for k, pair in enumerate(connected)}
+    rotations = np.full((len(connected), MOTIONS * WAYS, 3, 3), np.nan)
     for pair, k in at.items():
         for m, motion in enumerate(pairs[pair]):
             start = m * WAYS
             rotations[k, start : start + len(motion.rotations)] = motion.rotations
     exists = ~np.isnan(rotations[:, :, 0, 0])
-    edges = _triplets(known, at)
+    edges = _triplets(connected, at)
     closings = [_closed(rotations, edges[i : i + _CHUNK]) for i in range(0, len(edges), _CHUNK)]
     rows = np.concatenate(closings) if closings else np.zeros((0, 4), np.int32)
     votes = exists.astype(float)
@@ -254,21 +254,21 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
     return {pair: votes[k].reshape(MOTIONS, WAYS) for pair, k in at.items()}
 
 
-def _triplets(known: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
-    """[T, 3] pairs (a, b), (b, c), (a, c) with a < b < c, as indices into `known`."""
+def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
+    """Return all triplets [T, 3]: (a, b), (b, c), (a, c) with a < b < c, as indices into `pairs`."""
     after: dict[int, set[int]] = {}
-    for a, b in known:
+    for a, b in pairs:
         after.setdefault(a, set()).add(b)
-    found = [(at[a, b], at[b, c], at[a, c]) for a, b in known for c in sorted(after[a] & after.get(b, set()))]
-    return np.array(found, np.intp).reshape(-1, 3)
+    edges = [(at[a, b], at[b, c], at[a, c]) for a, b in pairs for c in sorted(after[a] & after.get(b, set()))]
+    return np.array(edges, np.intp).reshape(-1, 3)
 
 
 def _closed(rotations: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """[R, 4] row of `edges`, and one motion of each of its pairs, that together close."""
+    """Return [R, 4]: the row of a triplet in `edges`, and one motion of each of its pairs that close it."""
     first, second, direct = (rotations[edges[:, k]] for k in range(3))
     around = np.einsum("tbxz,tazy->tabxy", second, first)
     trace = np.einsum("tabxy,tcxy->tabc", around, direct)
-    # NaN, of what does not exist, is not larger than anything
+    # Motions that do not exist are NaN, which is never larger.
     return np.argwhere(trace > trace_of(CLOSED_DEG))
 
 
@@ -291,15 +291,15 @@ def agreed_motions(
     pairs: Mapping[Pair, Sequence[Motion]],
     votes: Mapping[Pair, np.ndarray],  # as `cycle_votes` returns them
 ) -> dict[Pair, tuple[int, int]]:
-    """Of every pair the motion, and its way, that turns its photos as most partners of each turn them.
+    """Return the motion of each pair, and its way, that agrees with the rotations of its two photos.
 
-    Rotations are chosen photo by photo: that on which the partners with most votes agree, until none changes.
-    Every photo counts once, however many matches it has. Pairs without such a motion are left out.
+    Rotations are chosen photo by photo, as most votes of the partners want it, until none changes. Every
+    partner counts once, however many matches it has. Pairs without such a motion are left out.
     """
     ends: dict[int, list[_End]] = {}
-    for (a, b), found in votes.items():
+    for (a, b), shares in votes.items():
         turns = [
-            (r, found[m, w]) for m, motion in enumerate(pairs[a, b]) for w, r in enumerate(motion.rotations)
+            (r, shares[m, w]) for m, motion in enumerate(pairs[a, b]) for w, r in enumerate(motion.rotations)
         ]
         turns = [(r, vote) for r, vote in turns if vote > 0]
         if turns:
@@ -310,21 +310,21 @@ def agreed_motions(
     for start in sorted(ends, key=lambda k: -sum(weight.max() for _, _, weight in ends[k])):
         if start not in rotations:
             rotations[start] = np.eye(3)
-            _grow(start, ends, rotations)
+            _spread_rotations(start, ends, rotations)
     for _ in range(SWEEPS):
         changed = 0
         for photo in ends:
             before = rotations[photo]
-            rotations[photo] = _turned(ends[photo], rotations, before)
+            rotations[photo] = _rotation(ends[photo], rotations, before)
             changed += not _alike(before[None], rotations[photo], CLOSED_DEG)[0]
         if not changed:
             break
     agreed = {}
-    for (a, b), found in votes.items():
+    for (a, b), shares in votes.items():
         if a in rotations and b in rotations:
             wanted = rotations[b] @ rotations[a].T
             fits = [
-                (found[m, w], -m, -w)
+                (shares[m, w], -m, -w)
                 for m, motion in enumerate(pairs[a, b])
                 for w in np.flatnonzero(_alike(motion.rotations, wanted, AGREED_DEG))
             ]
@@ -334,8 +334,8 @@ def agreed_motions(
     return agreed
 
 
-def _grow(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]) -> None:
-    """Turn the photos that pairs connect with `start`, those with most votes first."""
+def _spread_rotations(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]) -> None:
+    """Choose the rotations of the photos that pairs connect with `start`, those with most votes first."""
     gain: dict[int, float] = {}
     photo = start
     while True:
@@ -346,11 +346,11 @@ def _grow(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.nd
             return
         photo = max(gain, key=lambda k: (gain[k], -k))
         del gain[photo]
-        rotations[photo] = _turned(ends[photo], rotations, np.eye(3))
+        rotations[photo] = _rotation(ends[photo], rotations, np.eye(3))
 
 
-def _turned(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
-    """The rotation of a photo on which its turned partners agree best; one motion of each counts."""
+def _rotation(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
+    """Return the rotation of a photo on which most partners agree; each partner counts with one motion."""
     turns, weights, owners = [], [], []
     for other, forth, weight in ends:
         if other in rotations:
@@ -372,10 +372,10 @@ def _turned(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise
 
 
 def _alike(rotations: np.ndarray, wanted: np.ndarray, angle_deg: float) -> np.ndarray:
-    """[N] bool: rotations [N, 3, 3] that differ by less than an angle from one."""
+    """Tell which rotations [N, 3, 3] differ by less than an angle from the wanted one: [N] bool."""
     return (rotations * wanted).sum(axis=(1, 2)) > trace_of(angle_deg)
 
 
 def trace_of(angle_deg: float) -> float:
-    """Trace of a rotation by an angle."""
+    """Return the trace of a rotation by an angle."""
     return 1.0 + 2.0 * float(np.cos(np.radians(angle_deg)))

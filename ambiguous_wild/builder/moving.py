@@ -1,8 +1,8 @@
-"""Features that move: matches that fit another motion of their pair than the place's.
+"""Find features that move: their matches fit another motion of the pair than that of the static scene.
 
-Structure from motion throws these matches away. A distractor that looks like the place, or like itself a
-moment later, is told by nothing else. Features of what stands still in some photos fit the place; they are
-told by photos that show what lies behind their 3D points.
+Structure from motion discards these matches, but nothing else reveals a distractor that looks like the static
+scene, or like itself a moment later. Features of a distractor that stands still in some photos fit the static
+scene; photos that show what lies behind their 3D points reveal them.
 """
 
 from __future__ import annotations
@@ -25,54 +25,54 @@ from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-CLEARLY = 2.0  # times what fits: by as much is a match off that moves
-LEAST_FITTING = 0.25  # of a photo's partners must share a motion that fits its pose
-# Seen through a point: as many at most, no farther from it than this share of the photo's longer side, and
-# deeper by this factor
+CLEARLY = 2.0  # a match moves if its misfit is this many times what still fits
+LEAST_FITTING = 0.25  # share of a photo's partners that must share a motion that fits its pose
+# A point is seen through by comparing it with at most this many points around it, no farther away than this
+# share of the photo's longer side, which must be deeper by this factor.
 AROUND, THROUGH, BEHIND = 12, 0.02, 1.2
-LEAST_THROUGH = 2  # photos that see through a point
-NEIGHBOURS = 0.05  # of the longer side: points that are seen through and lie as near are of one thing
-LEAST_OF_THING = 3  # points
+LEAST_THROUGH = 2  # photos that must see through a point
+NEIGHBOURS = 0.05  # share of the longer side: points seen through that lie as near belong to one thing
+LEAST_OF_THING = 3  # points of one thing
 
 
 @dataclass
 class Votes:
-    """Of the features of one photo."""
+    """Votes of other photos on the features of one photo."""
 
-    static: np.ndarray  # [N] photos
-    moving: np.ndarray  # [N] photos
-    motions: list[np.ndarray] = field(default_factory=list)  # features of each motion that is not the place's
+    static: np.ndarray  # [N] photos that call a feature static
+    moving: np.ndarray  # [N] photos that call it moving
+    motions: list[np.ndarray] = field(default_factory=list)  # features of each motion but the static scene's
     partners: int = 0  # photos with which it shares a motion
-    fitting: int = 0  # of these, photos of which some motion fits its pose
+    fitting: int = 0  # partners of which some motion fits its pose
 
 
 def count_votes(
     matched: Matched, poses: Mapping[int, np.ndarray], voters: Collection[int]
 ) -> dict[int, Votes]:
-    """What the matches of the voters with each other say of their features.
+    """Count how many photos call each feature static or moving, by the matches among the voters.
 
     Args:
-        matched: with motions.
+        matched: photos, with the motions of their pairs.
         poses: photo -> [3, 4] camera from world.
-        voters: photos that are shown; test photos must say nothing of train photos.
+        voters: photos that vote and are voted on; test photos must not vote on train photos.
     """
     rays = matched.rays()
     votes = {k: Votes(*np.zeros((2, len(matched.features[k])), int)) for k in voters if k in poses}
     for (a, b), rows in matched.matches.items():
         if a not in votes or b not in votes:
             continue
-        off, found = matched.misfit((a, b), poses[a], poses[b], rays), matched.motions.get((a, b), [])
-        fits = [bool(np.mean(off[motion.matches] <= 1.0) >= FITS) for motion in found]
+        off, motions = matched.misfit((a, b), poses[a], poses[b], rays), matched.motions.get((a, b), [])
+        fits = [bool(np.mean(off[motion.matches] <= 1.0) >= FITS) for motion in motions]
         for photo in (a, b):
-            votes[photo].partners += bool(found)
+            votes[photo].partners += bool(motions)
             votes[photo].fitting += any(fits)
-        for motion, fit in zip(found, fits):
+        for motion, fit in zip(motions, fits):
             of_motion = off[motion.matches]
             if fit:
                 fitting = rows[motion.matches[of_motion <= 1.0]]
                 votes[a].static[fitting[:, 0]] += 1
                 votes[b].static[fitting[:, 1]] += 1
-            # a motion fitted to the place and to a distractor together has some that are off, too
+            # A motion fitted to static scene and distractor together also has matches that do not fit.
             moving = rows[motion.matches[of_motion > CLEARLY]]
             if len(moving) >= LEAST:
                 for photo, features in ((a, moving[:, 0]), (b, moving[:, 1])):
@@ -82,19 +82,19 @@ def count_votes(
 
 
 def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> dict[int, np.ndarray]:
-    """Of every feature of a photo, [N] photos that show what lies behind its 3D point instead of the point.
+    """Count for every feature of a photo, [N], the photos that show what lies behind its 3D point.
 
-    A distractor that stands still in some photos and is gone in others has points like the place's own. A
-    photo sees through a point if the points that it observes around the point's projection, on three sides
-    at least, lie behind it.
+    A distractor that stands still in some photos and is gone in others has points like the static scene. A
+    photo sees through a point if the points that it observes around the point's projection, on at least three
+    sides, lie behind it.
 
     Args:
-        model: with points.
-        photos: image of the model -> photo; these are asked, and their features are told.
+        model: COLMAP's model with points.
+        photos: image of the model -> photo; only these photos and their features are used.
     """
     row_of = {number: row for row, number in enumerate(model.points3D)}
     xyz = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    through, rows = np.zeros(len(xyz) + 1, int), {}  # the last row is of features without a point
+    through, rows = np.zeros(len(xyz) + 1, int), {}  # the last row stands for features without a point
     for number, photo in photos.items():
         image = model.images[number]
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
@@ -128,48 +128,48 @@ def motion_points(
     pinholes: Mapping[str, ModelCamera],
     through: Mapping[int, np.ndarray],
 ) -> dict[str, MotionPoints]:
-    """Points of the train photos, by their names in the scene.
+    """Return the static and moving points of the train photos, by their names in the scene.
 
-    A photo whose pose fits few of its partners has none: all of it would seem to move.
+    A photo whose pose fits few of its partners gets no points, as all of it would seem to move.
 
     Args:
-        matched: with motions, and with the model's cameras.
+        matched: photos with the motions of their pairs and the model's cameras.
         poses: photo -> [3, 4] camera from world.
-        names: of the train photos, work name -> name in the scene.
-        pinholes: of the undistorted photos, by these names.
-        through: `seen_through` of the photos.
+        names: work name -> name in the scene, of the train photos.
+        pinholes: name in the scene -> camera of the undistorted photo.
+        through: photo -> result of `seen_through`.
     """
     voters = {k: names[name] for k, name in enumerate(matched.names) if name in names}
-    rays, found = matched.rays(), {}
+    rays, points = matched.rays(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
         reach = NEIGHBOURS * max(matched.cameras[photo].width, matched.cameras[photo].height)
-        for thing in _things(matched.features[photo], through.get(photo, np.zeros(0)), reach):
+        for thing in _group_features(matched.features[photo], through.get(photo, np.zeros(0)), reach):
             votes.moving[thing] += through[photo][thing]
             votes.motions.append(thing)
         camera = pinholes[voters[photo]]
         fx, fy, cx, cy = camera.pinhole()
         xy = (rays[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
-        # undistortion cuts the rim off
-        heard = (votes.static + votes.moving) * (votes.fitting >= LEAST_FITTING * votes.partners)
-        some = np.flatnonzero((heard > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
-        # several features of one place, turned otherwise, are one point: that with most votes
-        some = some[np.argsort(-heard[some], kind="stable")]
+        # Only features that got votes and that undistortion leaves inside the photo are kept.
+        vote_counts = (votes.static + votes.moving) * (votes.fitting >= LEAST_FITTING * votes.partners)
+        some = np.flatnonzero((vote_counts > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
+        # Features at one position that differ in orientation become one point: the one with most votes.
+        some = some[np.argsort(-vote_counts[some], kind="stable")]
         some = np.sort(some[np.unique(matched.features[photo][some], axis=0, return_index=True)[1]])
         static, moving = (x.clip(max=255).astype(np.uint8) for x in (votes.static, votes.moving))
-        motion = _together(votes, moving > static)
-        found[voters[photo]] = MotionPoints(
+        motion = _number_motions(votes, moving > static)
+        points[voters[photo]] = MotionPoints(
             xy[some].astype(np.float32), static[some], moving[some], motion[some]
         )
-    return found
+    return points
 
 
-def _things(features: np.ndarray, through: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Features of each thing that photos see through; a single one is rather a point at a wrong depth.
+def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Group the features that photos see through into things; a lone one is likely a point at a wrong depth.
 
     Args:
         features: [N, 2] px.
-        through: [N] photos, of `seen_through`; empty = nothing is known.
-        reach: px between neighbours of one thing.
+        through: [N] photos that see through each, by `seen_through`; empty if the photo was not checked.
+        reach: largest distance in px between neighbours of one thing.
     """
     gone = np.flatnonzero(through >= LEAST_THROUGH)
     if not len(gone):
@@ -186,28 +186,28 @@ def write_motion(
     """Write the motion points of a scene into the folder of their stage.
 
     Args:
-        folder: of the stage.
-        database: with features and matches.
-        motions: file of the motions.
-        model: folder of COLMAP's model, with the lenses.
+        folder: folder of the stage.
+        database: COLMAP's database with features and matches.
+        motions: file of the motions of pairs.
+        model: folder of COLMAP's model, whose cameras have distortion.
         flat: folder of the model of the undistorted photos.
-        names: of the train photos, work name -> name in the scene.
+        names: work name -> name in the scene, of the train photos.
     """
-    matched, found = Matched.read(database), pycolmap.Reconstruction(str(model))
-    matched.take_cameras(found)
+    matched, colmap_model = Matched.read(database), pycolmap.Reconstruction(str(model))
+    matched.take_cameras(colmap_model)
     matched.load_motions(motions)
     undistorted = read_model(flat)
     pinholes = {image.name: undistorted.cameras[image.camera_id] for image in undistorted.images.values()}
-    # a model from elsewhere has no points of these features
+    # A model from another program has no points of these features.
     photos = {
         number: k
         for k, number in enumerate(matched.ids)
         if matched.names[k] in names
-        and number in found.images
-        and found.images[number].num_points2D() == len(matched.features[k])
+        and number in colmap_model.images
+        and colmap_model.images[number].num_points2D() == len(matched.features[k])
     }
-    through = seen_through(found, photos)
-    points = motion_points(matched, matched.poses(found), names, pinholes, through)
+    through = seen_through(colmap_model, photos)
+    points = motion_points(matched, matched.poses(colmap_model), names, pinholes, through)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),
@@ -216,8 +216,8 @@ def write_motion(
     }
 
 
-def _together(votes: Votes, moves: np.ndarray) -> np.ndarray:
-    """[N] int16 motions from 1, by size, of the features that move [N] bool; 0 = does not."""
+def _number_motions(votes: Votes, moves: np.ndarray) -> np.ndarray:
+    """Number the motions by size from 1: [N] int16, 0 for features that do not move, by `moves` [N] bool."""
     count = len(moves)
     chains = [features[moves[features]] for features in votes.motions]
     links = np.concatenate([np.zeros((2, 0), int), *(np.stack([c[:-1], c[1:]]) for c in chains)], axis=1)

@@ -8,7 +8,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.builder.records import KeyedRecord, PackageResult, SceneRecord
 from ambiguous_wild.core.scene import FileEntry
@@ -21,7 +20,7 @@ class SceneParts:
     """Files of the finished stages that the scene consists of."""
 
     full: Path  # images/, sparse/0, masks/, truth/ at full size
-    small: Path | None  # the same downsampled; None at factor 1
+    small: Path | None  # the same folders downsampled; None at factor 1
     factor: int
     train: list[str]
     test: list[str]
@@ -34,8 +33,8 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
     """Assemble the scene in `folder`.
 
     Args:
-        folder: does not exist yet; renamed to the scene afterwards.
-        parts: see `SceneParts`.
+        folder: must not exist yet; the caller renames it to the scene.
+        parts: files of the finished stages.
         record: scene.json without its files.
         link: hard-link the stages' files, which are deleted afterwards, instead of copying them.
         jobs: threads that hash.
@@ -48,7 +47,7 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
         _place(small / "images", folder / f"images_{parts.factor}", link)
     _place(parts.full / "sparse" / "0", folder / "sparse" / "0", link)
     if (small / "masks").is_dir():
-        # Not for test photos: NerfBaselines would leave the masked pixels out of the score.
+        # Masks of test photos are left out: NerfBaselines would not score the masked pixels.
         _place(small / "masks", folder / "masks" / "train", link, set(parts.train))
         # Pixels that alpha hides were never seen: psnr_valid leaves them out.
         _place(small / "masks", folder / "masks" / "test", link, set(parts.hidden))
@@ -73,8 +72,8 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
     return {"files": len(files) + 1, "bytes": sum(f["bytes"] for f in files.values())}
 
 
-def nerfbaselines_info(factor: int, name: str) -> dict[str, Any]:
-    """nb-info.json: the folder that NerfBaselines loads, and its evaluation protocol.
+def nerfbaselines_info(factor: int, name: str) -> dict[str, object]:
+    """Return nb-info.json: the folder that NerfBaselines loads, and its evaluation protocol.
 
     No `id`: NerfBaselines only loads ids that are registered with it.
     """
@@ -88,7 +87,7 @@ def nerfbaselines_info(factor: int, name: str) -> dict[str, Any]:
 
 
 def list_files(folder: Path, jobs: int) -> dict[str, FileEntry]:
-    """sha256 and size of every file, by path relative to the folder."""
+    """Return sha256 and size of every file, by path relative to the folder."""
     paths = sorted(p for p in folder.rglob("*") if p.is_file())
     with ThreadPoolExecutor(jobs) as pool:
         digests = list(pool.map(sha256_file, paths))

@@ -1,7 +1,7 @@
 """Compare photos on the surfaces they share: exposure, colour, sharpness, overlap.
 
 A photo's mean brightness depends on what it shows. On surfaces that two photos share (SIFT matches of one
-epipolar geometry) the median difference is that of the camera settings. Least squares over all pairs gives
+epipolar geometry) the median difference comes from the camera settings. Least squares over all pairs gives
 one offset a photo.
 """
 
@@ -21,14 +21,14 @@ RATIO = 0.8  # Lowe's ratio test
 MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
-EXTRA_CANDIDATES = 60  # more of them for a photo that overlaps with none yet
+EXTRA_CANDIDATES = 60  # further candidates of a photo that overlaps with none or one of these
 _PATCH = 4  # px, half a patch around a feature
 QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue over green
 
 
 @dataclass(frozen=True)
 class PhotoFeatures:
-    """What the comparison needs of one photo: about 150 kB."""
+    """Features and colours of one photo, about 150 kB, from which photos are compared."""
 
     xy: np.ndarray  # [F, 2] float32 px
     descriptors: np.ndarray  # [F, 128] uint8
@@ -49,7 +49,7 @@ class PhotoComparison:
 def photo_features(
     rgb: np.ndarray,  # [H, W, 3] uint8
 ) -> PhotoFeatures:
-    """SIFT features of a photo, with brightness, colour and sharpness around each."""
+    """Find SIFT features of a photo, and measure brightness, colour and sharpness around each."""
     scale = SIDE / max(rgb.shape[:2])
     small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else rgb
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
@@ -62,13 +62,13 @@ def photo_features(
 
 
 def _values(small: np.ndarray, gray: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """`QUANTITIES` in a patch around each feature, [F, 4]."""
+    """Measure `QUANTITIES` in a patch around each feature, [F, 4]."""
     codes = small.astype(np.float32) / 255
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     size = (2 * _PATCH + 1, 2 * _PATCH + 1)
     colour = cv2.blur(linear, size)
     laplacian = cv2.Laplacian(gray, cv2.CV_32F)
-    # Divided by contrast below, so that exposure does not count as sharpness.
+    # Fine detail is divided by contrast below, so that exposure does not count as sharpness.
     fine = np.sqrt(cv2.blur(laplacian * laplacian, size))
     mean = cv2.blur(gray.astype(np.float32), size)
     contrast = np.sqrt(np.maximum(cv2.blur(gray.astype(np.float32) ** 2, size) - mean * mean, 0.0))
@@ -85,7 +85,7 @@ def _values(small: np.ndarray, gray: np.ndarray, xy: np.ndarray) -> np.ndarray:
 
 
 def _coarse_colours(small: np.ndarray) -> np.ndarray:
-    """Mean colours of 8 x 4 cells, less their mean: similar for photos of the same thing."""
+    """Return the mean colours of 8 x 4 cells less their mean, similar for photos of the same thing."""
     cells = cv2.resize(small, (8, 4), interpolation=cv2.INTER_AREA).astype(np.float32).reshape(-1, 3)
     cells -= cells.mean(axis=0)
     return (cells / max(float(np.linalg.norm(cells)), 1e-6)).ravel()
@@ -103,27 +103,27 @@ def compare_photos(
     forward: list[bool] = []
 
     def matched(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
-        found = _match(features[pair[0]], features[pair[1]])
+        matching = _match(features[pair[0]], features[pair[1]])
         step()
-        return found
+        return matching
 
-    def enter(i: int, j: int, found: tuple[np.ndarray, np.ndarray] | None) -> None:
-        if found is None:
+    def enter(i: int, j: int, inliers: tuple[np.ndarray, np.ndarray] | None) -> None:
+        if inliers is None:
             return
         graph[i, j] = graph[j, i] = True
-        forward.append(is_forward(features[i].xy[found[0]], features[j].xy[found[1]]))
-        difference = features[i].values[found[0]] - features[j].values[found[1]]
+        forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]]))
+        difference = features[i].values[inliers[0]] - features[j].values[inliers[1]]
         good = np.isfinite(difference).all(axis=1)
         if good.sum() >= MIN_INLIERS // 2:
             rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
 
     tried = set(candidate_pairs(features))
     ordered = sorted(tried)
-    # OpenCV's random numbers are a thread's own, and each match seeds them.
+    # OpenCV keeps random numbers per thread, and each match seeds them: the result is deterministic.
     with ThreadPoolExecutor(jobs) as pool:
-        for (i, j), found in zip(ordered, pool.map(matched, ordered)):
-            enter(i, j, found)
-    # A photo that overlaps with few is tried against more candidates before it counts as isolated.
+        for (i, j), inliers in zip(ordered, pool.map(matched, ordered)):
+            enter(i, j, inliers)
+    # A photo that overlaps with few others is tried against more candidates before it counts as isolated.
     groups = _groups(graph)
     for i in np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist():
         for j in most_similar(features, i, EXTRA_CANDIDATES):
@@ -138,7 +138,7 @@ def is_forward(
     a: np.ndarray,  # [M, 2] px, matches of one geometry
     b: np.ndarray,  # [M, 2] px
 ) -> bool:
-    """Whether the picture grows or shrinks about a point inside it: motion along the line of sight.
+    """Tell whether the camera moved along the line of sight: the picture grows about a point inside it.
 
     A similarity is fitted to the matches. It must scale by over 3 %, turn by less than it scales, and have
     its fixed point among the matches: near that point there is no parallax.
@@ -157,7 +157,7 @@ def is_forward(
 
 
 def candidate_pairs(features: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
-    """Pairs to match: all of a small capture, else each photo with the next and the most similar ones."""
+    """Choose pairs to match: all of a small capture, else each photo with the next and most similar ones."""
     count = len(features)
     if count <= NEXT_PHOTOS + SIMILAR_PHOTOS:
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
@@ -173,13 +173,13 @@ def candidate_pairs(features: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:
 
 
 def most_similar(features: Sequence[PhotoFeatures], index: int, most: int) -> list[int]:
-    """The photos most similar to one, the most similar first."""
+    """Return the indices of the photos most similar to one, the most similar first."""
     alike = np.array([f.coarse_colours @ features[index].coarse_colours for f in features])
     return [int(j) for j in np.argsort(-alike, kind="stable") if j != index][:most]
 
 
 def _match(a: PhotoFeatures, b: PhotoFeatures) -> tuple[np.ndarray, np.ndarray] | None:
-    """Indices of matching features in both photos; None where the photos do not overlap."""
+    """Return the indices of matching features in each photo; None where the photos do not overlap."""
     if min(len(a.xy), len(b.xy)) < MIN_INLIERS:
         return None
     one, two = _ratio_matches(a.descriptors, b.descriptors)
@@ -197,10 +197,10 @@ def _ratio_matches(
     a: np.ndarray,  # [F, 128] uint8
     b: np.ndarray,  # [G, 128] uint8
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of matches by Lowe's ratio test.
+    """Return the indices of matches that pass Lowe's ratio test.
 
-    By a matrix product: sums of squares of bytes are exact in float32, and it takes a third of the time of
-    OpenCV's matcher (1000 features).
+    Distances come from a matrix product: sums of squares of bytes are exact in float32, and it takes a third
+    of the time of OpenCV's matcher (1000 features).
     """
     x, y = a.astype(np.float32), b.astype(np.float32)
     squared = (x * x).sum(axis=1)[:, None] + (y * y).sum(axis=1)[None] - 2 * (x @ y.T)
@@ -212,7 +212,7 @@ def _ratio_matches(
 
 
 def _solve(count: int, rows: list[tuple[int, int, np.ndarray, float]]) -> np.ndarray:
-    """Offsets [N, 4] whose differences fit the pairs' medians; NaN for photos without a pair."""
+    """Solve for offsets [N, 4] whose differences fit the pairs' medians; NaN for photos without a pair."""
     offsets = np.full((count, len(QUANTITIES)), np.nan)
     if not rows:
         return offsets
@@ -232,7 +232,7 @@ def _solve(count: int, rows: list[tuple[int, int, np.ndarray, float]]) -> np.nda
 
 
 def _groups(graph: np.ndarray) -> np.ndarray:
-    """Connected groups of photos, numbered by size, 0 the largest."""
+    """Number the connected groups of photos by size, 0 the largest."""
     from scipy.sparse.csgraph import connected_components
 
     _, label = connected_components(graph, directed=False)

@@ -74,7 +74,7 @@ def build_scene(
         progress: show bars on standard error.
 
     Raises:
-        AwError: no scene can be built from these photos, masks, lists or settings; says why.
+        AwError: no scene can be built from these photos, masks, lists or settings; the message says why.
     """
     started = time.perf_counter()
     target = Path(os.path.abspath(output))
@@ -101,11 +101,11 @@ def build_scene(
             link=not keep_work,
         )
         work_root = target.parent / f".{target.name}.build"
-        known = _existing(target, stages, overwrite)
-        if known is not None:
-            if not keep_work:  # left by a call that was killed after its last rename
+        finished = _existing(target, stages, overwrite)
+        if finished is not None:
+            if not keep_work:  # an earlier call was killed after its last rename
                 shutil.rmtree(work_root, ignore_errors=True)
-            return BuildResult(target, known, True, time.perf_counter() - started)
+            return BuildResult(target, finished, True, time.perf_counter() - started)
         earlier = work_root.exists()
         work = Workspace(work_root)
         for note in capture.notes:
@@ -117,7 +117,7 @@ def build_scene(
 
 
 def _check_paths(raw: Path | str, target: Path) -> None:
-    """Refuse a scene folder among the photos, and photos that are a scene.
+    """Refuse to write a scene among the photos, and to build from a folder that is a scene already.
 
     Args:
         raw: the capture folder, as given.
@@ -134,16 +134,16 @@ def _check_paths(raw: Path | str, target: Path) -> None:
             f"{target} lies inside {raw}, the folder of photos, which must stay as it is; "
             "choose a folder outside it for -o"
         )
-    found = next((n for n in ("scene.json", "sparse") if (root / n).exists()), None)
-    if found is not None:
+    part = next((n for n in ("scene.json", "sparse") if (root / n).exists()), None)
+    if part is not None:
         raise AwError(
-            f"{raw} is a scene already (it holds {found}): run 'aw bench' on it, or give the folder of the "
+            f"{raw} is a scene already (it holds {part}): run 'aw bench' on it, or give the folder of the "
             "original photos"
         )
 
 
 def _existing(target: Path, stages: Stages, overwrite: bool) -> SceneRecord | None:
-    """scene.json of a scene that is up to date; None if there is work to do.
+    """Return scene.json of a scene that is up to date; None if there is work to do.
 
     Raises:
         AwError: the folder holds something else and may not be replaced.
@@ -190,8 +190,8 @@ def _run(
             "then run the same command again: it goes on from the last finished stage"
         ) from error
     except AwError:
-        # After the user's mistake the new work folder goes; one of an interrupted call stays, also when the
-        # next call has a mistyped option.
+        # After the user's mistake a new work folder is deleted; that of an interrupted call stays, even if
+        # the next call has a mistyped option.
         if not keep_work and not earlier:
             work.remove()
         raise

@@ -1,8 +1,9 @@
 """Place every photo where its partners agree, and name those that have no such place.
 
-COLMAP's mapper places a photo where most of its matches fit. Where a distractor has more matches than the
-place, that is wrong, and nothing in the model tells: it is consistent with itself. Partners tell: a photo
-that a distractor placed fits the few photos that show the distractor alike, in a small part of the picture.
+COLMAP's mapper places a photo where most of its matches fit. If a distractor has more matches than the
+static scene, the photo is placed wrongly, and the model does not show it, as it is consistent with itself.
+Partners do: a photo placed by a distractor fits only the few photos that show the distractor alike, and only
+in a small part of the picture.
 """
 
 from __future__ import annotations
@@ -19,39 +20,39 @@ from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-FITS = 0.5  # share of a motion's matches that fit, from which on a partner agrees
-LEAST_PHOTOS = 3  # of a model
-AGREE = 2  # partners of a photo, at least
-AGREE_NEW = 3  # of a photo that COLMAP did not place, if less than `AREA_NEW` of it agrees
-RIVAL = 0.7  # weight of a second place over that of the first, from which on a photo has two places
-ALIKE_DEG, SAME_DEG = 5.0, 1.0  # between rotations that partners imply; between poses that are one place
-NEAR_DEG = 3.0  # between poses that may be one place, found twice
-SAME_SHARE = 0.1  # of the path's radius, between positions that are one place
-GRID = 12  # cells a side, which a photo's matches cover or not
-LEAST_AREA = 0.2  # of a photo: where less agrees, a distractor may
-AREA_NEW = 0.3  # of a photo that COLMAP did not place, for two partners to be enough
-PLACES = 3  # that are tried for a photo
-RESECTION_PX, RESECTION_LEAST = 6.0, 15  # error and number of the points of a place
-ROUNDS = 8  # of placing anew, besides those that only add photos
-TAKEN_OUT = 2  # times, after which a photo stays out
+FITS = 0.5  # share of a motion's matches that must fit for a partner to agree
+LEAST_PHOTOS = 3  # smallest number of photos of a model
+AGREE = 2  # smallest number of partners that agree with a photo's place
+AGREE_NEW = 3  # the same for a photo that COLMAP did not place, if less than `AREA_NEW` of it agrees
+RIVAL = 0.7  # relative weight of a second place from which on a photo has two places
+ALIKE_DEG, SAME_DEG = 5.0, 1.0  # largest angle of rotations that agree, and of poses that are one place
+NEAR_DEG = 3.0  # largest angle of poses that may be one place found twice
+SAME_SHARE = 0.1  # of the path's radius: largest distance of positions that are one place
+GRID = 12  # cells a side of the grid on which the area of matches is measured
+LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a distractor
+AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two partners are enough
+PLACES = 3  # largest number of places tried for a photo
+RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of the points of a place
+ROUNDS = 8  # rounds of placing anew, besides those that only add photos
+TAKEN_OUT = 2  # times a photo is taken out before it stays out
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
-ADJUSTMENTS, STILL = 3, 2e-3  # joint adjustments at most, and share of observations that end them
+ADJUSTMENTS, STILL = 3, 2e-3  # joint adjustments at most; share of changed observations that ends them
 
 
 @dataclass(frozen=True)
 class Place:
-    """A place of a photo, and what speaks for it."""
+    """A possible pose of a photo, and the evidence for it."""
 
     pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
-    partners: frozenset[int]  # placed photos that agree
-    area: float  # share of the photo, where it has features, that their matches cover
+    partners: frozenset[int]  # placed photos that agree with it
+    area: float  # share of the photo's textured part that their matches cover
     evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)  # motion -> its features
 
     @property
     def weight(self) -> float:
-        """A distractor may have partners, but covers little of the photo."""
+        """Partners times area, because a distractor may have partners but covers little of the photo."""
         return len(self.partners) * self.area
 
 
@@ -59,9 +60,9 @@ class Placement:
     """Poses, points and cameras of a capture, placed by the votes of partners."""
 
     def __init__(self, matched: Matched, database: Path, model: Any, seed: int) -> None:
-        """Begin with COLMAP's model; the database's verified pairs are replaced."""
+        """Start from COLMAP's model; the verified pairs of the database will be replaced."""
         self.matched, self.database, self.model, self.seed = matched, database, model, seed
-        self.pairs: list[list[Pair]] = [[] for _ in matched.ids]  # of every photo
+        self.pairs: list[list[Pair]] = [[] for _ in matched.ids]  # pairs of each photo
         for pair in matched.matches:
             for photo in pair:
                 self.pairs[photo].append(pair)
@@ -69,25 +70,25 @@ class Placement:
         self.poses: dict[int, np.ndarray] = {}  # photo -> [3, 4] camera from world
         self.places: dict[int, Place] = {}  # of the placed photos
         self.left_out: dict[int, str] = {}  # photo -> reason
-        self._take_over(model)
+        self._use_model(model)
 
     def run(self) -> None:
-        """Place all photos anew, one after another, until all stay."""
+        """Place all photos anew, one after another, until none moves."""
         outs = [0] * len(self.matched.ids)
         turn, moved = 0, True
         while moved and turn <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
             before = set(self.poses)
-            self._settle(final=False)
-            moved = self._look(outs, only_out=turn == ROUNDS)
+            self._triangulate_and_adjust(final=False)
+            moved = self._place_all(outs, only_out=turn == ROUNDS)
             turn += not set(self.poses) > before
-        if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust less
-            self._settle(final=True)
+        if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
+            self._triangulate_and_adjust(final=True)
         for photo in range(len(outs)):
             if photo not in self.poses:
                 self.left_out.setdefault(photo, "too few of its points are left")
 
     def cameras(self) -> list[CameraFact]:
-        """Focal length of every camera, with its standard deviation where the adjustment gives one."""
+        """Return the focal length of every camera, with its standard deviation if it can be estimated."""
         numbers: dict[int, list[int]] = {}
         for photo in self.poses:
             numbers.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
@@ -106,7 +107,7 @@ class Placement:
         return facts
 
     def _covariance(self) -> Any:
-        """Of a joint adjustment of the whole model; None where the photos do not determine it."""
+        """Return the covariance of a joint adjustment of the whole model; None if it is not determined."""
         config = pycolmap.BundleAdjustmentConfig()
         for number in self.model.reg_image_ids():
             config.add_image(number)
@@ -118,26 +119,26 @@ class Placement:
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
         return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
 
-    def _look(self, outs: list[int], only_out: bool) -> bool:
-        """Judge the places of all photos; whether one moved, came in or was taken out."""
+    def _place_all(self, outs: list[int], only_out: bool) -> bool:
+        """Place all photos, and tell whether one moved, was added or was taken out."""
         rays, points = self.matched.rays(), _Points.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
         self.places, self.left_out = {}, {}
         for photo in range(len(self.matched.ids)):
-            now = self.poses.get(photo)
-            best, rival = self._best(photo, now, rays, points)
-            few = now is None and best.area < AREA_NEW
+            pose_now = self.poses.get(photo)
+            best, rival = self._best(photo, pose_now, rays, points)
+            few = pose_now is None and best.area < AREA_NEW
             reason = _reason(best, rival, AGREE_NEW if few else AGREE)
-            if reason is None and now is None and (only_out or outs[photo] >= TAKEN_OUT):
+            if reason is None and pose_now is None and (only_out or outs[photo] >= TAKEN_OUT):
                 reason = "its partners do not settle on a place"
             if reason is not None:
                 self.left_out[photo] = reason
-                if now is not None:
+                if pose_now is not None:
                     moves[photo] = None
                     outs[photo] += 1
                 continue
             self.places[photo] = best
-            if not only_out and not self._same(best.pose, now):
+            if not only_out and not self._same(best.pose, pose_now):
                 moves[photo] = best.pose
         for photo, pose in moves.items():
             if pose is None:
@@ -149,7 +150,7 @@ class Placement:
     def _best(
         self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: _Points
     ) -> tuple[Place, Place]:
-        """The place with most weight, and the strongest one elsewhere."""
+        """Return the place with most weight, and the strongest place elsewhere."""
         places = [] if now is None else [self._judge(photo, now, rays)]
         places += [self._judge(photo, pose, rays) for pose in self._resections(photo, points)]
         best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
@@ -159,17 +160,17 @@ class Placement:
                 continue
             evidence = place.evidence
             if _turn_deg(place.pose, best.pose) < NEAR_DEG:
-                # perhaps the same place, less precisely: what fits both speaks for the best
+                # It may be the same place, less precise: evidence for both counts for the best only.
                 evidence = {k: rows for k, rows in evidence.items() if k not in best.evidence}
             elsewhere.append(self._place(photo, place.pose, evidence))
         elsewhere = [place for place in elsewhere if len(place.partners) >= AGREE]
-        dissent = self._dissent(photo, best.partners)
+        dissent = self._rival_by_motions(photo, best.partners)
         if len(dissent.partners) >= AGREE:
             elsewhere.append(dissent)
         return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
 
     def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
-        """What the placed partners say of a place; one agrees if one of its motions fits."""
+        """Collect placed partners' evidence for a place; a partner agrees if one of its motions fits."""
         evidence = {}
         for pair in self.pairs[photo]:
             other = pair[0] + pair[1] - photo
@@ -189,8 +190,8 @@ class Placement:
         partners = frozenset(a + b - photo for (a, b), _ in evidence)
         return Place(pose, partners, self._area(photo, list(evidence.values())), evidence)
 
-    def _dissent(self, photo: int, agree: frozenset[int]) -> Place:
-        """Where most of the other placed partners see the photo: those whose motions turn it alike."""
+    def _rival_by_motions(self, photo: int, agree: frozenset[int]) -> Place:
+        """Return the place that most other placed partners imply, by motions that turn the photo alike."""
         owners, turns, rows = [], [], []
         for pair in self.pairs[photo]:
             other = pair[0] + pair[1] - photo
@@ -211,40 +212,40 @@ class Placement:
         return Place(None, frozenset(owners[k] for k in largest), area)
 
     def _same(self, first: np.ndarray | None, second: np.ndarray | None) -> bool:
-        """Whether two poses are one place."""
+        """Tell whether two poses are one place."""
         if first is None or second is None:
             return False
         apart = float(np.linalg.norm(_centre(first) - _centre(second)))
         return _turn_deg(first, second) < SAME_DEG and apart < SAME_SHARE * self.radius
 
     def _area(self, photo: int, rows: Sequence[np.ndarray]) -> float:
-        """Share of the cells with features of a grid over the photo that hold one of these features."""
+        """Return the share of the photo's grid cells with features that hold one of the features `rows`."""
         if not rows:
             return 0.0
         cells = self.cells[photo]
         return len(np.unique(cells[np.concatenate(rows)])) / len(np.unique(cells))
 
     def _resections(self, photo: int, points: _Points) -> list[np.ndarray]:
-        """Places of a photo among points that two other photos determine: [3, 4] each."""
+        """Find poses [3, 4] of a photo from points that at least two other photos determine."""
         features, xyz = points.matched_with(photo, self.pairs[photo], self.poses)
         pixels = self.matched.features[photo][features]
         options = pycolmap.AbsolutePoseEstimationOptions()
         options.ransac.max_error = RESECTION_PX
         options.ransac.random_seed = self.seed
-        found: list[np.ndarray] = []
+        poses: list[np.ndarray] = []
         left = np.arange(len(features))
-        while len(found) < PLACES and len(left) >= RESECTION_LEAST:
+        while len(poses) < PLACES and len(left) >= RESECTION_LEAST:
             answer = pycolmap.estimate_and_refine_absolute_pose(
                 pixels[left], xyz[left], self.matched.cameras[photo], options
             )
             if answer is None or answer["num_inliers"] < RESECTION_LEAST:
                 break
-            found.append(np.asarray(answer["cam_from_world"].matrix()))
+            poses.append(np.asarray(answer["cam_from_world"].matrix()))
             left = left[~np.asarray(answer["inlier_mask"])]
-        return found
+        return poses
 
-    def _settle(self, *, final: bool) -> None:
-        """Points from all matches that fit the poses, then joint adjustments, finally until all is still."""
+    def _triangulate_and_adjust(self, *, final: bool) -> None:
+        """Triangulate all matches that fit the poses, then adjust jointly; `final`: until nothing changes."""
         matched = self.matched
         matched.write_verified(self.database, matched.fitting(self.poses))
         db = pycolmap.Database.open(str(self.database))
@@ -283,28 +284,28 @@ class Placement:
             self.matched.distorted = False
             for camera in self.matched.cameras:
                 camera.params = [*camera.params[:3], 0.0]
-            self._settle(final=final)
+            self._triangulate_and_adjust(final=final)
             return
-        self._take_over(model)
+        self._use_model(model)
 
-    def _take_over(self, model: Any) -> None:
-        """Cameras and poses of a model."""
+    def _use_model(self, model: Any) -> None:
+        """Use the cameras and poses of a model."""
         self.model = model
         self.matched.take_cameras(model)
         self.poses = self.matched.poses(model)
         centres = np.array([_centre(pose) for pose in self.poses.values()]).reshape(-1, 3)
         apart = np.linalg.norm(centres - np.median(centres, axis=0), axis=1) if len(centres) else np.zeros(1)
-        self.radius = float(np.median(apart))  # of the path
+        self.radius = float(np.median(apart))  # radius of the path of cameras
 
 
 @dataclass
 class _Points:
-    """Points of a model by the features that see them."""
+    """Points of a model, found by the features that observe them."""
 
     matched: Matched
-    rows: list[np.ndarray]  # of every photo: [N] row of `xyz` that a feature sees, -1 without a point
+    rows: list[np.ndarray]  # a photo each: [N] row of `xyz` that a feature observes, -1 without a point
     xyz: np.ndarray  # [P, 3]
-    views: np.ndarray  # [P] photos that see it
+    views: np.ndarray  # [P] number of photos that observe the point
 
     @classmethod
     def read(cls, matched: Matched, model: Any) -> _Points:
@@ -322,7 +323,7 @@ class _Points:
     def matched_with(
         self, photo: int, pairs: Sequence[Pair], poses: Mapping[int, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Features of a photo [K], and the points [K, 3] that their matches see, of two others at least."""
+        """Return features [K] of a photo, and their points [K, 3], which at least two others observe."""
         own = np.zeros(len(self.xyz), int)
         own[np.unique(self.rows[photo][self.rows[photo] >= 0])] = 1
         links = [np.zeros((0, 2), int)]
@@ -338,7 +339,7 @@ class _Points:
 
 
 def pipeline_options(seed: int) -> Any:
-    """COLMAP's, on one thread: bundle adjustment sums in the order of its threads."""
+    """Return COLMAP's options on one thread, because bundle adjustment sums in the order of its threads."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
@@ -347,13 +348,13 @@ def pipeline_options(seed: int) -> Any:
 
 
 def plausible(model: Any) -> bool:
-    """Whether the distortion is that of a lens: few or flat photos leave it free to explain anything."""
+    """Tell whether the distortion is that of a lens: few or flat photos leave it undetermined."""
     low, high = DISTORTIONS
     return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
 
 
 def adjustment_options(distorted: bool, *, final: bool) -> Any:
-    """Joint adjustment in which a match that does not fit counts little, on one thread as above."""
+    """Return options of a joint adjustment on one thread in which a match that does not fit counts little."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = distorted
     options.print_summary = False
@@ -366,7 +367,7 @@ def adjustment_options(distorted: bool, *, final: bool) -> Any:
 
 
 def _reason(best: Place, rival: Place, needed: int) -> str | None:
-    """Why a photo cannot stay at its best place; None if it can."""
+    """Return why a photo cannot stay at its best place; None if it can."""
     if not best.partners:
         return "no placed photo agrees with it on a place"
     if len(best.partners) == 1 < needed:
@@ -381,18 +382,18 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
 
 
 def _cells(features: np.ndarray, width: int, height: int) -> np.ndarray:
-    """[N] cell of a grid over the photo in which each feature [N, 2] lies."""
+    """Return the cell [N] of a grid over the photo in which each feature [N, 2] lies."""
     column, row = np.clip(features / [width, height] * GRID, 0, GRID - 1).astype(int).T
     return column * GRID + row
 
 
 def _centre(pose: np.ndarray) -> np.ndarray:
-    """Position of a camera, of its pose [3, 4] from world."""
+    """Return the position of a camera with pose [3, 4], camera from world."""
     return -pose[:, :3].T @ pose[:, 3]
 
 
 def _turn_deg(first: np.ndarray | None, second: np.ndarray | None) -> float:
-    """Angle between two poses [3, 4]; 180 where one is unknown."""
+    """Return the angle between two poses [3, 4]; 180 where one is unknown."""
     if first is None or second is None:
         return 180.0
     trace = float((first[:, :3] * second[:, :3]).sum())

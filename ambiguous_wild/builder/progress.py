@@ -1,4 +1,4 @@
-"""A progress bar on standard error that threads may step; none where standard error is no terminal."""
+"""A progress bar on standard error that threads may advance; it is hidden where that is no terminal."""
 
 from __future__ import annotations
 

@@ -5,9 +5,11 @@ They are written as JSON with the keys below: a stage's result to stage.json, `S
 
 from __future__ import annotations
 
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import Literal, NotRequired, TypedDict
 
 from ambiguous_wild.core.scene import FileEntry
+
+PlainSettings = dict[str, str | int | bool | None]  # `BuildSettings` as JSON
 
 
 class ExifRecord(TypedDict, total=False):
@@ -65,7 +67,7 @@ class SkippedPhoto(TypedDict):
 
 
 class ScreenResult(TypedDict):
-    """Of the stage `screen`."""
+    """Result of the stage `screen`."""
 
     photos: list[ScreenedPhoto]
     skipped: list[SkippedPhoto]
@@ -73,30 +75,30 @@ class ScreenResult(TypedDict):
 
 
 class MaskResult(TypedDict):
-    """Of the stage `masks`."""
+    """Result of the stage `masks`."""
 
     kept_share: dict[str, float]  # stem -> share of white pixels
     alpha: list[str]  # stems of photos whose alpha hides pixels
 
 
 class FeatureResult(TypedDict):
-    """Of the stage `features`."""
+    """Result of the stage `features`."""
 
     camera: str  # "single", "per-device", "per-folder" or "per-image"
     features: dict[str, int]  # work name -> number
 
 
 class MatchResult(TypedDict):
-    """Of the stage `matches`."""
+    """Result of the stage `matches`."""
 
     matcher: str  # "exhaustive", "sequential" or "retrieval"
-    pairs: int  # tried
-    verified: int  # that show one motion which other pairs confirm
-    planar: int  # of those, where all lies on one plane
+    pairs: int  # pairs tried
+    verified: int  # pairs with a motion that other pairs confirm
+    planar: int  # verified pairs whose matches lie on one plane
 
 
 class ModelSummary(TypedDict):
-    """The model in figures."""
+    """Size and accuracy of a model."""
 
     images: int
     points: int
@@ -105,7 +107,7 @@ class ModelSummary(TypedDict):
 
 
 class CameraFact(TypedDict):
-    """A camera as the photos determine it."""
+    """A camera with the focal length that the photos determine."""
 
     photos: list[str]  # work names; sources in scene.json
     focal_px: float
@@ -113,7 +115,7 @@ class CameraFact(TypedDict):
 
 
 class MappingResult(TypedDict):
-    """Of the stage `mapping`."""
+    """Result of the stage `mapping`."""
 
     model: ModelSummary | None
     left_out: dict[str, str]  # work name of a photo that is not placed -> reason
@@ -123,27 +125,27 @@ class MappingResult(TypedDict):
 
 
 class UndistortResult(TypedDict):
-    """Of the stage `undistort`."""
+    """Result of the stage `undistort`."""
 
     truth: dict[str, int] | None  # part of the truth -> photos that have it
 
 
 class MotionResult(TypedDict):
-    """Of the stage `motion`: features of the train photos."""
+    """Result of the stage `motion`: numbers of features of the train photos."""
 
     static: int
-    moving: int  # they fit another motion than the place's
-    silent: int  # photos without any
+    moving: int  # they fit another motion than that of the static scene
+    silent: int  # photos without such features
 
 
 class DownsampleResult(TypedDict):
-    """Of the stage `downsample`."""
+    """Result of the stage `downsample`."""
 
     size: list[int]  # width and height of most photos, px
 
 
 class PackageResult(TypedDict):
-    """Of the stage `package`."""
+    """Result of the stage `package`."""
 
     files: int
     bytes: int
@@ -157,7 +159,7 @@ class LostPhoto(TypedDict):
 
 
 class ChosenMethods(TypedDict):
-    """What the settings "auto" became, and the model that was taken."""
+    """The choices that the settings "auto" led to."""
 
     camera: str
     sfm: str  # "fast", "wider" or "thorough"
@@ -166,7 +168,7 @@ class ChosenMethods(TypedDict):
 
 
 class SceneCounts(TypedDict):
-    """How many of what the build found."""
+    """Numbers of photos, cameras, points, pairs and features."""
 
     photos: int
     readable: int
@@ -179,8 +181,8 @@ class SceneCounts(TypedDict):
     points_of_track_length_2: int
     pairs: int
     pairs_verified: int
-    features_that_stay: int  # features of train photos that fit the place in others
-    features_that_move: int  # that fit another motion
+    features_that_stay: int  # features of train photos that are static by other photos
+    features_that_move: int  # features of train photos that fit another motion
 
 
 class ScenePhoto(TypedDict):
@@ -200,18 +202,18 @@ class ScenePhoto(TypedDict):
 
 
 class BuildInputs(TypedDict):
-    """Everything that the scene's files follow from."""
+    """Everything that the scene's files depend on."""
 
     photos: list[list[str | None]]  # source, stem, side, sha256, and "copy" where it is one
     masks: list[list[str]] | None  # path and sha256 of every file
     truth: list[list[str]] | None
     test_list: str | None  # sha256
-    settings: dict[str, Any]  # `BuildSettings` as plain data
+    settings: PlainSettings
     versions: dict[str, str]
 
 
 class BuildRecord(TypedDict):
-    """What the build found; the part of scene.json that a person reads."""
+    """Result of a build: the part of scene.json that a person reads."""
 
     name: str
     license: str
@@ -219,7 +221,7 @@ class BuildRecord(TypedDict):
     images: str
     split: str  # "list", "folders" or "every-8"
     seed: int
-    settings: dict[str, Any]  # `BuildSettings` as plain data
+    settings: PlainSettings
     chosen: ChosenMethods
     counts: SceneCounts
     reprojection_error_px: float

@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -55,7 +55,7 @@ def scene_record(
     masks: MaskResult | None,
     warnings: list[str],
 ) -> BuildRecord:
-    """scene.json without its files, inputs and timings."""
+    """Assemble scene.json without its files, inputs and timings."""
     facts = screened["photos"]
     lost = _lost_photos(facts, mapping["left_out"], features["features"])
     summary = mapping["model"]
@@ -115,7 +115,7 @@ def scene_record(
 
 
 def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[int, int]:
-    """(points seen in test photos only, points of track length 2): leaked, and poorly determined."""
+    """Count the points that only test photos see (leaked) and those of track length 2 (poorly determined)."""
     points = model.points
     tests = [i.image_id for i in model.images.values() if names[i.name] in test]
     lengths = np.diff(points.track_offsets)
@@ -128,7 +128,7 @@ def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[i
 
 
 def parallax_deg(model: Model) -> float:
-    """Median over points of the widest angle between its first ray and another; NaN without points."""
+    """Return the median over points of the widest angle between first ray and another; NaN without points."""
     points = model.points
     owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.track_offsets))
     numbers = sorted(model.images)
@@ -138,7 +138,7 @@ def parallax_deg(model: Model) -> float:
     rows = np.array([at[int(i)] for i in points.track_image_ids], dtype=np.intp)
     rays = centres[rows] - points.xyz[owner]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-    # The widest angle of all pairs is at most twice that, at quadratic cost.
+    # The widest angle between any two rays is at most twice this one, but costs quadratic time.
     first = rays[points.track_offsets[owner]]
     angles = np.zeros(len(points.xyz))
     np.maximum.at(angles, owner, np.arccos(np.clip((rays * first).sum(axis=1), -1.0, 1.0)))
@@ -146,7 +146,7 @@ def parallax_deg(model: Model) -> float:
 
 
 def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
-    """One line: the counts, and the next command."""
+    """Return one line with the counts and the next command."""
     counts = info["counts"]
     points = f"{counts['points']:,}".replace(",", " ")
     named = f", {len(info['lost'])} left out without a clear place" if info["lost"] else ""
@@ -160,31 +160,32 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
 
 
 def summary_lines(info: SceneRecord) -> list[str]:
-    """The split, the lost photos and every warning."""
+    """Return the lines about the split, the lost photos and every warning."""
     counts = info["counts"]
-    found = [f"{counts['train']} training and {counts['test']} test photos (split: {info['split']})"]
+    lines = [f"{counts['train']} training and {counts['test']} test photos (split: {info['split']})"]
     if info["lost"]:
         reasons = shortlist([f"{p['source']} ({p['reason']})" for p in info["lost"]], 4)
-        found.append(f"{len(info['lost'])} not placed: {reasons}")
-    return found + [f"warning: {w}" for w in info["warnings"]]
+        lines.append(f"{len(info['lost'])} not placed: {reasons}")
+    return lines + [f"warning: {w}" for w in info["warnings"]]
 
 
 def sfm_share(info: SceneRecord) -> float:
-    """Share of the build's time that COLMAP took, 0 to 1."""
+    """Return the share of the build's time that COLMAP took, 0 to 1."""
     seconds = info["seconds"]
     return sum(seconds.get(s, 0.0) for s in SFM_STAGES) / max(sum(seconds.values()), 1e-9)
 
 
 def what_changed(
-    old: Mapping[str, Any],  # `BuildInputs` of any version of ours
+    old: Mapping[str, object],  # `BuildInputs`, perhaps of another version
     new: BuildInputs,
 ) -> str:
-    """The inputs that differ, for the message that refuses to overwrite."""
+    """Name the inputs that differ, for the message that refuses to overwrite."""
     pairs = {k: v for k, v in new.items() if k not in ("settings", "versions")}
     parts = [k.replace("_", " ") for k, v in pairs.items() if old.get(k) != v]
-    groups: dict[str, Mapping[str, Any]] = {"settings": new["settings"], "versions": new["versions"]}
+    groups: dict[str, Mapping[str, object]] = {"settings": new["settings"], "versions": new["versions"]}
     for group, values in groups.items():
-        before = old.get(group) or {}
+        earlier = old.get(group)
+        before = earlier if isinstance(earlier, dict) else {}
         changed = [f"{k} {before.get(k)} -> {v}" for k, v in values.items() if before.get(k) != v]
         parts += [f"{group} ({shortlist(changed)})"] if changed else []
     return ", ".join(parts) or "inputs"
@@ -193,7 +194,7 @@ def what_changed(
 def _lost_photos(
     facts: list[ScreenedPhoto], left_out: dict[str, str], features: dict[str, int]
 ) -> list[LostPhoto]:
-    """The readable photos that are not in the scene, each with the reason."""
+    """List the readable photos that are not in the scene, each with the reason."""
     lost: list[LostPhoto] = []
     for fact in facts:
         count = features.get(fact["work_name"], 0)
@@ -224,7 +225,7 @@ def _photo(
 
 
 def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> list[str]:
-    """Cameras whose focal length contradicts their photos' EXIF."""
+    """Warn of cameras whose focal length contradicts their photos' EXIF."""
     stated = {f["source"]: (exif_focal(f), max(f["width"], f["height"])) for f in facts}
     odd = []
     for camera in cameras:

@@ -1,11 +1,11 @@
-"""Pairs of photos to match, where matching all of them would take too long: those likely to overlap.
+"""Choose pairs of photos that are likely to overlap, where matching all pairs would take too long.
 
-By the order of capture, and by SIFT features.
-Each photo's descriptors become one vector (VLAD: Jegou et al., CVPR 2010): per visual word the sum of the
-differences to it, each scaled to unit length. Similar vectors show the same surfaces. Then the largest few
-hundred features of each pair are matched, which survive changes of size best (preemptive matching: Wu, 3DV
-2013); a match is mutual and passes the ratio test. On 66 photos of a smooth skull the 815 pairs chosen so
-(20 a photo) hold 0.96 of those that COLMAP verifies among all 2145; the 700 most similar by VLAD hold 0.74.
+Pairs are chosen by the order of capture and by SIFT features. Each photo's descriptors become one vector
+(VLAD: Jegou et al., CVPR 2010): per visual word the sum of the differences to it, each scaled to unit length.
+Photos with similar vectors show the same surfaces. Then the largest few hundred features of each pair, which
+survive changes of size best, are matched (preemptive matching: Wu, 3DV 2013); a match is mutual and passes
+the ratio test. On 66 photos of a smooth skull the 815 pairs chosen so (20 a photo) hold 0.96 of those that
+COLMAP verifies among all 2145; the 700 most similar by VLAD hold 0.74.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-PAIRS = "pairs.txt"  # in the stage's folder: what was matched
-MOTIONS = "motions.npz"  # beside it: the motions of each pair
+PAIRS = "pairs.txt"  # file in the stage's folder that lists the matched pairs
+MOTIONS = "motions.npz"  # file beside it with the motions of each pair
 OVERLAP = 10  # neighbours on each side
 FAST_EXHAUSTIVE_LIMIT = 25  # photos
 EXHAUSTIVE_LIMIT = 200  # photos; 19 900 pairs, about nine minutes on two cores at 3000 features
-LARGEST = 400  # features of a photo; 300 find less
-RATIO = 0.8  # of the angles to the nearest and the second
+LARGEST = 400  # features of a photo that are matched; with 300 fewer pairs are right
+RATIO = 0.8  # of the angle to the nearest descriptor over that to the second nearest
 FARTHEST = 0.7  # radians between two descriptors that match
-CHANCE = 5  # matches; below it only the best few pairs of a photo are kept
-KEPT = 4  # those
+CHANCE = 5  # matches that may be chance: with fewer, only the best pairs of a photo are kept
+KEPT = 4  # number of these best pairs
 WORDS = 64  # visual words
 SAMPLE = 20_000  # descriptors that the words are learnt from
-MOST = 1500  # descriptors of a photo that count: the largest features come first in COLMAP
+MOST = 1500  # descriptors of a photo that are used: the largest features come first in COLMAP
 SIMILAR = 16  # photos that each is matched with, unless a plan says otherwise
-NEIGHBOURS = 5  # next photos in the order of capture, likewise
-ALL_PAIRS = 100  # photos; 4950 pairs are looked at in about 10 s of a core
+NEIGHBOURS = 5  # next photos in the order of capture that each is matched with, likewise
+ALL_PAIRS = 100  # photos up to which every pair is compared; 4950 pairs take about 10 s of a core
 SHORTLIST = 3
 _ROWS = 256  # photos compared at a time
 _ROUNDS = 12  # of k-means
@@ -41,7 +41,7 @@ def embed(
     names: Sequence[str],
     seed: int = 0,
 ) -> np.ndarray:  # [N, WORDS * 128] float32, unit length; zero where a photo has no features
-    """One vector a photo; holds one photo's descriptors at a time."""
+    """Compute one vector a photo, with one photo's descriptors in memory at a time."""
     generator = np.random.default_rng(seed)
     share = max(1, SAMPLE // max(len(names), 1))
     sample = []
@@ -59,7 +59,7 @@ def embed(
 
 
 def _words(sample: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """k-means from random rows; an empty word stays where it is."""
+    """Learn visual words by k-means from random rows; a word without descriptors stays where it is."""
     count = min(WORDS, len(sample))
     words = sample[generator.permutation(len(sample))[:count]]
     for _ in range(_ROUNDS):
@@ -93,7 +93,7 @@ def most_similar(
     among: Sequence[int],  # rows that may be partners
     count: int = SIMILAR,
 ) -> list[tuple[int, int]]:
-    """(query, partner) pairs, at most `count` a query, the most similar first; equal ones by row."""
+    """Return (query, partner) pairs, at most `count` a query, the most similar first; equal ones by row."""
     pool = np.array(among, np.intp)
     pairs: list[tuple[int, int]] = []
     for start in range(0, len(queries), _ROWS):
@@ -116,16 +116,16 @@ def retrieval_pairs(
     seed: int = 0,
     jobs: int = 1,
 ) -> list[tuple[str, str]]:
-    """Each photo with those that share most features and, but for a separate test set, the next ones.
+    """Pair each photo with those that share most features and with the next ones in the order of capture.
 
-    Up to `ALL_PAIRS` photos, every pair is looked at; above, each photo and the `SHORTLIST` times `similar`
-    photos with the most similar vectors.
+    Photos of a separate test set get no next ones. Up to `ALL_PAIRS` photos every pair is compared; above,
+    each photo is compared with the `SHORTLIST` times `similar` photos that have the most similar vectors.
 
     Args:
-        read: called several times a name.
-        names: in the order of capture.
-        test_names: those of a separate test set.
-        similar: photos that each is matched with, at most.
+        read: returns the descriptors of a photo; called several times a name.
+        names: photos in the order of capture.
+        test_names: photos of a separate test set.
+        similar: largest number of photos that each is matched with.
         neighbours: next photos that each is matched with.
         only: photos that look for partners; None: all.
         seed: of the visual words.
@@ -157,7 +157,7 @@ def pairs_of_tests(
     test_names: set[str],
     count: int = 2 * SIMILAR,
 ) -> list[tuple[str, str]]:
-    """Photos of a separate test set with the most similar photos of the walk and of the test set."""
+    """Pair photos of a separate test set with the most similar photos of the walk and of the test set."""
     walk = [i for i, name in enumerate(names) if name not in test_names]
     tests = [i for i, name in enumerate(names) if name in test_names]
     pairs = {(min(a, b), max(a, b)) for a, b in most_similar(vectors, tests, walk, count)}
@@ -166,14 +166,14 @@ def pairs_of_tests(
 
 
 def sequential_pairs(names: list[str], test_names: set[str]) -> list[tuple[str, str]]:
-    """Neighbours in the given order, and photos 2^k further on.
+    """Pair neighbours in the given order, and photos 2^k further on.
 
     Photos of a separate test set are not part of the walk: their neighbours by name are other test photos.
     `pairs_of_tests` finds their partners.
 
     Args:
-        names: in the order of capture.
-        test_names: those of a separate test set; may be empty.
+        names: photos in the order of capture.
+        test_names: photos of a separate test set; may be empty.
 
     Returns:
         Each pair once, in a fixed order.
@@ -189,7 +189,7 @@ def shared_features(
     pairs: Iterable[tuple[int, int]],
     jobs: int,
 ) -> dict[tuple[int, int], int]:
-    """(a, b) with a < b -> matches; the same for any number of jobs."""
+    """Count the matches of each pair (a, b) with a < b; the result does not depend on `jobs`."""
     units = [unit(read(name)[:LARGEST]) for name in names]
     todo = sorted({(min(a, b), max(a, b)) for a, b in pairs if a != b})
     with ThreadPoolExecutor(jobs) as pool:
@@ -198,7 +198,7 @@ def shared_features(
 
 
 def unit(rows: np.ndarray) -> np.ndarray:
-    """Descriptors [F, 128] as float32 of unit length."""
+    """Scale descriptors [F, 128] to float32 of unit length."""
     values = rows.astype(np.float32)
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
 
@@ -217,14 +217,14 @@ def _matches(a: np.ndarray, b: np.ndarray) -> int:
 
 
 def best_partners(shared: Mapping[tuple[int, int], int], wanted: Mapping[int, int]) -> set[tuple[int, int]]:
-    """Of each photo its best pairs, `wanted` at most, but no more than `KEPT` that look like chance."""
+    """Choose the best pairs of each photo, at most `wanted`, and at most `KEPT` that may be chance."""
     partners: dict[int, list[tuple[int, int]]] = {}
     for (a, b), count in shared.items():
         partners.setdefault(a, []).append((-count, b))
         partners.setdefault(b, []).append((-count, a))
-    found = set()
+    best = set()
     for photo, most in wanted.items():
         for rank, (minus, other) in enumerate(sorted(partners.get(photo, []))[:most]):
             if -minus >= CHANCE or rank < KEPT:
-                found.add((min(photo, other), max(photo, other)))
-    return found
+                best.add((min(photo, other), max(photo, other)))
+    return best

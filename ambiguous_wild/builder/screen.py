@@ -1,8 +1,7 @@
 """Second stage: read every photo, leave out damaged files and copies, warn of blur and changed settings.
 
-Phones add one photo in two formats, bursts, and videos of live photos.
-
-Every warning states the number behind it.
+What phones add is recognised too: one photo in two formats, bursts, videos of live photos. Every warning
+states the number behind it.
 """
 
 from __future__ import annotations
@@ -45,9 +44,9 @@ class ReadCapture(Generic[More]):
 
     photos: list[PhotoRecord]
     thumbnails: np.ndarray  # [N, 1024], see `thumbnail`
-    more: list[More]  # of each photo
-    copies: dict[str, str]  # relative name of a copy or another format -> that of the photo that is used
-    skipped: list[SkippedPhoto]  # with the copies
+    more: list[More]  # what the caller's function returned for each photo
+    copies: dict[str, str]  # relative name of a copy or of another format -> name of the photo that is used
+    skipped: list[SkippedPhoto]  # unreadable photos and copies
 
 
 def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar) -> ScreenResult:
@@ -68,7 +67,7 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
         bar=bar,
     )
     for path in photos.iterdir():
-        if path.name not in read.more:  # there in another format too
+        if path.name not in read.more:  # left out: another format of the same photo is used
             path.unlink()
     facts: list[ScreenedPhoto] = [
         {
@@ -98,11 +97,11 @@ def read_capture(
     jobs: int,
     bar: Bar,
 ) -> ReadCapture[More]:
-    """Read every photo once; copies, and photos that are there in another format too, are left out.
+    """Read every photo once; leave out copies, and the second format of a photo saved in two formats.
 
     Args:
-        capture: its photos.
-        more: called with each photo and its pixels [H, W, 3] uint8.
+        capture: the photos to read.
+        more: called with each photo and its pixels [H, W, 3] uint8; its results are returned.
         strict: refuse a photo that cannot be read.
         jobs: threads; each holds one photo.
         bar: progress.
@@ -132,14 +131,14 @@ def read_capture(
         good = [row for row in good if row[0]["source"] not in twins]
         copies = copies | twins
     _refuse_bad(capture, unreadable, copies, len(good), strict)
-    photos, thumbnails, found = zip(*good)
+    photos, thumbnails, results = zip(*good)
     return ReadCapture(
-        list(photos), np.stack(thumbnails), list(found), copies, [*unreadable, *_copy_rows(copies)]
+        list(photos), np.stack(thumbnails), list(results), copies, [*unreadable, *_copy_rows(copies)]
     )
 
 
 def photo_record(source: Source, photo: Photo, pixels: np.ndarray) -> PhotoRecord:
-    """Size, EXIF, blur and brightness of one photo."""
+    """Measure size, EXIF, blur and brightness of one photo."""
     exif = {k: v for k, v in dataclasses.asdict(photo.exif).items() if v is not None}
     return {
         "source": source.relative,
@@ -157,10 +156,10 @@ def photo_record(source: Source, photo: Photo, pixels: np.ndarray) -> PhotoRecor
 
 
 def without_copies(capture: Capture) -> tuple[list[Source], dict[str, str]]:
-    """The photos to use, and the copies to leave out: relative name -> the first file with the same bytes.
+    """Return the photos to use, and the copies to leave out: relative name -> first file with the same bytes.
 
-    Of two copies one could train and the other test, which leaks test data. In a capture with train/ and
-    test/ the copies stay, and a warning names them.
+    One of two copies could be a training photo and the other a test photo, which leaks test data. In a
+    capture with train/ and test/ the copies stay, and a warning names them.
     """
     if capture.has_sides:
         return list(capture.sources), {}
@@ -176,7 +175,7 @@ def without_copies(capture: Capture) -> tuple[list[Source], dict[str, str]]:
 def sharpness(
     rgb: np.ndarray,  # [H, W, 3] uint8
 ) -> float:
-    """Variance of the Laplacian of grey at `BLUR_SIDE` px (Pech-Pacheco et al., ICPR 2000)."""
+    """Return the variance of the Laplacian of grey at `BLUR_SIDE` px (Pech-Pacheco et al., ICPR 2000)."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     scale = BLUR_SIDE / max(gray.shape)
     if scale < 1:
@@ -187,7 +186,7 @@ def sharpness(
 def thumbnail(
     rgb: np.ndarray,  # [H, W, 3] uint8
 ) -> np.ndarray:  # [1024] float32, zero mean, unit length
-    """The photo at 32 x 32 grey, normalised: the dot product of two is their correlation."""
+    """Reduce the photo to 32 x 32 grey, normalised: the dot product of two is their correlation."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(gray, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).astype(np.float32)
     small -= small.mean()
@@ -195,42 +194,42 @@ def thumbnail(
 
 
 def drift_warnings(facts: Sequence[PhotoRecord]) -> list[str]:
-    """Blurred photos, and camera settings that changed within the capture."""
-    found = []
+    """Warn of blurred photos, and of camera settings that changed within the capture."""
+    warnings = []
     blur = np.array([f["blur"] for f in facts])
     limit = BLUR_RATIO * float(np.median(blur))
     soft = [f["source"] for f, b in zip(facts, blur) if b < limit]
     if soft:
-        found.append(
+        warnings.append(
             f"{len(soft)} photos are blurred (Laplacian variance under {limit:.0f}, a fifth of the "
             f"capture's median): {shortlist(soft)}"
         )
     stops = [s for f in facts if (s := exposure_stops(f["exif"])) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_STOPS:
-        found.append(
+        warnings.append(
             f"exposure settings span {max(stops) - min(stops):.1f} stops: appearance changes between photos"
         )
     balances = {f["exif"]["white_balance"] for f in facts if "white_balance" in f["exif"]}
     if len(balances) > 1:
-        found.append("white balance is automatic in some photos and manual in others: colours may shift")
+        warnings.append("white balance is automatic in some photos and manual in others: colours may shift")
     for camera in sorted({f["camera"] for f in facts if f["camera"]}):
         focal = [f["exif"]["focal_mm"] for f in facts if f["camera"] == camera and "focal_mm" in f["exif"]]
         if focal and max(focal) > 1.01 * min(focal):
-            found.append(f"{camera} was zoomed: {min(focal):.1f} to {max(focal):.1f} mm")
+            warnings.append(f"{camera} was zoomed: {min(focal):.1f} to {max(focal):.1f} mm")
     if len({(f["width"], f["height"]) for f in facts}) > 1:
-        found.append(f"photos have {len({(f['width'], f['height']) for f in facts})} different sizes")
-    return found + panorama_warnings(facts)
+        warnings.append(f"photos have {len({(f['width'], f['height']) for f in facts})} different sizes")
+    return warnings + panorama_warnings(facts)
 
 
 def panorama_warnings(facts: Sequence[PhotoRecord]) -> list[str]:
-    """Photos of the shape of 360 degree photos, which say so in XMP unless a tool dropped it."""
+    """Warn of photos shaped like 360 degree photos: a tool may have dropped the XMP data that says so."""
     wide = [f["source"] for f in facts if f["width"] == 2 * f["height"]]
     name = f"{len(wide)} photos are 2:1, as 360 degree photos are ({shortlist(wide, 2)})"
     return [f"{name}: {SPLIT_PANORAMAS}"] if wide else []
 
 
 def exposure_stops(exif: ExifRecord) -> float | None:
-    """log2(t ISO / N^2), up to a constant; None where EXIF has no exposure time."""
+    """Return log2(t ISO / N^2), up to a constant; None where EXIF has no exposure time."""
     if "exposure_s" not in exif:
         return None
     return math.log2(exif["exposure_s"] * exif.get("iso", 100.0) / exif.get("f_number", 1.0) ** 2)
@@ -252,18 +251,18 @@ def _near_duplicates(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> li
 
 
 def _format_twins(facts: Sequence[PhotoRecord], thumbnails: Sequence[np.ndarray]) -> dict[str, str]:
-    """Photos that are there in another format too: source -> the source that is kept.
+    """Find photos saved in two formats: source to leave out -> source to keep.
 
     Phones save or export IMG_1.HEIC and IMG_1.JPG. The larger one is kept, of equal ones the first by name.
 
     Args:
         facts: photos that can be read.
-        thumbnails: [1024] each, of `thumbnail`.
+        thumbnails: [1024] each, as `thumbnail` returns them.
     """
     groups: dict[str, list[int]] = {}
     for index, fact in enumerate(facts):
         groups.setdefault(str(PurePosixPath(fact["source"]).with_suffix("")).casefold(), []).append(index)
-    found = {}
+    twins = {}
     for members in groups.values():
         if len(members) < 2:
             continue
@@ -275,12 +274,12 @@ def _format_twins(facts: Sequence[PhotoRecord], thumbnails: Sequence[np.ndarray]
                 and len(suffixes) == 2
                 and float(thumbnails[first] @ thumbnails[other]) > NEAR_DUPLICATE
             ):
-                found[facts[other]["source"]] = facts[first]["source"]
-    return found
+                twins[facts[other]["source"]] = facts[first]["source"]
+    return twins
 
 
 def _burst_warnings(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> list[str]:
-    """Runs of near-identical photos of one camera, taken within the same second."""
+    """Warn of runs of near-identical photos that one camera took within the same second."""
     groups: dict[tuple[str | None, str], list[int]] = {}
     for index, fact in enumerate(facts):
         taken = fact["exif"].get("taken_at")
@@ -294,14 +293,13 @@ def _burst_warnings(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> lis
     if not bursts:
         return []
     return [
-        f"{len(bursts)} bursts of near-identical photos of one second: {shortlist(bursts, 3)}; keep "
-        "the sharpest "
-        "of each: where every 8th photo tests, its neighbours of the burst train"
+        f"{len(bursts)} bursts of near-identical photos of one second: {shortlist(bursts, 3)}; keep the "
+        "sharpest of each, or training photos may show nearly the same as test photos"
     ]
 
 
 def _live_photo_warnings(capture: Capture) -> list[str]:
-    """Videos that belong to photos of the same name."""
+    """Warn of videos that belong to photos of the same name."""
     stems = {PurePosixPath(s.relative).stem.casefold() for s in capture.sources}
     videos = [
         name
@@ -332,16 +330,16 @@ def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> 
 
 
 def _attributes(photo: Photo) -> dict[str, str | int | float]:
-    """EXIF under OpenImageIO's names."""
+    """Return EXIF values under OpenImageIO's names."""
     if photo.format == "heic":
         exif = photo.exif
-        known = {
+        values = {
             "Make": exif.make,
             "Model": exif.model,
             "Exif:FocalLength": exif.focal_mm,
             "Exif:FocalLengthIn35mmFilm": None if exif.focal_35mm is None else int(exif.focal_35mm),
         }
-        return {key: value for key, value in known.items() if value is not None}
+        return {key: value for key, value in values.items() if value is not None}
     import OpenImageIO as oiio
 
     return {
@@ -354,12 +352,12 @@ def _attributes(photo: Photo) -> dict[str, str | int | float]:
 
 def _identical_warning(group: list[str]) -> str:
     sides = {name.partition("/")[0] for name in group}
-    leak = ": one trains and one tests, which leaks test data into training" if len(sides) > 1 else ""
+    leak = ": in train/ and in test/, which leaks test data into training" if len(sides) > 1 else ""
     return f"identical files: {shortlist(group)}{leak}"
 
 
 def _copy_rows(copies: dict[str, str]) -> list[SkippedPhoto]:
-    """The copies as photos that are left out."""
+    """Record the copies as photos that are left out."""
     return [{"source": copy, "skipped": f"{_sameness(copy, kept)} {kept}"} for copy, kept in copies.items()]
 
 

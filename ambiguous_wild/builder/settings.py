@@ -1,6 +1,6 @@
-"""Settings of a build, as scene.json records them, and the plans of structure from motion that follow.
+"""Settings of a build, as scene.json records them, and the plans of structure from motion they lead to.
 
-A model is built with little work first, then, if that leaves photos out, with more.
+The first plan costs little; if it leaves photos out, the next one does more work.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ Mapper = Literal["incremental", "global"]
 Effort = Literal["auto", "fast", "thorough"]
 
 
-WIDER = 40  # partners of a photo that was left out
-ENOUGH = 0.9  # placed: the rest has no clear place, which more pairs seldom give
-HALF = 0.5  # placed after that: where fewer are, matching everything cannot make it worse
-MOST_FEATURES = 100_000  # a photo; SIFT finds fewer in any
+WIDER = 40  # partners in the second attempt of a photo that was left out
+ENOUGH = 0.9  # placed share that ends the attempts: more pairs seldom place the rest
+HALF = 0.5  # placed share below which all pairs are matched in the end: it cannot make the model worse
+MOST_FEATURES = 100_000  # largest --max-features; SIFT finds fewer in any photo
 
 
 @dataclass(frozen=True)
@@ -56,23 +56,23 @@ class BuildSettings:
 
 @dataclass(frozen=True)
 class SfmPlan:
-    """What an attempt does; `benchmarks/results/poses.md` compares them on real captures."""
+    """Settings of one attempt; `benchmarks/results/poses.md` compares the plans on real captures."""
 
     name: str  # "fast", "wider" or "thorough"
-    sift: str  # whose: "opencv", or "colmap", which takes three to five times as long
+    sift: str  # implementation: "opencv", or "colmap", which takes three to five times as long
     matcher: str  # "exhaustive", "retrieval" or "sequential"
     similar: int  # photos that each is matched with, for "retrieval"
     neighbours: int  # next photos in the order of capture, for "retrieval"
-    growth: float  # all cameras are adjusted when the model has grown so many times
+    growth: float  # all cameras are adjusted whenever the model has grown by this factor
     refinements: int  # rounds of such an adjustment, at most
     local_refinements: int  # rounds of the adjustment after a photo was placed, at most
     local_cameras: int  # cameras in that adjustment: the new one and those that share most points with it
     continues: bool = False  # only photos left out so far look for partners, besides the pairs matched so far
-    below: float = 1.0  # the plan is for captures of which a smaller share is placed so far
+    below: float = 1.0  # the plan runs only if a smaller share of the photos is placed so far
 
 
 def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPlan]:
-    """The attempts in order; the next is made where one leaves photos out."""
+    """Return the attempts in order; each next one runs if the one before leaves photos out."""
     thorough = _thorough(len(photos), settings)
     if settings.sfm == "thorough":
         return [thorough]

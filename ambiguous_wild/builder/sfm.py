@@ -1,6 +1,6 @@
 """Structure from motion: the stages features, matches and mapping, each in a child process.
 
-Jobs of that process are written as JSON; `sfm_worker` reads them.
+A job for that process is written as JSON, which `sfm_worker` reads.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from ambiguous_wild.builder.records import (
 )
 from ambiguous_wild.builder.retrieval import MOTIONS, PAIRS
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
-from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.files import write_json
 
@@ -38,7 +37,7 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
 
 class FeatureJob(TypedDict):
-    """Extract features."""
+    """Job: extract features."""
 
     task: Literal["features"]
     database: str
@@ -47,47 +46,53 @@ class FeatureJob(TypedDict):
     camera: str
     groups: list[list[str]]  # names that share a camera, where the camera is "per-device" or "per-folder"
     masks: str | None  # folder
-    settings: dict[str, Any]  # `BuildSettings`
-    plan: dict[str, Any]  # `SfmPlan`
+    max_features: int
+    max_side: int  # px
+    sift: str  # of `SfmPlan`
     seed: int
     jobs: int
     parent: NotRequired[int]  # process id, added when the job is written
 
 
 class MatchJob(TypedDict):
-    """Match and verify pairs."""
+    """Job: match and verify pairs."""
 
     task: Literal["matches"]
     database: str
     names: list[str]
     test_names: list[str]
-    plan: dict[str, Any]  # `SfmPlan`
+    matcher: str  # of `SfmPlan`, as the two below
+    similar: int
+    neighbours: int
     only: list[str] | None  # names that look for partners; None: all
-    focals: dict[str, float] | None  # name -> over the longer side, by EXIF; None: poses are known
-    earlier: str | None  # file of pairs that the database holds matched
+    focals: dict[str, float] | None  # name -> EXIF focal length over the longer side; None: poses are known
+    earlier: str | None  # file of the pairs that are matched already
     seed: int
     jobs: int
     parent: NotRequired[int]
 
 
 class MappingJob(TypedDict):
-    """Build models."""
+    """Job: build models."""
 
     task: Literal["mapping"]
     database: str
-    motions: str  # file of the stage before
+    motions: str  # file that the stage `matches` wrote
     photos: str  # folder
     output: str  # folder
     progress: str  # file that holds the number of placed photos
     mapper: str
-    plan: dict[str, Any]  # `SfmPlan`
+    growth: float  # of `SfmPlan`, as the three below
+    refinements: int
+    local_refinements: int
+    local_cameras: int
     seed: int
     jobs: int
     parent: NotRequired[int]
 
 
 class TriangulationJob(TypedDict):
-    """Triangulate points with known poses."""
+    """Job: triangulate points with known poses."""
 
     task: Literal["triangulation"]
     database: str
@@ -99,7 +104,7 @@ class TriangulationJob(TypedDict):
 
 
 class MotionJob(TypedDict):
-    """Find the motions of matched pairs whose cameras are known."""
+    """Job: find the motions of matched pairs whose cameras are known."""
 
     task: Literal["motions"]
     database: str
@@ -118,7 +123,7 @@ class SfmCrash(AwError):
 
 
 def choose_camera(photos: Sequence[PhotoRecord], wanted: str) -> str:
-    """ "single", "per-device", "per-folder" or "per-image".
+    """Choose which photos share a camera: "single", "per-device", "per-folder" or "per-image".
 
     "single" where size, camera model and focal length are the same in all photos. Photos of one size and
     folder without EXIF count as frames of one camera: internet photos differ in size. "per-device" where EXIF
@@ -143,7 +148,7 @@ def _folder(photo: PhotoRecord) -> tuple[str, ...]:
 
 
 def camera_groups(photos: Sequence[PhotoRecord], camera: str = "per-device") -> list[list[int]]:
-    """Indices of photos that share a camera by EXIF and size; "per-folder": by folder and size.
+    """Group the indices of photos that share a camera by EXIF and size; "per-folder": by folder and size.
 
     Photos without make and focal length share one if all photos of their folder may be of one camera, turned
     or not: EXIF does not tell the cameras of two folders (of a rig, of two videos) apart.
@@ -166,7 +171,7 @@ def camera_groups(photos: Sequence[PhotoRecord], camera: str = "per-device") -> 
 
 
 def exif_focal(photo: PhotoRecord) -> float | None:
-    """Focal length over the longer side, from the 35 mm equivalent (same diagonal); None: not stated."""
+    """Return the focal length over the longer side, from the 35 mm equivalent; None if EXIF has none."""
     focal_mm = photo["exif"].get("focal_35mm")
     if not focal_mm:
         return None
@@ -185,7 +190,7 @@ def extract_features(
     masks: Path | None,
     bar: Bar,
 ) -> FeatureResult:
-    """SIFT features of every photo into `folder/database.db`."""
+    """Write the SIFT features of every photo to `folder/database.db`."""
     database = folder / DATABASE
     bar.start("features", len(facts))
     job: FeatureJob = {
@@ -198,8 +203,9 @@ def extract_features(
         if camera in ("per-device", "per-folder")
         else [],
         "masks": str(masks) if masks else None,
-        "settings": to_plain(settings),
-        "plan": to_plain(plan),
+        "max_features": settings.max_features,
+        "max_side": settings.max_side,
+        "sift": plan.sift,
         "seed": settings.seed,
         "jobs": jobs,
     }
@@ -234,16 +240,16 @@ def match(
     """Match pairs, and find the motions that they show.
 
     Args:
-        folder: of the result: a database and the list of pairs.
+        folder: gets the database and the list of pairs.
         features: folder of the database with features.
-        facts: of the photos.
-        settings: of the build.
-        plan: matcher, and numbers of partners.
+        facts: screened photos.
+        settings: settings of the build.
+        plan: gives the matcher and the number of partners a photo.
         jobs: threads.
         bar: progress.
         earlier: folder of an earlier result whose pairs are kept.
         left_out: work names of the photos that look for partners; None: all.
-        posed: poses are known: only match.
+        posed: the poses are known, so pairs are matched only.
     """
     matcher = plan.matcher
     database = folder / DATABASE
@@ -252,14 +258,16 @@ def match(
     test_names = [f["work_name"] for f in facts if f["side"] == "test"]
     listed = folder / PAIRS
     every = len(names) * (len(names) - 1) // 2
-    # How many pairs retrieval finds is known once it has.
+    # The number of pairs that retrieval chooses is not known in advance.
     bar.start("matching pairs", every if matcher == "exhaustive" else None)
     job: MatchJob = {
         "task": "matches",
         "database": str(database),
         "names": names,
         "test_names": test_names,
-        "plan": to_plain(plan),
+        "matcher": matcher,
+        "similar": plan.similar,
+        "neighbours": plan.neighbours,
         "only": list(left_out) if left_out is not None else None,
         "focals": None if posed else {f["work_name"]: x for f in facts if (x := exif_focal(f)) is not None},
         "earlier": str(earlier / PAIRS) if earlier else None,
@@ -296,7 +304,10 @@ def map_scene(
         "output": str(folder),
         "progress": str(progress),
         "mapper": settings.mapper,
-        "plan": to_plain(plan),
+        "growth": plan.growth,
+        "refinements": plan.refinements,
+        "local_refinements": plan.local_refinements,
+        "local_cameras": plan.local_cameras,
         "seed": settings.seed,
         "jobs": jobs,
     }
@@ -348,7 +359,7 @@ def _last_line(log: Path) -> str:
 
 
 def _count(database: Path, table: str) -> int:
-    """Rows of a table that another process writes; 0 while it is locked or absent."""
+    """Count the rows of a table that another process writes; 0 while it is locked or absent."""
     if not database.is_file():
         return 0
     try:

@@ -5,11 +5,10 @@ command. Every seed is fixed, so features and matches are the same for any numbe
 adjustment sums in the order of its threads, so mapping uses one (40 photos: 11.5 s on one thread,
 12.0-14.4 s on two; equal bits on one thread only).
 
-SIFT with OpenCV into COLMAP's database: as precise as COLMAP's own, in a third to a fifth of the time.
-
-Both double each photo first. Options are COLMAP's defaults where OpenCV has them: peak threshold 0.02 over
-three levels, edge threshold 10, descriptors as square roots of their L1 norm (RootSIFT: Arandjelovic and
-Zisserman, CVPR 2012).
+SIFT is computed by OpenCV, as precisely as by COLMAP and in a third to a fifth of the time, unless the plan
+asks for COLMAP's. Both double each photo first. The options are COLMAP's defaults where OpenCV has them: peak
+threshold 0.02 over three levels, edge threshold 10, descriptors as square roots of their L1 norm (RootSIFT:
+Arandjelovic and Zisserman, CVPR 2012).
 """
 
 from __future__ import annotations
@@ -40,7 +39,6 @@ from ambiguous_wild.builder.retrieval import (
     retrieval_pairs,
     sequential_pairs,
 )
-from ambiguous_wild.builder.settings import SfmPlan
 from ambiguous_wild.builder.sfm import (
     FeatureJob,
     MappingJob,
@@ -54,19 +52,19 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PEAK, EDGE, LEVELS, BLUR = 0.02, 10.0, 3, 1.6
 SCALE = 512.0  # descriptors are stored as bytes; of a unit vector few elements exceed a half
-OCTAVES = 4  # from the doubled photo on; features of coarser ones are badly placed
+OCTAVES = 4  # octaves used, from the doubled photo on; features of coarser ones are badly localised
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads
-# COLMAP's SIFT ends with the octave that exceeds the limit on features; so many places give as many as it has
+# Positions per requested feature: COLMAP finishes the octave that exceeds its limit, so it returns more.
 PLACES_A_FEATURE = 1.4
 AHEAD = 2  # photos in work a thread, so that few lie in memory
 
 
 def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Keypoints and descriptors of one photo, the largest first.
+    """Compute keypoints and descriptors of one photo, the largest first.
 
     Args:
         gray: [H, W] uint8.
-        most: number of places, at most; a place may have several orientations, each of them a feature.
+        most: largest number of positions; one with several orientations gives several features.
         mask: [H, W], zero where nothing is wanted.
 
     Returns:
@@ -74,15 +72,15 @@ def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[n
         radians; [N, 128] uint8. The same for any number of threads.
     """
     finder = cv2.SIFT.create(0, LEVELS, PEAK, EDGE, BLUR, enable_precise_upscale=True)
-    # OpenCV packs the octave into the lowest byte; -1, of the doubled photo, is 255
-    found = [k for k in finder.detect(gray, mask) if (k.octave + 1 & 255) < OCTAVES]
-    if not found:
+    # OpenCV packs the octave into the lowest byte; the doubled photo's, -1, is 255.
+    keypoints = [k for k in finder.detect(gray, mask) if (k.octave + 1 & 255) < OCTAVES]
+    if not keypoints:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
-    where = np.array([(k.size, *k.pt) for k in found], np.float32)
-    order = np.lexsort((where[:, 1], where[:, 2], -where[:, 0]))  # by size, then place: the same again
-    next_place = np.any(np.diff(where[order], axis=0) != 0.0, axis=1)
+    places = np.array([(k.size, *k.pt) for k in keypoints], np.float32)
+    order = np.lexsort((places[:, 1], places[:, 2], -places[:, 0]))  # by size, then position
+    next_place = np.any(np.diff(places[order], axis=0) != 0.0, axis=1)
     kept = order[np.concatenate([[0], np.cumsum(next_place)]) < most]
-    described, words = finder.compute(gray, [found[i] for i in kept])
+    described, words = finder.compute(gray, [keypoints[i] for i in kept])
     points = np.array([(*k.pt, k.size / 2, np.radians(k.angle)) for k in described], np.float32)
     points[:, :2] += 0.5  # OpenCV counts from the centre of the first pixel
     roots = np.sqrt(words / np.maximum(words.sum(1, keepdims=True), 1e-12))
@@ -92,15 +90,15 @@ def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[n
 def features_of(
     photos: Path, masks: Path | None, names: Sequence[str], most: int, side: int, jobs: int
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """name, keypoints in px of the whole photo, descriptors; in the order of the names.
+    """Yield name, keypoints in px of the full-size photo, and descriptors, in the order of the names.
 
     Args:
         photos: folder.
         masks: folder of NAME.png, black where nothing is wanted; a photo without one is used whole.
-        names: files in it.
-        most: places a photo.
-        side: photos with a longer side are reduced to it first.
-        jobs: photos at a time.
+        names: files in `photos`.
+        most: largest number of positions a photo.
+        side: px; larger photos are reduced to this longer side first.
+        jobs: threads, one photo each.
 
     Raises:
         OSError: a photo that cannot be read.
@@ -133,13 +131,13 @@ def features_of(
             waiting += [pool.submit(one, name) for name in islice(todo, 1)]
 
 
-FOCAL_CHANGE = 0.05  # relative, of half of the photos
-FOCAL_DOUBT = 0.015  # the same; votes are counted on a grid of 2 %
+FOCAL_CHANGE = 0.05  # relative change of half of the focal lengths after which pairs are verified again
+FOCAL_DOUBT = 0.015  # relative change after which a rival model is built; votes lie on a grid of 2 %
 _PR_SET_PDEATHSIG = 1
 
 
 def run_features(job: FeatureJob) -> None:
-    """SIFT on the CPU into a new database, then cameras."""
+    """Create the database with cameras and images, and write SIFT features computed on the CPU."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     if job["masks"]:
@@ -152,14 +150,14 @@ def run_features(job: FeatureJob) -> None:
         pycolmap.import_images(
             job["database"], job["photos"], camera_mode=mode, image_names=names, options=reader
         )
-    if job["plan"]["sift"] == "opencv":
+    if job["sift"] == "opencv":
         _extract_with_opencv(job)
         return
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
-    options.max_image_size = job["settings"]["max_side"]
-    options.sift.max_num_features = job["settings"]["max_features"]
+    options.max_image_size = job["max_side"]
+    options.sift.max_num_features = job["max_features"]
     pycolmap.extract_features(
         job["database"],
         job["photos"],
@@ -179,8 +177,8 @@ def _extract_with_opencv(job: FeatureJob) -> None:
             Path(job["photos"]),
             masks,
             job["names"],
-            round(PLACES_A_FEATURE * job["settings"]["max_features"]),
-            job["settings"]["max_side"],
+            round(PLACES_A_FEATURE * job["max_features"]),
+            job["max_side"],
             job["jobs"],
         ):
             database.write_keypoints(numbers[name], points)
@@ -191,22 +189,22 @@ def _extract_with_opencv(job: FeatureJob) -> None:
 
 
 def run_matches(job: MatchJob) -> None:
-    """Match pairs, all of them or those that are likely to overlap; then find the motions of each."""
+    """Match all pairs or those that are likely to overlap, then find the motions of each pair."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
     options.skip_geometric_verification = True
     database = Path(job["database"])
-    if job["plan"]["matcher"] == "exhaustive":
+    if job["matcher"] == "exhaustive":
         pycolmap.match_exhaustive(job["database"], matching_options=options)
     else:
-        listed = database.with_name(PAIRS)
-        known = Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
-        found = [f"{a} {b}" for a, b in _likely_pairs(job)]
-        # COLMAP leaves alone what is matched already
-        listed.write_text("".join(f"{line}\n" for line in dict.fromkeys(known + found)), encoding="utf-8")
+        path = database.with_name(PAIRS)
+        earlier = Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
+        likely = [f"{a} {b}" for a, b in _likely_pairs(job)]
+        # COLMAP skips pairs that are matched already.
+        path.write_text("".join(f"{line}\n" for line in dict.fromkeys(earlier + likely)), encoding="utf-8")
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(listed)
+        pairing.match_list_path = str(path)
         pycolmap.match_image_pairs(job["database"], matching_options=options, pairing_options=pairing)
     if job["focals"] is None:  # poses are known: triangulation takes the matches that fit them
         return
@@ -220,9 +218,9 @@ def run_matches(job: MatchJob) -> None:
 
 
 def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
-    """By the order of capture, by similar features, or both."""
+    """Choose pairs by the order of capture, by similar features, or by both."""
     tests = set(job["test_names"])
-    sequential = job["plan"]["matcher"] == "sequential"
+    sequential = job["matcher"] == "sequential"
     if sequential and not tests:
         return sequential_pairs(job["names"], tests)
     database = pycolmap.Database.open(job["database"])
@@ -234,14 +232,14 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
         if sequential:
             vectors = embed(read, job["names"], job["seed"])
-            found = {*sequential_pairs(job["names"], tests), *pairs_of_tests(vectors, job["names"], tests)}
-            return sorted(found)
+            pairs = {*sequential_pairs(job["names"], tests), *pairs_of_tests(vectors, job["names"], tests)}
+            return sorted(pairs)
         return retrieval_pairs(
             read,
             job["names"],
             tests,
-            job["plan"]["similar"],
-            job["plan"]["neighbours"],
+            job["similar"],
+            job["neighbours"],
             job["only"],
             job["seed"],
             job["jobs"],
@@ -251,21 +249,21 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
 
 def run_mapping(job: MappingJob) -> None:
-    """Take the largest of COLMAP's models, place every photo of it anew; `mapping.json` has the facts.
+    """Take the largest of COLMAP's models and place every photo of it anew; write `mapping.json`.
 
     Where photos look outwards, a wrong focal length on a bent path explains nearly all matches (yard, seed 2:
-    4.4 % too long, no photo right). So if the pairs voted for another focal length than the mapper found, it
-    maps again with that one held, and the model with more observations stays.
+    4.4 % too long, no photo right). So if the pairs voted for another focal length than the mapper found, the
+    mapper runs again with the voted one held fixed, and the model with more observations is kept.
     """
     output, database = Path(job["output"]), Path(job["database"])
     matched = Matched.read(database)
     mapper = _map_globally if job["mapper"] == "global" else _map_incrementally
 
     def largest(*, held: bool = False) -> Any:
-        found = mapper(job, output, matched.distorted and not held, held).values()
+        models = mapper(job, output, matched.distorted and not held, held).values()
         for folder in output.glob("[0-9]*"):
             shutil.rmtree(folder)
-        return max(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+        return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
 
     model = largest()
     if model is not None and not plausible(model):
@@ -276,10 +274,10 @@ def run_mapping(job: MappingJob) -> None:
         change = matched.take_cameras(model)
         rival = largest(held=True) if change > FOCAL_DOUBT else None
         if rival is not None:
-            other = Matched.read(database)  # now: with the cameras that the pairs voted for
+            other = Matched.read(database)  # read now, while the database has the focal length of the votes
             other.distorted = matched.distorted
         if change > FOCAL_CHANGE:
-            # poses of pairs were wrong by as much: once more, with the focal length that the model found
+            # The poses of pairs were wrong by as much, so verify and map again with the model's focal length.
             matched.write_agreed(database, matched.find_motions(job["jobs"]))
             model = largest() or model
         else:
@@ -296,8 +294,8 @@ def run_mapping(job: MappingJob) -> None:
     if placement is not None:
         left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
     if placement is None or len(placement.poses) < LEAST_PHOTOS:
-        nothing: dict[str, Any] = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
-        write_json(output / "mapping.json", nothing)
+        empty: dict[str, object] = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
+        write_json(output / "mapping.json", empty)
         return
     placement.matched.save_motions(output / MOTIONS)
     model = placement.model
@@ -323,30 +321,30 @@ def run_mapping(job: MappingJob) -> None:
 
 
 def _explained(placement: Placement) -> int:
-    """Observations of a model; 0 where it lost its photos, whose points are those of an earlier turn."""
+    """Count the observations of a model; 0 where it lost its photos, because its points are then outdated."""
     enough = len(placement.poses) >= LEAST_PHOTOS
     return int(placement.model.compute_num_observations()) if enough else 0
 
 
 def run_triangulation(job: TriangulationJob) -> None:
-    """Points from the matches that fit the poses; these and the intrinsics stay as they are."""
-    known = pycolmap.Reconstruction(job["model"])
+    """Triangulate points from the matches that fit the poses; poses and intrinsics do not change."""
+    posed = pycolmap.Reconstruction(job["model"])
     matched = Matched.read(Path(job["database"]))
-    matched.take_cameras(known)
-    matched.write_verified(Path(job["database"]), matched.fitting(matched.poses(known)))
-    found = pycolmap.triangulate_points(
-        known,
+    matched.take_cameras(posed)
+    matched.write_verified(Path(job["database"]), matched.fitting(matched.poses(posed)))
+    triangulated = pycolmap.triangulate_points(
+        posed,
         job["database"],
         job["photos"],
         job["output"],
         options=pipeline_options(job["seed"]),
         refine_intrinsics=False,
     )
-    found.write_binary(job["output"])
+    triangulated.write_binary(job["output"])
 
 
 def run_motions(job: MotionJob) -> None:
-    """The motions of every matched pair, with known cameras."""
+    """Find the motions of every matched pair, with known cameras."""
     matched = Matched.read(Path(job["database"]))
     matched.take_cameras(pycolmap.Reconstruction(job["model"]))
     matched.find_motions(job["jobs"])
@@ -358,11 +356,10 @@ def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: boo
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not held
     options.min_model_size = LEAST_PHOTOS
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
-    plan = SfmPlan(**job["plan"])
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = plan.growth
-    options.ba_global_max_refinements = plan.refinements
-    options.ba_local_max_refinements = plan.local_refinements
-    options.mapper.ba_local_num_images = plan.local_cameras
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
+    options.ba_global_max_refinements = job["refinements"]
+    options.ba_local_max_refinements = job["local_refinements"]
+    options.mapper.ba_local_num_images = job["local_cameras"]
     counter = Path(job["progress"])
     state = {"best": 0, "now": 0}
 
@@ -370,7 +367,7 @@ def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: boo
         state["now"] = 2
 
     def following() -> None:
-        # Each model starts again at two: the bar shows the largest so far.
+        # COLMAP may build several models, each from two photos: the bar shows the largest so far.
         state["now"] += 1
         state["best"] = max(state["best"], state["now"])
         counter.write_text(str(state["best"]))
@@ -405,7 +402,7 @@ def _map_globally(job: MappingJob, output: Path, distorted: bool, held: bool) ->
 def main() -> None:
     """Read the job file and run its task."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides, and ends this process
-    if sys.platform == "linux":  # end with the parent, even if that is killed
+    if sys.platform == "linux":  # end when the parent ends, even if the parent is killed
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     job: SfmJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     if os.getppid() != job["parent"]:  # the parent ended before the line above

@@ -1,6 +1,6 @@
-"""The stages of a build in order: what each reads, and the inputs that key its result.
+"""The stages of a build in order: what each reads, and the inputs that its result is stored under.
 
-Refuse a failed reconstruction with its cause.
+A reconstruction that holds too few photos or points is refused here, with the likely cause.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.motion_points import FILE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-MIN_SHARE = 0.3  # of the readable photos; with fewer, most of the place is missing
+MIN_SHARE = 0.3  # share of the readable photos that must be placed, or most of the scene is missing
 MIN_POINTS = 10  # per placed photo; fewer determine neither poses nor surfaces
 _STRONG_PAIRS = 60  # pairs with the most inliers, used for the diagnosis
 _MAX_PAIR_ID = 2147483647  # COLMAP: pair id = id1 * this + id2
@@ -74,7 +74,7 @@ class PairFacts:
     angle_deg: float  # median triangulation angle of the strongest pairs
 
     def sentence(self) -> str:
-        """The figures, for a message."""
+        """Describe the matching in figures, for an error message."""
         text = f"median {self.features:.0f} features a photo, {self.verified} of {self.tried} pairs verified"
         if self.verified:
             text += f" (median {self.inliers:.0f} inliers)"
@@ -83,7 +83,7 @@ class PairFacts:
         return text
 
     def reason(self, photos: int) -> str:
-        """The likeliest cause of a failure, and what to try."""
+        """Return the likeliest cause of a failure and what to try."""
         if self.features < 200:
             return "too little texture or too much blur; try --max-features 8000 or sharper photos"
         if self.verified < photos - 1:
@@ -109,10 +109,10 @@ def check_registered(
     """Refuse a reconstruction that holds too few photos or points to be a scene.
 
     Args:
-        model: None: there is none.
+        model: COLMAP's best model; None if it built none.
         photos: number of photos that COLMAP got.
         skipped: number of photos left out before.
-        database: COLMAP's.
+        database: COLMAP's database with features and matches.
         matches: result of the matching stage.
         remarks: other possible causes, added to the error.
 
@@ -126,10 +126,10 @@ def check_registered(
         return
     facts = pair_facts(database, matches)
     unread = f", {skipped} were left out" if skipped else ""
-    found = f"{registered} of {photos} photos" + f" with {points} points" * few
+    placed = f"{registered} of {photos} photos" + f" with {points} points" * few
     wanted = f"{needed}" + f" and {MIN_POINTS} points a photo" * few
     raise AwError(
-        f"structure from motion placed {found}{unread}; a scene needs {wanted}: "
+        f"structure from motion placed {placed}{unread}; a scene needs {wanted}: "
         f"{facts.sentence()}; likely {facts.reason(photos)}" + "".join(f"; {remark}" for remark in remarks)
     )
 
@@ -154,7 +154,7 @@ def pair_facts(database: Path, matches: MatchResult) -> PairFacts:
 
 
 def _motion(database: Path, pair_ids: list[int]) -> tuple[list[float], list[float]]:
-    """|t_z| / |t| and triangulation angle in degrees, of the pairs whose relative pose can be estimated."""
+    """Return |t_z| / |t| and the triangulation angle in degrees of each pair whose pose can be estimated."""
     forward, angles = [], []
     db = pycolmap.Database.open(str(database))
     try:
@@ -188,7 +188,7 @@ class SfmStages:
 
     @property
     def placed(self) -> int:
-        """Photos of the model."""
+        """Number of photos in the model."""
         model = self.mapping.facts["model"]
         return model["images"] if model else 0
 
@@ -207,7 +207,7 @@ class Stages:
 
     @cached_property
     def inputs(self) -> BuildInputs:
-        """Everything that the scene's files follow from."""
+        """Everything that the scene's files depend on."""
         _, copies = without_copies(self.capture)
         return {
             "photos": [
@@ -223,7 +223,7 @@ class Stages:
 
     @cached_property
     def build_key(self) -> str:
-        """Hash of the inputs: the scene's identity."""
+        """Hash of the inputs; a scene with the same key is up to date."""
         return content_key(self.inputs)
 
     def run(self, work: Workspace, collect_s: float) -> Path:
@@ -231,7 +231,7 @@ class Stages:
 
         Args:
             work: holds the finished stages.
-            collect_s: seconds spent before, for scene.json.
+            collect_s: seconds spent on listing the photos, for scene.json.
 
         Returns:
             The scene folder, inside the work folder.
@@ -276,7 +276,7 @@ class Stages:
                 lambda f: downsample(f, flat.folder, factor, jobs=self.jobs, bar=bar),
             )
             small_key, small_folder = small.key, small.folder
-        found = report.scene_record(
+        record_of_build = report.scene_record(
             settings,
             screened.facts,
             features.facts,
@@ -293,7 +293,7 @@ class Stages:
             warnings=[*mask_warnings(mask_stage.facts if mask_stage else None), *split_warnings],
         )
         record: KeyedRecord = {
-            **found,
+            **record_of_build,
             "build_key": self.build_key,
             "inputs": inputs,
             "seconds": {"collect": round(collect_s, 3), **work.seconds()},
@@ -327,14 +327,14 @@ class Stages:
         return done.folder / "scene"
 
     def _masks(self, work: Workspace, screened: StageResult[ScreenResult]) -> StageResult[MaskResult] | None:
-        facts, found = screened.facts["photos"], {}
+        facts, mask_files = screened.facts["photos"], {}
         alpha = alphas(self.capture.root, facts)
         if self.mask_folder is not None:
-            found = find_masks(self.mask_folder, facts, self.settings.masks_missing)
+            mask_files = find_masks(self.mask_folder, facts, self.settings.masks_missing)
         elif not alpha:
             return None
-        key = [screened.key, mask_hashes(found)]
-        return work.run("masks", key, lambda f: lay_out_masks(f, found, facts, alpha))
+        key = [screened.key, mask_hashes(mask_files)]
+        return work.run("masks", key, lambda f: lay_out_masks(f, mask_files, facts, alpha))
 
     def _sfm(
         self,
@@ -351,7 +351,7 @@ class Stages:
             if attempts:
                 self.bar.say(f"{placed} of {len(facts)} photos placed: trying harder")
             attempts.append(self._attempt(work, screened, masks, plan, attempts[-1] if attempts else None))
-        # of equal ones the later, which is the more precise
+        # Of attempts that place equally many photos the last is taken, which is the most precise.
         best = max(reversed(attempts), key=lambda attempt: attempt.placed)
 
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
@@ -437,7 +437,7 @@ class Stages:
 
 
 def _file_hashes(folder: Path | None) -> list[list[str]] | None:
-    """[path, sha256] of every file below a folder; None without a folder."""
+    """Return [path, sha256] of every file below a folder; None without a folder."""
     if folder is None or not folder.is_dir():
         return None
     paths = sorted(p for p in folder.rglob("*") if p.is_file())

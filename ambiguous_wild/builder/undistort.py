@@ -1,7 +1,7 @@
 """Undistort photos, masks and truth to pinhole cameras, with one map a camera.
 
-COLMAP chooses the pinhole camera (no blank pixels). We resample: masks (nearest pixel) and photos (bicubic,
-once, without another JPEG) need the same map.
+COLMAP chooses the pinhole camera (no blank pixels). Resampling is our own, because masks (nearest pixel) and
+photos (bicubic, once, without another JPEG) need the same map.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 TRUTH_PARTS = ("distractor", "clean")
-MOST_LOST = 0.9  # of the photo; what is lost beyond is said
-LEAST_SHARE, MOST_SHARE = 0.1, 1.1  # of the photo; less is no picture of it, more lies outside
+MOST_LOST = 0.9  # share of the photo that is kept, below which a message says so
+LEAST_SHARE, MOST_SHARE = 0.1, 1.1  # plausible shares of the photo that undistortion keeps
 NEGLIGIBLE_PX = 0.1  # distortion below this everywhere is ignored
 
 
@@ -37,19 +37,19 @@ class Lens:
     pinhole: ModelCamera
     # [H, W] float32 each: source of every pixel; None: no map needed
     map_xy: tuple[np.ndarray, np.ndarray] | None
-    share: float = 1.0  # of the photo that the pinhole camera sees
-    shear: float = 0.0  # of the camera, see `ModelCamera`
+    share: float = 1.0  # share of the photo that the pinhole camera sees
+    shear: float = 0.0  # as in `ModelCamera`
 
     def remap(self, image: np.ndarray, *, nearest: bool) -> np.ndarray:
-        """The image [H, W] or [H, W, 3] of the distorted camera as the pinhole camera sees it."""
+        """Resample an image [H, W] or [H, W, 3] of the distorted camera to the pinhole camera."""
         if self.map_xy is None:
             return image
         how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
-        # The map may reach half a pixel over the border: reflection fills that.
+        # The map may reach half a pixel beyond the border, which reflection fills.
         return cv2.remap(image, *self.map_xy, how, borderMode=cv2.BORDER_REFLECT_101)
 
     def undistort_points(self, xys: np.ndarray) -> np.ndarray:
-        """[K, 2] px of the distorted camera to px of the pinhole camera."""
+        """Map points [K, 2] px of the distorted camera to px of the pinhole camera."""
         if not len(xys):
             return xys
         fx, fy, cx, cy = self.pinhole.pinhole()
@@ -93,7 +93,7 @@ def make_lens(camera: ModelCamera) -> Lens:
 
 
 def _source_pixels(lens: Any, pinhole: ModelCamera, shear: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel centres of the pinhole camera, and where the lens sees them: [H, W, 2] px each."""
+    """Return pixel centres of the pinhole camera, and where the lens sees them: [H, W, 2] px each."""
     fx, fy, cx, cy = pinhole.pinhole()
     grid = np.stack(np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5), axis=-1)
     rays = np.concatenate([(grid - [cx, cy]) / [fx, fy], np.ones((*grid.shape[:2], 1))], axis=-1)
@@ -116,7 +116,7 @@ def undistort(
     """Write `images/`, `masks/`, `truth/` at full size and `sparse/0` of the registered photos.
 
     Args:
-        folder: of the stage.
+        folder: folder of the stage, empty.
         model: the chosen model, named by work names.
         facts: screened photos.
         read: gives a photo's pixels, [H, W, 3] uint8, upright.
@@ -152,15 +152,15 @@ def undistort(
         bar.say(f"undistortion leaves {least:.0%} of the photos, the middle of what the lens sees")
     cameras, images = {c.camera_id: c for _, c, _ in done}, {image.image_id: image for image, _, _ in done}
     write_model(folder / "sparse" / "0", Model(cameras, images, model.points))
-    found = {part: sum(part in parts for _, _, parts in done) for part in TRUTH_PARTS}
-    return {"truth": found if truth is not None else None}
+    photos_with = {part: sum(part in parts for _, _, parts in done) for part in TRUTH_PARTS}
+    return {"truth": photos_with if truth is not None else None}
 
 
 def _truth(folder: Path, lens: Lens, fact: ScreenedPhoto, truth: Path) -> list[str]:
     """Undistort the truth of one photo: the mask by nearest pixel, the clean photo like the photo."""
     parts = PurePosixPath(fact["source"]).with_suffix("").parts
     original = "/".join(parts[parts[0] in ("train", "test", "images") :])
-    found = []
+    written = []
     for part in TRUTH_PARTS:
         path = truth / part / f"{original}.png"
         if not path.is_file():
@@ -174,5 +174,5 @@ def _truth(folder: Path, lens: Lens, fact: ScreenedPhoto, truth: Path) -> list[s
             )
         flat = lens.remap(pixels, nearest=part == "distractor")
         write_png(folder / "truth" / part / f"{fact['stem']}.png", flat)
-        found.append(part)
-    return found
+        written.append(part)
+    return written

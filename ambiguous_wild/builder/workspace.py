@@ -1,7 +1,7 @@
 """The hidden work folder of a build: one folder a stage, complete or absent, so a kill costs one stage.
 
-A stage's folder name holds a key: the hash of its inputs, its settings, the code's version and the keys of
-the stages it reads. A changed setting changes the keys of later stages only.
+The name of a stage's folder holds a key: the hash of its inputs, its settings, the code's version and the
+keys of the stages it reads. A changed setting changes the keys of later stages only.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions that the result depends on, by name, without libraries that have another name here."""
-    found = {"ambiguous_wild": __version__, "builder": str(BUILDER)}
+    """Return the versions that the result depends on, by name; a library under another name is absent."""
+    version_of = {"ambiguous_wild": __version__, "builder": str(BUILDER)}
     for name in _LIBRARIES:
         try:
-            found[name] = metadata.version(name)
+            version_of[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return version_of
 
 
 def content_key(*parts: Any) -> str:
@@ -94,11 +94,11 @@ class Workspace:
         return result
 
     def seconds(self) -> dict[str, float]:
-        """Of each stage; of one that gave several results the sum, each counted once."""
-        found: dict[str, float] = {}
+        """Return the time of each stage; a stage with several results gets their sum."""
+        seconds_of: dict[str, float] = {}
         for result in {result.key: result for result in self.results}.values():
-            found[result.name] = round(found.get(result.name, 0.0) + result.seconds, 3)
-        return found
+            seconds_of[result.name] = round(seconds_of.get(result.name, 0.0) + result.seconds, 3)
+        return seconds_of
 
     def forget(self, result: StageResult[Any]) -> None:
         """Delete one stage's folder, so that it runs again."""

@@ -21,7 +21,7 @@ from ambiguous_wild.methods.ablation import Group
 @click.option("--scene", "scenes", multiple=True, type=PathName(), help="A scene folder; repeatable.")
 @click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
 @click.option(
-    "--sweep", "sweeps", multiple=True, metavar="KEY=V1,V2", help="Values of an option instead; repeatable."
+    "--sweep", "sweeps", multiple=True, metavar="KEY=V1,V2", help="Vary an option, not groups; repeatable."
 )
 @training_options
 @click.option("--budget", help="Training time instead of --iterations: 90s, 10m, 1.5h.")
@@ -56,7 +56,7 @@ def command(
     """Train the variants of METHOD on SCENEs. Write ablation.csv, .json, .md and .png to OUTPUT.
 
     Finished runs are kept: after an interruption the same command continues. Another --group of the same
-    scenes, seeds and length is added to what OUTPUT holds.
+    scenes, seeds and length is added to the results in OUTPUT.
 
     \b
     aw ablate --list
@@ -69,7 +69,7 @@ def command(
     for plugin in plugins:
         load_plugin(plugin)
     entry = get_method(method)
-    method = entry.name  # of a file's recipe; its reference would read the file again
+    method = entry.name  # FILE.py:RECIPE would read the file again
     if sweeps:
         swept = sweep_groups(entry.options(), sweeps)
         entry = register(dataclasses.replace(entry, ablations=(*entry.ablation_groups(), *swept)))

@@ -21,7 +21,7 @@ from ambiguous_wild.cli.options import PathName
     "[default: the first available]",
 )
 @click.option(
-    "--keep-masks", type=PathName(), help="Instead: a folder of <stem>.png, white = keep, black = distractor."
+    "--keep-masks", type=PathName(), help="Folder of <stem>.png instead, white = keep, black = distractor."
 )
 @click.option(
     "--background",
@@ -62,7 +62,7 @@ def command(
     record: bool,
     as_json: bool,
 ) -> None:
-    """Measure how similar the distractors of SCENE are to it, in colour and semantically, and their share.
+    """Measure how similar the distractors of SCENE are to it, in colour and semantically, and their coverage.
 
     Writes an HTML page, a CSV and an image.
     """

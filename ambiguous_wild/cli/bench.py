@@ -26,10 +26,10 @@ _UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
 
 
 def parse_budget(text: str) -> float:
-    """ "90s", "10m", "1.5h" in seconds.
+    """Convert "90s", "10m" or "1.5h" to seconds.
 
     Raises:
-        AwError: it is none of these.
+        AwError: it is no duration of this form.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|m|min|h)\s*", text)
     if not match or float(match[1]) <= 0:
@@ -80,14 +80,14 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--mask",
     metavar="METHOD",
-    help="Masks of another method; none; motion: what moves; or truth: exact masks.",
+    help="Masks of another method; none; motion: of moving features; or truth: exact masks.",
 )
 @click.option("--density", metavar="METHOD", help="Density control of another method.")
-@click.option("--regulariser", metavar="METHOD", help="Another method's losses on the render.")
+@click.option("--regulariser", metavar="METHOD", help="Losses of another method on the render.")
 @click.option("--passes", type=click.IntRange(1, 2), default=1, show_default=True,
               help="2: train again with the final masks; the cost counts both trainings.")  # fmt: skip
 @click.option(
-    "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="An option of a method; repeatable."
+    "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="Option of a method; repeatable."
 )
 @click.option(
     "--effects",
@@ -176,11 +176,11 @@ def command(
     aw bench --method 3dgs,robustsplat --mask refinesplat --scene scene -o runs
     aw bench --suite on-the-go --root datasets/on-the-go -o runs
 
-    A run ("cell") is one method on one scene with one seed. --jobs 4 trains four runs at a time, --engine ray
-    as many as a cluster has room for.
+    A run is one method on one scene with one seed. --jobs 4 trains four runs at a time, --engine ray as many
+    as a cluster has room for.
 
-    --mask, --density and --regulariser take a part of one method into every METHOD. The runs are called
-    3dgs@mask=refinesplat, which is also a METHOD.
+    --mask, --density and --regulariser replace a part of every METHOD by that of another method. The runs are
+    called 3dgs@mask=refinesplat, which is also a METHOD.
 
     Several --budget or --effects train every combination, each into its own folder:
     runs/budget-60s/effects-exposure/SCENE/METHOD/seed0. 'aw cost runs' compares all of them, 'aw table' the
@@ -235,7 +235,7 @@ def _suite(
     iterations: int | None,
     budgets_s: Sequence[float],
 ) -> tuple[PreparedSuite, tuple[str, ...], int | None]:
-    """The suite's scenes, its methods and length unless others are asked for."""
+    """Return the suite's scenes, and its methods and length unless others are given."""
     from ambiguous_wild.datasets.suites import get_suite
     from ambiguous_wild.report.suite import prepare_suite, suite_methods
 
@@ -253,5 +253,5 @@ def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
 
     try:
         click.echo(to_text(suite_tables(prepared, folder), color=sys.stdout.isatty()), nl=False)
-    except AwError as error:  # every run failed, which `finish` tells
+    except AwError as error:  # every run failed, which `finish` reports
         say(str(error))

@@ -28,10 +28,10 @@ _CODE = (
 
 @contextmanager
 def kernels_meanwhile() -> Iterator[None]:
-    """Compile at the lowest priority meanwhile; what is not finished at the end is left for later.
+    """Compile the CPU kernels at the lowest priority while the scene is built.
 
-    Each kernel is kept as soon as it is compiled. Nothing is said and nothing fails: the command that needs
-    the kernels compiles what is missing, and reports what went wrong.
+    Each kernel is kept as soon as it is compiled, and unfinished ones are left for later. Errors are ignored:
+    the command that needs the kernels compiles what is missing and reports errors.
     """
     if _compiled():
         yield
@@ -53,7 +53,7 @@ def kernels_meanwhile() -> Iterator[None]:
 
 
 def _compiled() -> bool:
-    """Whether the kernel that is compiled last is on disk for this state of the source."""
+    """Tell whether the kernel that is compiled last is on disk for the present source."""
     from ambiguous_wild.splat.cpu.compile import kernel_cache
 
     return any(kernel_cache().rglob("*catch_up_all*.nbi"))
@@ -70,7 +70,7 @@ def _compiled() -> bool:
     type=click.Choice(["auto", "single", "per-device", "per-folder", "per-image"]),
     default="auto",
     show_default=True,
-    help="Which photos share one camera model; auto: decided by EXIF, photo size and folder.",
+    help="Photos that share a camera model; auto: decided by EXIF, photo size and folder.",
 )
 @click.option(
     "--sfm",
@@ -116,7 +116,7 @@ def _compiled() -> bool:
 @click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene built from other photos or settings.")
 @click.option("--keep-work", is_flag=True, help="Keep the work folder with every stage and COLMAP's log.")
-@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(
     raw: tuple[Path, ...],
     output: Path,
@@ -132,8 +132,8 @@ def command(
     """Build a scene from the photos in RAW: check, COLMAP, undistort, downsample, split.
 
     RAW holds photos directly, in images/, in train/ and test/ (clean photos for testing), or in folders of
-    any name (front/, back/); several RAW become one scene. They are not changed. If the command is killed,
-    the same command continues the build.
+    any name (front/, back/); several RAW become one scene. They are not changed. If the build is killed,
+    the same command continues it.
     """
     from ambiguous_wild.builder import report
     from ambiguous_wild.builder.pipeline import build_scene
@@ -143,7 +143,7 @@ def command(
     from ambiguous_wild.io.images import image_size
 
     settings["name"] = "" if name is None else check_name("scene name", name)
-    # One of the two cores is idle while photos are placed; training needs the kernels next.
+    # A core is idle while photos are placed, and training needs the kernels next.
     with kernels_meanwhile():
         result = build_scene(
             raw,
@@ -173,8 +173,8 @@ def command(
     click.echo(verdict)
 
 
-def _facts(result: BuildResult, size: tuple[int, int], verdict: str) -> dict[str, Any]:
-    """scene.json without its long lists, and facts of this call."""
+def _facts(result: BuildResult, size: tuple[int, int], verdict: str) -> dict[str, object]:
+    """Return scene.json without its long lists, and facts of this call."""
     long = ("files", "photos", "inputs")
     return {
         "scene": str(result.scene),

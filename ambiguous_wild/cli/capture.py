@@ -98,7 +98,7 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 @click.argument("raw", type=PathName(), nargs=-1, required=True)
 @click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
 @threads_option
-@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def screen_command(raw: tuple[Path, ...], strict: bool, threads: int | None, as_json: bool) -> None:
     """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
     near-duplicates, overlap, motion. Nothing is written."""
@@ -107,31 +107,31 @@ def screen_command(raw: tuple[Path, ...], strict: bool, threads: int | None, as_
     from ambiguous_wild.builder.checks import check_capture, refuse_failed
     from ambiguous_wild.builder.progress import Bar
 
-    found = check_capture(raw, jobs=threads or os.cpu_count() or 1, bar=Bar(not as_json))
+    report = check_capture(raw, jobs=threads or os.cpu_count() or 1, bar=Bar(not as_json))
     if as_json:
         facts = {
-            "capture": str(found.root),
-            "photos": found.photos,
-            "skipped": found.skipped,
-            "checks": [dataclasses.asdict(c) for c in found.checks],
+            "capture": str(report.root),
+            "photos": report.photos,
+            "skipped": report.skipped,
+            "checks": [dataclasses.asdict(c) for c in report.checks],
         }
         click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
     else:
-        _print(found)
+        _print(report)
     if strict:
-        refuse_failed(found)
+        refuse_failed(report)
 
 
-def _print(found: CaptureReport) -> None:
-    width = max(len(c.name) for c in found.checks)
-    for check in found.checks:
+def _print(report: CaptureReport) -> None:
+    width = max(len(c.name) for c in report.checks)
+    for check in report.checks:
         word, colour = _WORDS[check.state]
         # File names may hold control characters of the terminal.
         text = "".join(c if c.isprintable() else "?" for c in f"{check.finding}  [{check.basis}]")
         click.echo(f"{check.name:<{width}}  {click.style(f'{word:<7}', fg=colour)}  {text}")
         if check.advice:
             click.echo(f"{'':<{width}}           -> {check.advice}")
-    bad = len(found.warnings)
-    verdict = "all checks passed" if not bad else f"{bad} of {len(found.checks)} checks failed"
-    unknown = sum(c.state == "unknown" for c in found.checks)
-    click.echo(f"{found.photos} photos: {verdict}" + (f", {unknown} unknown" if unknown else ""))
+    bad = len(report.warnings)
+    verdict = "all checks passed" if not bad else f"{bad} of {len(report.checks)} checks failed"
+    unknown = sum(c.state == "unknown" for c in report.checks)
+    click.echo(f"{report.photos} photos: {verdict}" + (f", {unknown} unknown" if unknown else ""))

@@ -27,7 +27,7 @@ from ambiguous_wild.splat import readiness
 
 TIMEOUT_S = 60
 
-# Each prints one line of JSON.
+# Code of each probe, which prints one line of JSON.
 PROBES = {
     "torch": """
 from ambiguous_wild.splat.readiness import torch_facts
@@ -57,7 +57,7 @@ print(json.dumps({"version": pycolmap.__version__}))
 
 @dataclass(frozen=True)
 class Probe:
-    """The facts a process printed, or the error."""
+    """The facts that a process printed, or its error."""
 
     facts: Any  # the JSON object that it printed; None if it failed
     error: str = ""
@@ -87,7 +87,7 @@ PACKAGE = Path(__file__).resolve().parent.parent
 DISTRIBUTION = "ambiguous-wild"
 SMALL_MEMORY_GB = 2.0  # COLMAP and a training of 100 000 Gaussians need this much
 SMALL_DISK_GB = 1.0  # photos, features and one run
-# What a remedy that is a command begins with.
+# A remedy that begins with one of these is a command.
 COMMANDS = (f"{sys.executable} ", f"{shlex.quote(sys.executable)} ", "sudo ", "brew ", "python3 ", "aw ", "#")
 _PIP = f"{shlex.quote(sys.executable)} -m pip"
 
@@ -112,21 +112,21 @@ def _optional(name: str, ok: bool, detail: str, fix: str = "") -> Check:
 
 
 def all_checks() -> list[Check]:
-    """Every check, core first."""
+    """Make all checks, core first."""
     names = [n for n in PROBES if n != "torchvision" or importlib.util.find_spec(n) is not None]
     with ThreadPoolExecutor(len(names)) as pool:
-        found = dict(zip(names, pool.map(probe, names)))
+        probed = dict(zip(names, pool.map(probe, names)))
     return [
         *_machine(),
         _packages(),
-        _library("torch", found["torch"], "training and LPIPS"),
-        _library("OpenImageIO", found["OpenImageIO"], "reading photos"),
+        _library("torch", probed["torch"], "training and LPIPS"),
+        _library("OpenImageIO", probed["OpenImageIO"], "reading photos"),
         _library(
-            "pycolmap", found["pycolmap"], "structure from motion; PNG files are written correctly after it"
+            "pycolmap", probed["pycolmap"], "structure from motion; PNG files are written correctly after it"
         ),
-        *_numba(found["numba"]),
-        *_gpu(found["torch"]),
-        _torchvision(found.get("torchvision")),
+        *_numba(probed["numba"]),
+        *_gpu(probed["torch"]),
+        _torchvision(probed.get("torchvision")),
         *_vision(),
         *_metrics(),
         _git(),
@@ -151,7 +151,7 @@ def _machine() -> list[Check]:
 
 
 def _system_install(package: str, page: str) -> str:
-    """The command that installs a system package, for the package manager of this machine."""
+    """Return the command that installs a system package with the package manager of this machine."""
     managers = {"apt-get": "sudo apt-get install -y", "dnf": "sudo dnf install -y", "brew": "brew install"}
     for name, command in managers.items():
         if shutil.which(name) is not None:
@@ -160,7 +160,7 @@ def _system_install(package: str, page: str) -> str:
 
 
 def _packages() -> Check:
-    """The required packages: allowed ranges, and the tested versions."""
+    """Check the required packages: allowed ranges, and tested versions."""
     try:
         required = [r for r in importlib.metadata.requires(DISTRIBUTION) or [] if "extra ==" not in r]
     except importlib.metadata.PackageNotFoundError:
@@ -179,7 +179,7 @@ def _packages() -> Check:
 
 
 def unmet(requirements: Iterable[str]) -> list[str]:
-    """The requirements ("name>=1.0") that the installed packages do not meet."""
+    """Return the requirements ("name>=1.0") that the installed packages do not meet."""
     from packaging.requirements import Requirement
 
     wrong = []
@@ -192,7 +192,7 @@ def unmet(requirements: Iterable[str]) -> list[str]:
 
 
 def other_versions(constraints: Path) -> list[str] | None:
-    """Installed packages whose version differs from the pinned one; None if there is no such file."""
+    """List installed packages whose version differs from the pinned one; None without the file of pins."""
     if not constraints.is_file():
         return None
     lines = []
@@ -206,20 +206,20 @@ def other_versions(constraints: Path) -> list[str] | None:
 
 
 def _install_again(words: str) -> str:
-    """The command of pip that installs the tested versions, in a checkout."""
+    """Return the pip command that installs the tested versions, in a checkout."""
     path = PACKAGE.parent / "constraints.txt"
     tested = f" -c {shlex.quote(str(path))}" if path.is_file() else ""
     return f"{_PIP} install{tested} --force-reinstall {words}"
 
 
-def _library(name: str, found: Probe, use: str) -> Check:
-    detail = found.error if found.facts is None else str(found.facts["version"])
-    return _core(name, found.facts is not None, f"{detail} ({use})", _install_again(f"--no-deps {name}"))
+def _library(name: str, probed: Probe, use: str) -> Check:
+    detail = probed.error if probed.facts is None else str(probed.facts["version"])
+    return _core(name, probed.facts is not None, f"{detail} ({use})", _install_again(f"--no-deps {name}"))
 
 
-def _numba(found: Probe) -> list[Check]:
-    if found.facts is None:
-        return [_core("numba", False, found.error, _install_again("numba llvmlite"))]
+def _numba(probed: Probe) -> list[Check]:
+    if probed.facts is None:
+        return [_core("numba", False, probed.error, _install_again("numba llvmlite"))]
     from ambiguous_wild.splat.cpu.compile import kernel_cache
 
     folder = kernel_cache()
@@ -230,13 +230,13 @@ def _numba(found: Probe) -> list[Check]:
     writable = os.access(existing, os.W_OK)
     where = f"in {folder}" if writable else f"{folder} is not writable"
     return [
-        _core("numba", True, f"{found.facts['threads']} threads, threading layer {found.facts['layer']}"),
+        _core("numba", True, f"{probed.facts['threads']} threads, threading layer {probed.facts['layer']}"),
         _core("kernel cache", writable, f"{state}, {where}", "export NUMBA_CACHE_DIR=$HOME/.cache/numba"),
     ]
 
 
 def _gpu(torch: Probe) -> list[Check]:
-    """The same messages as those of `--device`."""
+    """Check the GPU, with the same messages as `--device`."""
     if torch.facts is None:
         return [_optional("torch cuda", False, torch.error, _install_again("--no-deps torch"))]
     facts = readiness.look(torch.facts)
@@ -267,7 +267,7 @@ def _part(name: str, fine: str, lack: readiness.Lack | None) -> Check:
 
 
 def pastable(fix: str) -> str:
-    """The remedy as a shell line: words that are no command become a comment."""
+    """Turn a remedy into a shell line; words that are no command become a comment."""
     if fix.startswith(("export ", "unset ")):
         line, comma, why = fix.partition(", ")
         return f"{line}  # {why}" if comma else line
@@ -281,7 +281,7 @@ def _installed(name: str, extra: str, use: str) -> Check:
 
 
 def _extras() -> list[Check]:
-    """Packages for single commands, and nerfbaselines, which has its own environment."""
+    """Check packages for single commands, and nerfbaselines, which has its own environment."""
     from ambiguous_wild.methods.nerfbaselines import find_program
 
     checks = [
@@ -299,10 +299,10 @@ def _extras() -> list[Check]:
 
 
 def _vision() -> list[Check]:
-    """Foundation models: transformers and the weights."""
+    """Check foundation models: transformers and the weights."""
     from ambiguous_wild.vision import weights
 
-    # those of LPIPS are listed by metric
+    # Weights of LPIPS are listed by metric.
     listed = {w.name: w for w in weights.KNOWN if "LPIPS" not in w.used_for}
     return [
         _installed("transformers", "masks", "DINO features, SAM masks"),
@@ -313,18 +313,18 @@ def _vision() -> list[Check]:
     ]
 
 
-def _torchvision(found: Probe | None) -> Check:
-    """Not needed; but if it is installed and broken, transformers cannot be imported."""
-    if found is None:
+def _torchvision(probed: Probe | None) -> Check:
+    """Check torchvision: it is not needed, but a broken one keeps transformers from being imported."""
+    if probed is None:
         return _optional("torchvision", True, "not installed, not needed")
-    if found.facts is not None:
-        return _optional("torchvision", True, f"{found.facts['version']}, not needed")
-    why = f"broken, and breaks transformers: {found.error}"
+    if probed.facts is not None:
+        return _optional("torchvision", True, f"{probed.facts['version']}, not needed")
+    why = f"broken, and breaks transformers: {probed.error}"
     return _optional("torchvision", False, why, f"{_PIP} uninstall -y torchvision")
 
 
 def _metrics() -> list[Check]:
-    """LPIPS per metric, because each needs two files."""
+    """Check LPIPS metric by metric, because each needs two files."""
     from ambiguous_wild.metrics import lpips
     from ambiguous_wild.vision import weights
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     "--recommend", "recommended", type=PathName(file_okay=False), metavar="SCENE",
     help="Name the best measured setting for this scene within the time of --budget.",
 )  # fmt: skip
-@click.option("--budget", metavar="TIME", help="With --recommend: training time here, e.g. 90s, 5m.")
+@click.option("--budget", metavar="TIME", help="With --recommend: training time on this machine, e.g. 5m.")
 @click.option("--plots/--no-plots", default=True, show_default=True, help="Draw SVG and PNG.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def command(
@@ -72,13 +72,13 @@ def command(
         raise AwError(
             "--recommend SCENE and --budget TIME belong together, e.g. --recommend scene --budget 5m"
         )
-    found = read_cost_runs(runs, scenes=scenes)
+    cost_runs = read_cost_runs(runs, scenes=scenes)
     if recommended is not None and budget is not None:
-        _recommend(found, recommended, budget, as_json)
+        _recommend(cost_runs, recommended, budget, as_json)
         return
     made_by = command_line(runs, output, targets, scenes, with_setup)
-    report = cost_report(found, targets=targets, setup=with_setup, made_by=made_by)
-    check_output(output / "cost.json")  # not before: it makes the folder, and there may be nothing to write
+    report = cost_report(cost_runs, targets=targets, setup=with_setup, made_by=made_by)
+    check_output(output / "cost.json")  # only now, because it makes the folder
     written = write_report(report, output)
     if plots:
         from ambiguous_wild.report.cost_plots import draw_all
@@ -88,7 +88,7 @@ def command(
     click.echo(f"wrote {', '.join(p.name for p in written)} in {output}", err=True)
 
 
-def _recommend(found: CostRuns, scene: Path, budget: str, as_json: bool) -> None:
+def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> None:
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.harness.cell import scene_identity
     from ambiguous_wild.io.scene_folder import load_scene
@@ -97,13 +97,13 @@ def _recommend(found: CostRuns, scene: Path, budget: str, as_json: bool) -> None
 
     seconds = parse_budget(budget)
     opened = load_scene(scene, verify="quick")
-    speed = speed_here(found) if found.reference else 1.0
-    advice = recommend(found.runs, opened.name, seconds, speed=speed, scene_hash=scene_identity(opened))
-    if not found.reference:
-        click.echo("the runs have wall seconds alone: this machine is taken for theirs", err=True)
+    speed = speed_here(cost_runs) if cost_runs.reference else 1.0
+    advice = recommend(cost_runs.runs, opened.name, seconds, speed=speed, scene_hash=scene_identity(opened))
+    if not cost_runs.reference:
+        click.echo("the runs have wall times only: this machine is assumed to be as fast as theirs", err=True)
     if as_json:
-        told = dataclasses.asdict(advice) | {"command": advice.command(str(scene))}
-        click.echo(json.dumps(finite(told), indent=2))
+        facts = dataclasses.asdict(advice) | {"command": advice.command(str(scene))}
+        click.echo(json.dumps(finite(facts), indent=2))
     else:
         click.echo(in_words(advice, str(scene)), nl=False)
 
@@ -111,7 +111,7 @@ def _recommend(found: CostRuns, scene: Path, budget: str, as_json: bool) -> None
 def command_line(
     runs: tuple[Path, ...], output: Path, targets: tuple[float, ...], scenes: tuple[str, ...], setup: bool
 ) -> str:
-    """The command that makes this report again."""
+    """Return the command that makes this report again."""
     words = ["aw", "cost", *map(str, runs), "-o", str(output)]
     for target in targets:
         words += ["--target", f"{target:g}"]

@@ -1,4 +1,4 @@
-"""`aw import`, `fetch`, `export-scene`, `package` and `verify`: scenes from elsewhere, and for others."""
+"""`aw import`, `fetch`, `export-scene`, `package` and `verify`: datasets in other layouts, releases."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from ambiguous_wild.cli.options import PathName, threads_option
 from ambiguous_wild.core.errors import AwError, shortlist
+
+if TYPE_CHECKING:
+    from ambiguous_wild.datasets.write import ImportRecord
 
 KINDS = (
     "on-the-go", "robustnerf", "photo-tourism", "drone", "dualsplat", "nerfbaselines", "nerfstudio",
@@ -49,7 +52,7 @@ KINDS = (
     help="Seed of matching and of random points.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace a scene imported from other files or settings.")
-@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def import_command(
     source: Path,
     output: Path,
@@ -92,8 +95,8 @@ def import_command(
     click.echo(f"next: aw bench --method refinesplat --scene {shlex.quote(str(output))} -o runs")
 
 
-def summary(info: dict[str, Any], why: str) -> list[str]:
-    """What was recognised, counted and decided."""
+def summary(info: ImportRecord, why: str) -> list[str]:
+    """Return lines on what was recognised, counted and decided."""
     counts, imported = info["counts"], info["imported"]
     protocol = info.get("evaluation", {}).get("protocol", "full")
     measured = {"full": "whole test photos", "half": "right halves of test photos"}[protocol]
@@ -111,9 +114,9 @@ def summary(info: dict[str, Any], why: str) -> list[str]:
 @click.option(
     "-o", "--output", type=PathName(), default=Path("datasets"), show_default=True, help="Folder of datasets."
 )
-@click.option("--list", "listing", is_flag=True, help="List what can be fetched: licence, size, page.")
+@click.option("--list", "listing", is_flag=True, help="List the datasets: licence, size, page.")
 @click.option("--unpack/--no-unpack", default=True, show_default=True, help="Unpack the archive.")
-@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, as_json: bool) -> None:
     """Download the dataset NAME and unpack it. An interrupted download continues.
 
@@ -150,8 +153,8 @@ def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, a
         facts = {"archive": str(done.archive), "folder": str(done.folder) if done.folder else None}
         click.echo(json.dumps({**facts, "sha256": done.sha256, "first": done.first}, indent=2))
         return
-    known = "recorded now, nothing to compare with" if done.first else "as known"
-    click.echo(f"{done.archive}: sha256 {done.sha256[:16]}... ({known})")
+    state = "recorded now, nothing to compare with" if done.first else "as recorded before"
+    click.echo(f"{done.archive}: sha256 {done.sha256[:16]}... ({state})")
     if done.folder is not None:
         click.echo(
             f"unpacked into {done.folder}; next: aw import {shlex.quote(str(done.folder))}/SCENE -o SCENE"
@@ -169,7 +172,7 @@ def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, a
 )
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder to make.")
 @click.option("--copy", is_flag=True, help="Copy photos instead of linking them.")
-@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_json: bool) -> None:
     """Write SCENE in another tool's layout: photos at their training size, cameras, split, points, masks."""
     from ambiguous_wild.datasets.export import export_scene
@@ -193,7 +196,7 @@ def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_js
     help="YAML file with licence, consent, creators; see --template.",
 )
 @click.option("--template", type=PathName(dir_okay=False), help="Write an empty --info file and stop.")
-@click.option("--keep-metadata", is_flag=True, help="Leave EXIF (places, serial numbers) in the photos.")
+@click.option("--keep-metadata", is_flag=True, help="Keep EXIF (places, serial numbers) in the photos.")
 @click.option(
     "--people/--no-people",
     default=True,
@@ -201,7 +204,7 @@ def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_js
     help="List photos in which a detector sees a person; it misses most people.",
 )
 @threads_option
-@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def package_command(
     scenes: tuple[Path, ...],
     output: Path | None,
@@ -271,7 +274,7 @@ def package_command(
 @click.option(
     "--scratch", type=PathName(file_okay=False), help="Folder to unpack in.  [default: the system's]"
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def verify_command(package: Path, scratch: Path | None, as_json: bool) -> None:
     """Check PACKAGE, a folder of 'aw package' or one of its archives: every checksum, table and scene.
 
@@ -279,11 +282,11 @@ def verify_command(package: Path, scratch: Path | None, as_json: bool) -> None:
     """
     from ambiguous_wild.datasets.verify import verify
 
-    found = verify(package, scratch=scratch)
+    verified = verify(package, scratch=scratch)
     if as_json:
-        facts = {"scenes": found.scenes, "files": found.files, "warnings": found.warnings}
+        facts = {"scenes": verified.scenes, "files": verified.files, "warnings": verified.warnings}
         click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
         return
-    for warning in found.warnings:
+    for warning in verified.warnings:
         click.echo(f"warning: {warning}")
-    click.echo(f"{package} is whole: {len(found.scenes)} scenes, {found.files} files")
+    click.echo(f"{package} is whole: {len(verified.scenes)} scenes, {verified.files} files")

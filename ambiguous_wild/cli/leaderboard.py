@@ -22,7 +22,7 @@ _board = click.option(
     show_default=True,
     help="Folder of the leaderboard.",
 )
-_json = click.option("--json", "as_json", is_flag=True, help="Print the same facts as JSON.")
+_json = click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 
 
 @click.group("leaderboard")
@@ -95,10 +95,10 @@ def add_command(
         )
     _print_reports(reports, as_json)
     counts = Counter(r.outcome for r in reports)
-    told = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
+    outcomes = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
     dry_note = " (nothing written)" if dry_run else ""
     click.echo(
-        f"{len(reports)} run{'' if len(reports) == 1 else 's'}: {told}{dry_note}; board {board}", err=True
+        f"{len(reports)} run{'' if len(reports) == 1 else 's'}: {outcomes}{dry_note}; board {board}", err=True
     )
     if counts["refused"]:
         sys.exit(AwError.exit_code)
@@ -117,7 +117,7 @@ def _print_reports(reports: list[AddReport], as_json: bool) -> None:
 
 
 class _bar:
-    """A bar over the runs, where somebody looks."""
+    """A bar over the runs, shown in a terminal only."""
 
     def __enter__(self) -> Any:
         self.bar: Any = None
@@ -207,12 +207,12 @@ def publish_command(
     )
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(done), indent=2))
-    told = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures"
+    summary = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures"
     if models:
-        told += f", {done.model_pages} pages with models"
+        summary += f", {done.model_pages} pages with models"
     if done.reported_from is not None:
-        told += f", {done.reported} reported numbers from {done.reported_from}"
-    click.echo(f"wrote {output / 'index.html'}: {told}", err=True)
+        summary += f", {done.reported} reported numbers from {done.reported_from}"
+    click.echo(f"wrote {output / 'index.html'}: {summary}", err=True)
 
 
 @command.command("check")
@@ -228,12 +228,12 @@ def check_command(board: Path, as_json: bool) -> None:
     from ambiguous_wild.core import AwError
     from ambiguous_wild.report.board_edit import check
 
-    found = check(board)
+    result = check(board)
     if as_json:
-        click.echo(json.dumps(dataclasses.asdict(found), indent=2, ensure_ascii=False))
+        click.echo(json.dumps(dataclasses.asdict(result), indent=2, ensure_ascii=False))
     else:
-        for problem in found.problems:
+        for problem in result.problems:
             click.secho(f"wrong: {problem}", fg="red")
-    click.echo(f"{found.runs} runs: {len(found.problems)} problems; board {board}", err=True)
-    if found.problems:
+    click.echo(f"{result.runs} runs: {len(result.problems)} problems; board {board}", err=True)
+    if result.problems:
         sys.exit(AwError.exit_code)

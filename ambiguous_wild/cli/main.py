@@ -1,6 +1,6 @@
 """`aw`: parse, call, print. A command's module is imported only when that command runs.
 
-Options that had another name in the version before: the old name works once more, and prints a line.
+An option that was renamed since the last version still works under its old name, with a note.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import click
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, logged_to, unknown
 
-POSITIONAL, GONE = "", None  # instead of a name: the value alone; neither name nor value
+POSITIONAL, GONE = "", None  # new names: only the value is kept; neither name nor value is kept
 _OUT = {"--out": "--output"}
 _JOBS = {"--jobs": "--threads"}
 _SCENE = {"--scene": "--only", "--scene-folder": "--scene"}
 
-# Command -> its options' old names -> names of today.
+# Command -> old name of an option -> present name.
 RENAMED: dict[str, dict[str, str | None]] = {
     "simulate": {**_OUT, "--sheet": "--pictures", "--no-sheet": "--no-pictures"},
     "plan": {**_OUT},
@@ -52,32 +52,32 @@ _NAMES_OR_FOLDERS = {"view", "video"}  # --scene was the name of a scene, and is
 
 
 def with_new_names(args: Sequence[str]) -> list[str]:
-    """The words after `aw` with today's names of options; each old one is told once on stderr."""
+    """Replace old names of options in the words after `aw`, with a line on stderr for each old name."""
     length = next((n for n in (2, 1) if " ".join(args[:n]) in RENAMED), 0)
     command = " ".join(args[:length])
     names, words = dict(RENAMED.get(command, {})), list(args)
     if command == "ambiguity-report" and {"keep", "--masks-white=keep"} & {*words}:
         names["--masks"] = "--keep-masks"
-    found, told = words[:length], dict[str, str]()
+    renamed, notes = words[:length], dict[str, str]()
     words = words[length:]
     while words and words[0] != "--":
         old, equals, value = words.pop(0).partition("=")
         following = value or "".join(words[:1])
         folder = "/" in following or Path(following).is_dir()
         if old not in names or (command in _NAMES_OR_FOLDERS and old == "--scene" and folder):
-            found.append(old + equals + value)
+            renamed.append(old + equals + value)
             continue
         new = names[old]
-        told[old] = "not needed any more" if new is GONE else new or "given without a name"
+        notes[old] = "not needed any more" if new is GONE else new or "given without a name"
         if new:
-            found.append(new + equals + value)
+            renamed.append(new + equals + value)
         elif new == POSITIONAL and equals:
-            found.append(value)
+            renamed.append(value)
         elif new is GONE and not equals:
             del words[:1]
-    for old, new_name in told.items():
+    for old, new_name in notes.items():
         click.echo(f"{old} is now {new_name}; the old name works in this version only", err=True)
-    return found + words
+    return renamed + words
 
 
 # command -> (module, one line of help); help is here so that `aw --help` imports no command.
@@ -144,7 +144,7 @@ class _LazyGroup(click.Group):
         if name not in COMMANDS:
             return None
         module = importlib.import_module(f"ambiguous_wild.cli.{COMMANDS[name][0]}")
-        # a module of several commands names them
+        # A module with several commands has a function NAME_command for each.
         return getattr(module, f"{name.replace('-', '_')}_command", None) or module.command
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -154,7 +154,7 @@ class _LazyGroup(click.Group):
 
     def resolve_command(self, ctx: click.Context, args: list[str]):
         args = with_new_names(args)
-        if args[:1] == ["help"]:  # as git has it
+        if args[:1] == ["help"]:  # as in git
             if not args[1:]:
                 click.echo(ctx.get_help())
                 ctx.exit()
@@ -197,7 +197,7 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
 
 
 def _printed() -> logging.Handler:
-    """Prints records above a bar."""
+    """Return a handler that prints records above a progress bar."""
     from tqdm import tqdm
 
     handler = logging.Handler()
@@ -207,7 +207,7 @@ def _printed() -> logging.Handler:
 
 def main() -> None:
     """Run the command line: one red line and exit code 2 for errors that the user can fix."""
-    # a closed standard output (`>&-`) is None in Python
+    # Python sets a closed standard output (`>&-`) to None.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - until the process ends
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     try:
@@ -215,14 +215,14 @@ def main() -> None:
         cli.main(standalone_mode=False)
     except AwError as error:
         _fail(str(error))
-    except click.exceptions.NoArgsIsHelpError as error:  # `aw`, `aw study`: a question, not a mistake
+    except click.exceptions.NoArgsIsHelpError as error:  # `aw` and `aw study` alone ask for help
         click.echo(error.format_message())
     except click.ClickException as error:
         _fail(_click_message(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:
-        # click puts its own exception before the one that says what was kept
-        told = str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
-        click.secho(told, fg="yellow", err=True)
+        # click wraps the exception that says what was kept.
+        text = str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
+        click.secho(text, fg="yellow", err=True)
         sys.exit(130)
     except BrokenPipeError:
         # The reader closed our output (`aw table | head`); this is not an error.
@@ -245,7 +245,7 @@ _THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS
 
 
 def _check_threads() -> None:
-    """Raise AwError where a variable that the libraries count threads by is no number from 1 on."""
+    """Raise AwError if a variable that sets the libraries' threads is no number from 1 on."""
     for name in _THREADS:
         words = os.environ.get(name, "").strip()
         if words and not re.fullmatch(r"[0 ]*[1-9]\d{0,5}( *, *\d{1,6})*", words):
@@ -271,7 +271,7 @@ def _click_message(error: click.ClickException) -> str:
 
 
 def _fail(message: str) -> None:
-    shown = message.encode("utf-8", "backslashreplace").decode()  # names of files may be no text
+    shown = message.encode("utf-8", "backslashreplace").decode()  # names of files may not be UTF-8
     click.secho("error: " + " ".join(shown.split()), fg="red", err=True)
     sys.exit(AwError.exit_code)
 

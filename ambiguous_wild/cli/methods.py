@@ -1,4 +1,4 @@
-"""`aw methods`: the available methods, one of them in full, or what they consist of."""
+"""`aw methods`: list the methods, show one of them in full, or compare their parts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ WIDTH = 100
 def command(names: tuple[str, ...], table: bool, plugins: tuple[Path, ...], as_json: bool) -> None:
     """List the methods: name, summary, paper, extra requirements.
 
-    With NAME: what differs from its release and why, its features there and here, its options with their
-    defaults, and its ablations.
+    With NAME: differences from the published code and why, features in the publication and here, options with
+    their defaults, and ablations.
     """
     from ambiguous_wild.methods.registry import all_methods, get_method, load_plugin
 
@@ -79,11 +79,11 @@ def _table(entries: Sequence[MethodEntry], as_json: bool) -> None:
 def _in_full(entries: Sequence[MethodEntry], as_json: bool) -> None:
     from ambiguous_wild.methods.describe import details
 
-    found = [details(entry) for entry in entries]
+    described = [details(entry) for entry in entries]
     if as_json:
-        click.echo(json.dumps(found, indent=2, ensure_ascii=False))
+        click.echo(json.dumps(described, indent=2, ensure_ascii=False))
         return
-    for number, one in enumerate(found):
+    for number, one in enumerate(described):
         click.echo("\n" * bool(number), nl=False)
         _show(one)
 

@@ -97,8 +97,8 @@ _TRAINING = (
         flag_value="always",
         default="missing",
         show_default=True,
-        help="missing: train what is not finished; changed: also where a method's file has changed; never: skip "
-        "existing folders; always, or no word: train again.",
+        help="missing: train unfinished runs; changed: also runs whose method's file has changed; never: skip "
+        "existing folders; always, or no word: train all again.",
     ),
     click.option(
         "--cache",
@@ -139,14 +139,14 @@ _ENGINE = (
 
 
 def engine_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add them to a click command, as one argument `engine`: an `Engine`."""
+    """Add the engine's options to a click command, which gets them as one argument `engine`, an `Engine`."""
 
     def with_engine(**values: Any) -> Any:
         names = [f for f in Engine.__dataclass_fields__ if f in values]
         return command(engine=Engine(**{name: values.pop(name) for name in names}), **values)
 
     with_engine.__doc__, with_engine.__name__ = command.__doc__, command.__name__
-    # Options added below this one are on the function already.
+    # Keep the options that decorators below this one have added.
     with_engine.__dict__.update(command.__dict__)
     wrapped: Callable[..., Any] = with_engine
     for option in reversed(_ENGINE):
@@ -155,12 +155,12 @@ def engine_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def choose_device(device: str) -> str:
-    """The device for "cpu", "cuda" or "auto": auto is the GPU if torch and gsplat can use one.
+    """Choose the device for "cpu", "cuda" or "auto": auto is the GPU if torch and gsplat can use one.
 
     Compiles gsplat's kernels if needed; reports a GPU that cannot be used on stderr.
 
     Raises:
-        AwError: cuda was requested but is not usable; names what is missing.
+        AwError: cuda was requested but cannot be used; the message names what is missing.
     """
     if device == "cpu":
         return "cpu"

@@ -32,7 +32,7 @@ MASKS = (
     "--probe/--no-probe",
     default=True,
     show_default=True,
-    help="Try effects and masks in short trainings on small photos; without, the limits decide alone.",
+    help="Try effects and masks in short trainings on small photos; without probes only the limits decide.",
 )
 @click.option(
     "--iterations",
@@ -62,8 +62,8 @@ def command(
 ) -> None:
     """Measure SCENE and decide which effects it needs: evidence, limit, gain of a probe, decision and cost.
 
-    An effect from its limit on is tried: two short trainings with and without it, measured on pixels that
-    both leave out. 'aw bench --effects auto' decides the same way, but not about masks.
+    An effect that reaches its limit is tried in two short trainings, with and without it, and measured on pixels
+    that both leave out. 'aw bench --effects auto' decides the same way, but not about masks.
     """
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.effects_plan import plan_without_training
@@ -101,7 +101,7 @@ def command(
 
 
 def _probed(scene: Scene, iterations: int, path: Path, quiet: bool) -> Plan:
-    """The plan from probes; those of effects are kept beside its file until it is written."""
+    """Make the plan from probes; finished probes are kept beside its file until it is written."""
     from tqdm import tqdm
 
     from ambiguous_wild.harness.make_plan import plan_with_probes
@@ -122,7 +122,7 @@ def _probed(scene: Scene, iterations: int, path: Path, quiet: bool) -> Plan:
 
 
 def _check_overwrite(path: Path, probe: bool) -> None:
-    """Only an earlier plan may be replaced, and not one with a probe by one without."""
+    """Refuse to replace any other file than a plan, or a plan with probes by one without."""
     from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.effects_plan import read_plan
 
@@ -139,7 +139,7 @@ def _check_overwrite(path: Path, probe: bool) -> None:
 
 
 def table(plan: Plan) -> list[str]:
-    """The plan as text lines for a terminal."""
+    """Return the plan as text lines for a terminal."""
     head = ("effect", "evidence", "found", "from", "gain", "decision", "ms/iteration", "why")
     rows = [head, *(_row(d) for d in plan.decisions)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]

@@ -1,4 +1,4 @@
-"""What commands print while runs are made, and when all are made."""
+"""Print the progress of runs, and a summary when all have ended."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class ProgressBar(Callbacks):
-    """A bar for each run, for runs that are made one by one; it says what is done beside the steps."""
+    """A bar for each run, if runs are made one by one; it also names work between the steps."""
 
     def __init__(self, cells: int) -> None:
         self.cells, self.index = cells, 0
@@ -81,7 +81,7 @@ class ProgressBar(Callbacks):
 
 
 class Progress(Callbacks):
-    """Bars for runs made one by one; for several at a time lines, as their bars would mix."""
+    """Bars for runs made one by one; lines for several at a time, because their bars would mix."""
 
     def __init__(self) -> None:
         self.shown: Callbacks = Lines(say)
@@ -105,7 +105,7 @@ class Progress(Callbacks):
 
 
 def finish(report: BenchReport, as_json: bool) -> None:
-    """Print what became of the runs and how to compare them.
+    """Print how the runs ended and how to compare them.
 
     Raises:
         AwError: a run failed.

@@ -126,16 +126,16 @@ def simulate_command(
 
 
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:
-    """Number of train photos whose share of distractors is clearly outside ``spec.occlusion``."""
+    """Count the train photos whose share of distractors is clearly outside ``spec.occlusion``."""
     low, high = spec.occlusion
     if not spec.distractors or all(d.path == "walk" for d in spec.distractors):
-        return 0  # walkers have no choice of place
-    slack = 0.02 + 0.1 * (high - low)  # shares were chosen in a small preview
+        return 0  # the place of a walker is given, not chosen
+    slack = 0.02 + 0.1 * (high - low)  # because layouts were chosen by a small preview
     return sum(not low - slack <= photo["occlusion"] <= high + slack for photo in photos.values())
 
 
 def _never_seen(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> list[str]:
-    """Names of distractors with a presence above 0 that no train photo shows."""
+    """Return the names of distractors with a presence above 0 that no train photo shows."""
     seen = {d["distractor"] for photo in photos.values() for d in photo["distractors"] if d["occlusion"] > 0}
     return [d.name for d in spec.distractors if d.name not in seen and d.presence > 0]
 
@@ -159,7 +159,7 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
 @click.option("--cutouts", type=PathName(), help="Folder of PNG files with alpha as the mask.")
 @click.option("--patches", is_flag=True, help="Fill the shapes with pieces of the photos.")
 @click.option(
-    "--coverage", type=Number(), default=0.15, show_default=True, help="Mean covered share of photos."
+    "--coverage", type=Number(), default=0.15, show_default=True, help="Mean covered share of a train photo."
 )
 @click.option(
     "--presence",
@@ -193,11 +193,11 @@ def composite_command(
     as_json: bool,
     **settings: Any,  # fields of `CompositeConfig`
 ) -> None:
-    """Add distractors to the train photos of SOURCE, in each photo at other places. Test photos do not change.
+    """Add distractors to the train photos of SOURCE, at other places in each photo. Test photos do not change.
 
-    SOURCE is a scene: the output is a scene, with the poses of the clean photos. Or it is a folder of at least six
-    plain photos: the output is a capture for 'aw build-scene', every sixth photo for test, so that structure from
-    motion sees the distractors.
+    From a scene it makes a scene with the poses of the clean photos. From a folder of at least six plain photos
+    it makes a capture for 'aw build-scene', with every sixth photo for testing, so that structure from motion sees
+    the distractors.
 
     --patches without --cutouts draws rounded shapes.
     """

@@ -13,7 +13,7 @@ from ambiguous_wild.cli.options import PathName
 
 @click.command("stress")
 @click.option(
-    "--only", multiple=True, metavar="CASE", help="Number (4), name or part of a name of a case; repeatable."
+    "--only", multiple=True, metavar="CASE", help="Only this case: number or part of its name; repeatable."
 )
 @click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
 @click.option(
@@ -95,8 +95,8 @@ def command(
 def _devices(wanted: str) -> list[str]:
     from ambiguous_wild.cli.options import choose_device, prepare_cpu
 
-    found = choose_device(wanted)  # its error names what is missing for a GPU
-    devices = ["cuda"] if wanted == "cuda" else ["cpu"] if found == "cpu" else ["cpu", "cuda"]
+    usable = choose_device(wanted)  # its error names what is missing for a GPU
+    devices = ["cuda"] if wanted == "cuda" else ["cpu"] if usable == "cpu" else ["cpu", "cuda"]
     if "cpu" in devices:
         prepare_cpu(None)
     return devices

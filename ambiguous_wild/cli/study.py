@@ -85,8 +85,8 @@ def make_command(
     questions: int, truth: bool, outline: bool, side: int, quality: int, title: str, seed: int, overwrite: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Write the study as one HTML file that works offline and on a phone: about the test renders in RUNS, the
-    output of 'aw bench', about the photos of --scene, or both.
+    """Write the study as one HTML file that works offline and on a phone. It asks about the test renders in RUNS
+    (the output of 'aw bench'), about the photos of --scene, or about both.
 
     The page contains no names of methods, scenes or files. The key does: do not give it to raters.
     """
@@ -125,18 +125,18 @@ def make_command(
     if runs is not None:
         asked += render_pairs(runs, methods=methods, scenes=scenes, truth=truth)
     settings = StudySettings(title=title, limit=questions, side=side, quality=quality, seed=seed)
-    made = make_study(
+    study = make_study(
         asked, output, key, settings, lambda q: tqdm(q, unit="question", disable=as_json or None)
     )
     if as_json:
-        facts = {k: str(v) if isinstance(v, Path) else v for k, v in vars(made).items()}
+        facts = {k: str(v) if isinstance(v, Path) else v for k, v in vars(study).items()}
         click.echo(json.dumps(facts, indent=2))
         return
     click.echo(
-        f"wrote {made.page} ({made.photos} questions about photos, {made.pairs} about renders, "
-        f"{made.pictures} images, {made.megabytes:.1f} MB)"
+        f"wrote {study.page} ({study.photos} questions about photos, {study.pairs} about renders, "
+        f"{study.pictures} images, {study.megabytes:.1f} MB)"
     )
-    click.echo(f"wrote {made.key}: keep it private, it names the method of each render")
+    click.echo(f"wrote {study.key}: keep it private, it names the method of each render")
 
 
 @command.command("score")
@@ -167,15 +167,15 @@ def score_command(
     from ambiguous_wild.study.report import SCORE_FILES, markdown_of, write_scores
     from ambiguous_wild.study.scores import score
 
-    known = read_key(key)
-    raters = read_answers(answers, known, lambda text: click.echo(f"warning: {text}", err=True))
+    key_of_study = read_key(key)
+    raters = read_answers(answers, key_of_study, lambda text: click.echo(f"warning: {text}", err=True))
     folder = output or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
     if folder.is_dir():
         refuse_strangers(folder, SCORE_FILES)
         if not is_record(folder / "scores.json", "raters"):
             refuse_files_there(folder, SCORE_FILES)
     check_output(folder)
-    scores = score(known, raters, seed)
+    scores = score(key_of_study, raters, seed)
     write_scores(scores, folder)
     click.echo(json.dumps(scores, indent=2, ensure_ascii=False) if as_json else markdown_of(scores))
     if not as_json:

@@ -49,7 +49,7 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
     "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
     help="Group these scenes as dataset NAME; repeatable.  [default: as in the papers' tables]",
 )  # fmt: skip
-@click.option("--all", "everything", is_flag=True, help="Text tables with every column, however wide.")
+@click.option("--all", "everything", is_flag=True, help="Show every column of text tables, however wide.")
 @click.option("--reported", is_flag=True, help="Also show numbers from papers, in separate rows.")
 @click.option(
     "--reported-from", type=PathName(exists=True),
@@ -75,9 +75,9 @@ def table_command(
 ) -> None:
     """Compare the runs below the folders RUNS: quality, cost and masks, method by method.
 
-    Means are over images, then seeds, then scenes. What is missing, failed or not comparable is named below
-    the table (for CSV: on standard error). Where several folders hold runs of one method, scene and seed, the
-    rows of this method name their folder.
+    Means are over images, then seeds, then scenes. Missing, failed and incomparable runs are named below the
+    table (for CSV: on standard error). If several folders hold runs of one method, scene and seed, the rows of
+    this method name their folder.
 
     \b
     aw table runs
@@ -109,27 +109,27 @@ def table_command(
                 )
     from ambiguous_wild.io.files import write_text
 
-    found = None if layout == "ablation" else _read(runs)
-    if sheet is not None and found is not None:
+    loaded = None if layout == "ablation" else _read(runs)
+    if sheet is not None and loaded is not None:
         from ambiguous_wild.harness.sheets import write_sheet
 
-        shown = write_sheet(found, sheet, scene=scenes[0] if scenes else None)
+        shown = write_sheet(loaded, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
     made_by = "command: " + command_line(
         runs, style, metrics, scenes, layout, datasets, reported, reported_from
     )
     color = style == "text" and output is None and sys.stdout.isatty()
     width = _width(everything, output)
-    if found is not None and layout == "blocks" and style != "html":
-        text, told = _blocks(found, style, metrics, scenes, made_by, color, width)
+    if loaded is not None and layout == "blocks" and style != "html":
+        text, summary = _blocks(loaded, style, metrics, scenes, made_by, color, width)
     else:
-        made = _layouts(found, runs[0], layout, metrics, scenes, _named(datasets), reported, reported_from)
-        text, told = _laid_out(made, style, made_by, color, width)
+        tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported, reported_from)
+        text, summary = _laid_out(tables, style, made_by, color, width)
     if output is None:
         click.echo(text, nl=False)
         return
     write_text(output, text)
-    click.echo(f"wrote {output}: {told}", err=True)
+    click.echo(f"wrote {output}: {summary}", err=True)
 
 
 def _read(runs: Sequence[Path]) -> Runs:
@@ -149,7 +149,7 @@ def _style_of(output: Path | None) -> str:
 
 
 def _width(everything: bool, output: Path | None) -> int | None:
-    """Characters that a row of a text table may have; None: any number."""
+    """Return how many characters a row of a text table may have; None: any number."""
     from ambiguous_wild.report.plain_formats import WIDTH
 
     if everything:
@@ -157,14 +157,14 @@ def _width(everything: bool, output: Path | None) -> int | None:
     return WIDTH if output is not None else shutil.get_terminal_size((WIDTH, 0)).columns
 
 
-def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
+def _write_tidy(loaded: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
     from ambiguous_wild.io.files import write_text
     from ambiguous_wild.report.comparison import tidy
     from ambiguous_wild.report.plain_formats import to_csv
 
-    frame = tidy(found, metrics=metrics, scenes=scenes)
+    frame = tidy(loaded, metrics=metrics, scenes=scenes)
     text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
-    for run in found.incomplete:
+    for run in loaded.incomplete:
         click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
     if output is None:
         click.echo(text, nl=False)
@@ -174,7 +174,7 @@ def _write_tidy(found: Runs, output: Path | None, metrics: Sequence[str], scenes
 
 
 def _blocks(
-    found: Runs,
+    loaded: Runs,
     style: str,
     metrics: Sequence[str],
     scenes: Sequence[str],
@@ -185,17 +185,17 @@ def _blocks(
     from ambiguous_wild.report.papers import cost_at_the_end, in_blocks
     from ambiguous_wild.report.plain_formats import fitted, to_wide_csv
 
-    tables = in_blocks(found, metrics=metrics, scenes=scenes)
+    tables = in_blocks(loaded, metrics=metrics, scenes=scenes)
     if style == "text" and not metrics and width is not None:
         tables = fitted(tables, width)
     scene_count = sum(bool(table.columns[0].scene) for table in tables)
     counts = {"method": len(tables[0].rows), "scene": scene_count, "column": len(tables[0].columns)}
-    told = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
+    summary = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
     if style == "csv":
         _echo_notes(tables, made_by)
-        return to_wide_csv(tables), told
+        return to_wide_csv(tables), summary
     tables = [cost_at_the_end(tables)] if style == "latex" else tables
-    return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color), told
+    return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color), summary
 
 
 def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
@@ -215,7 +215,7 @@ def _written(tables: Sequence[Table], style: str, color: bool) -> str:
 
 
 def _layouts(
-    found: Runs | None,
+    loaded: Runs | None,
     runs: Path,
     layout: str,
     metrics: Sequence[str],
@@ -228,34 +228,36 @@ def _layouts(
     from ambiguous_wild.report.ablation import ablation
     from ambiguous_wild.report.papers import datasets_of, read_reported, with_reported
 
-    if found is None:
+    if loaded is None:
         return ablation(runs, tuple(metrics))
     if layout == "blocks":
-        return papers.in_blocks(found, metrics=metrics, scenes=scenes)
+        return papers.in_blocks(loaded, metrics=metrics, scenes=scenes)
     numbers = read_reported(reported_from) if reported or reported_from else []
     if not datasets:
-        datasets = datasets_of(numbers or read_reported(), sorted(set(found.runs["scene"])))
+        datasets = datasets_of(numbers or read_reported(), sorted(set(loaded.runs["scene"])))
     if layout == "memory":
         metrics = metrics or papers.MEMORY
     if layout == "means":
-        made = papers.means(found, metrics=metrics, scenes=scenes, datasets=datasets)
+        tables = papers.means(loaded, metrics=metrics, scenes=scenes, datasets=datasets)
     else:
         subject = "memory" if layout == "memory" else ""
-        made = papers.paper(found, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
-    return [with_reported(one, numbers) for one in made] if numbers else made
+        tables = papers.paper(loaded, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
+    return [with_reported(one, numbers) for one in tables] if numbers else tables
 
 
-def _laid_out(made: list[Table], style: str, made_by: str, color: bool, width: int | None) -> tuple[str, str]:
+def _laid_out(
+    tables: list[Table], style: str, made_by: str, color: bool, width: int | None
+) -> tuple[str, str]:
     from ambiguous_wild.report.plain_formats import divided, to_long_csv
 
-    told = f"{len(made)} table{'' if len(made) == 1 else 's'}"
+    summary = f"{len(tables)} table{'' if len(tables) == 1 else 's'}"
     if style == "csv":
-        _echo_notes(made, made_by)
-        return to_long_csv(made), told
-    made = [one.with_notes(made_by) for one in made]
+        _echo_notes(tables, made_by)
+        return to_long_csv(tables), summary
+    tables = [one.with_notes(made_by) for one in tables]
     if style == "text" and width is not None:
-        made = [part for one in made for part in divided(one, width)]
-    return _written(made, style, color), told
+        tables = [part for one in tables for part in divided(one, width)]
+    return _written(tables, style, color), summary
 
 
 def _named(datasets: Sequence[str]) -> dict[str, list[str]]:
@@ -279,7 +281,7 @@ def command_line(
     reported: bool = False,
     reported_from: Path | None = None,
 ) -> str:
-    """The command that makes this table again."""
+    """Return the command that makes this table again."""
     words = ["aw", "table", *map(str, runs)]
     words += ["--format", style] if style != "text" else []
     words += ["--layout", layout] if layout != "blocks" else []
@@ -299,11 +301,11 @@ def command_line(
 def rescore_command(
     runs: tuple[Path, ...], scene_folder: Path | None, metrics: tuple[Path, ...], as_json: bool
 ) -> None:
-    """Add metrics that were missing when the runs below RUNS ended, e.g. LPIPS before its weights were there.
+    """Add metrics that were missing when the runs below RUNS ended, e.g. LPIPS whose weights were absent.
 
     Nothing is trained: the saved renders are compared with the scene's test photos. First every number of a
     result is computed again; a run whose renders, photos or settings were changed is refused. metrics.json
-    records what was added, and by which version.
+    records the added metrics and the version that added them.
 
     \b
     aw rescore runs
@@ -314,16 +316,16 @@ def rescore_command(
 
     for file in metrics:
         load_metrics(file)
-    found = rescore(runs, scene=scene_folder)
+    reports = rescore(runs, scene=scene_folder)
     if as_json:
-        click.echo(json.dumps([dataclasses.asdict(r) | {"run": str(r.run)} for r in found], indent=2))
+        click.echo(json.dumps([dataclasses.asdict(r) | {"run": str(r.run)} for r in reports], indent=2))
     else:
-        for r in found:
+        for r in reports:
             what = r.error or (f"added {', '.join(r.added)}" if r.added else "nothing to add")
             still = f"; still missing: {', '.join(r.missing)}" if r.missing and not r.error else ""
             click.echo(f"{r.run}: {what}{still}")
-    counts = Counter(r.outcome for r in found)
+    counts = Counter(r.outcome for r in reports)
     click.echo(", ".join(f"{n} {outcome}" for outcome, n in counts.items()), err=True)
-    refused = [r for r in found if r.outcome == "refused"]
+    refused = [r for r in reports if r.outcome == "refused"]
     if refused:
-        raise AwError(f"{len(refused)} of {len(found)} runs refused: {refused[0].error}")
+        raise AwError(f"{len(refused)} of {len(reports)} runs refused: {refused[0].error}")

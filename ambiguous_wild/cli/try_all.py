@@ -13,13 +13,13 @@ from ambiguous_wild.cli.options import PathName, say, threads_option
 from ambiguous_wild.core.errors import AwError, counted
 
 METHODS = ("3dgs", "refinesplat")
-IN_3DGS = 1 + 1.2  # time of an iteration of both, in iterations of 3dgs (docs/refinesplat.md)
-# Of the time that is left once the scene is built; the plan, measuring and the page take the rest.
+IN_3DGS = 1 + 1.2  # an iteration of 3dgs and one of refinesplat, in iterations of 3dgs (docs/refinesplat.md)
+# Share of the time after the scene is built; the plan, measuring and the page take the rest.
 TRAINING = 0.7
 SHORTEST, LONGEST = 300, 30_000  # iterations; shorter runs show no difference of methods
-FRAMES = 60  # of a video
-# `aw build-scene` on two idle cores, photos of about 1 MP: 11 take 9 to 11 s, 23 take 15, 40 take 43
-SCENE_S = (3.0, 1.0)  # for any scene, for every photo
+FRAMES = 60  # taken from a video
+# 'aw build-scene' on two idle cores with photos of about 1 MP: 11 take 9 to 11 s, 23 take 15 s, 40 take 43 s.
+SCENE_S = (3.0, 1.0)  # for any scene; for each photo
 
 
 @click.command("try")
@@ -31,8 +31,8 @@ SCENE_S = (3.0, 1.0)  # for any scene, for every photo
 def command(ctx: click.Context, source: Path, output: Path, budget: str, threads: int | None) -> None:
     """Try it on your photos: check, scene, plan, 3dgs and refinesplat, page, table.
 
-    Each step is a command that is printed first and can be typed alone. The time decides how many iterations
-    both methods train, 300 at least. If it is stopped, the same command continues.
+    Each step is a command that is printed first and can be run alone. The time decides how many iterations each
+    method trains, at least 300. After an interruption the same command continues.
 
     \b
     aw try photos/ -o out
@@ -81,7 +81,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
 
 
 def _announced(source: Path, seconds: float) -> str:
-    """How long it will take; refuses what is neither photos nor a video before anything is written."""
+    """Return how long it will take; refuse a source that is neither photos nor a video."""
     from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
     count = FRAMES
@@ -103,7 +103,7 @@ def _minutes(seconds: float) -> str:
 
 
 def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
-    """How many iterations both methods can train in this time, measured here; told with its time."""
+    """Print and return how many iterations each method can train in this time on this machine."""
     from ambiguous_wild.cli.options import prepare_cpu
     from ambiguous_wild.harness.timing import expected_s, slowness
     from ambiguous_wild.io.scene_folder import load_scene

@@ -1,4 +1,4 @@
-"""`aw view`, `aw video` and `aw export`: models as people see them, and as other programs read them."""
+"""`aw view`, `aw video` and `aw export`: show models to people, and write them for other programs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _one_scene = click.option(
 @scene_folder_option
 @click.option(
     "--max-gaussians", type=click.IntRange(1), default=MOST_GAUSSIANS, show_default=True,
-    help="A larger model is reduced to this number of Gaussians in the page, with a note.",
+    help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note.",
 )  # fmt: skip
 @plugin_option
 @click.option("--title", help="Title of the page.  [default: the scene's name]")
@@ -130,8 +130,8 @@ def view_command(
         title=title,
         say=say,
     )
-    told = f"{page.bytes / 1e6:.1f} MB, of which models {page.models_bytes / 1e6:.1f} MB"
-    say(f"wrote {page.path}: {told}; open it in a browser")
+    size = f"{page.bytes / 1e6:.1f} MB, of which models {page.models_bytes / 1e6:.1f} MB"
+    say(f"wrote {page.path}: {size}; open it in a browser")
 
 
 @click.command(name="video")
@@ -184,7 +184,7 @@ def video_command(
 
 
 class _Bar:
-    """A bar over the frames, where somebody looks."""
+    """A bar over the frames, shown in a terminal only."""
 
     def __init__(self) -> None:
         self.bar: Any = None
@@ -220,10 +220,10 @@ UPS = ("x", "y", "z", "-x", "-y", "-z")
 )  # fmt: skip
 @click.option(
     "--up", type=click.Choice(UPS),
-    help="Turn the files so that this axis points up as the photos do, with the floor at zero below the middle of "
-    "the scene; glTF: y, always.  [default: the scene's coordinates]",
+    help="Turn the files so that this axis points up, with the floor at zero below the middle of the scene; "
+    "always y in glTF.  [default: the scene's coordinates]",
 )  # fmt: skip
-@click.option("--overwrite", is_flag=True, help="Replace files of these names in the folder of -o.")
+@click.option("--overwrite", is_flag=True, help="Replace existing files of the same names.")
 @click.option(
     "--loss/--no-loss", default=True, show_default=True, help="Render the test views to measure the loss."
 )
@@ -246,8 +246,8 @@ def export_command(
     """Write the models of RUNS (run folders, folders of them, or splat files of any tool: PLY, compressed
     PLY, SPZ, SOG) as compressed PLY, SPZ, SOG, glTF and PLY.
 
-    Prints the size of each file and the loss from its rounding: PSNR against the renders of the model, and dB
-    lost against the test photos. The plain point_cloud.ply stays.
+    Prints the size of each file and the loss by rounding: PSNR against the renders of the model, and dB lost
+    against the test photos. The plain point_cloud.ply is not changed.
 
     \b
     aw export runs
@@ -300,8 +300,8 @@ def _plain(value: object) -> object:
 
 
 def _line(e: Exported) -> str:
-    told = f"{e.format:<14} {e.bytes / 1e6:8.2f} MB  {100 * e.share:5.1f} % of {e.source}"
+    text = f"{e.format:<14} {e.bytes / 1e6:8.2f} MB  {100 * e.share:5.1f} % of {e.source}"
     if e.psnr_to_model is not None and e.lost_db is not None:
         same = "renders the same" if math.isinf(e.psnr_to_model) else f"{e.psnr_to_model:.1f} dB to the model"
-        told += f"  {same}, {e.lost_db:+.3f} dB lost"
-    return f"{told}  {e.path}"
+        text += f"  {same}, {e.lost_db:+.3f} dB lost"
+    return f"{text}  {e.path}"

@@ -17,7 +17,7 @@ def command() -> None:
     \b
     aw weights list                           all networks, their size, licence and source
     aw weights get lpips efficientnet-lite0   download
-    aw weights check                          load what is there and compare hashes
+    aw weights check                          load downloaded networks and compare hashes
     """
 
 
@@ -61,13 +61,13 @@ def list_command(as_json: bool) -> None:
 
 @command.command(name="get")
 @click.argument("names", nargs=-1, required=True)
-@click.option("--overwrite", "again", is_flag=True, help="Download also what is there and seems complete.")
+@click.option("--overwrite", "again", is_flag=True, help="Download networks again that seem complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print names and places as JSON.")
 def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     """Download networks into AW_WEIGHTS (by default ~/.cache/ambiguous_wild/weights).
 
-    What is there already is checked, and downloaded again only if it is damaged. Hashes are checked; pickles are
-    converted to safetensors, and only arrays are read from them.
+    A network that is already there is checked, and downloaded again only if it is damaged. Hashes are checked;
+    pickles are converted to safetensors, and only arrays are read from them.
     """
     from ambiguous_wild.vision import fetch, weights
 

@@ -1,4 +1,4 @@
-"""`aw export-scene`: a scene in the layout of another tool."""
+"""`aw export-scene`: write a scene in the layout of another tool."""
 
 from __future__ import annotations
 
@@ -30,19 +30,17 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """Folder, numbers of photos, and what was left out."""
 
     folder: Path
     photos: int
     train: int
     test: int
-    left_out: tuple[str, ...]  # what the layout cannot hold
+    left_out: tuple[str, ...]  # parts of the scene that the layout cannot hold
 
 
 def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> Exported:
     """Write a scene in another layout, at the size that it is trained at (On-the-go: full size).
-
-    Photos are linked.
 
     Args:
         path: a scene folder.
@@ -78,12 +76,12 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _stored(view: View) -> str:
-    """The photo's name with the extension of the file that is trained on."""
+    """Return the photo's name with the extension of the file that is trained on."""
     return without_suffix(view.name) + view.image_path.suffix
 
 
 def _sized_model(scene: Scene) -> Model:
-    """The model of the split's photos at the size of the loaded files, a camera a distinct intrinsics."""
+    """Return the model of the listed photos at the size of the loaded files, with equal cameras merged."""
     model = read_model(model_folder(scene.root))
     by_name = {view.name: view for view in scene.views}
     cameras: dict[tuple[Any, ...], ModelCamera] = {}
@@ -117,7 +115,7 @@ def _write_lists(scene: Scene, folder: Path) -> None:
 
 
 def _colmap(scene: Scene, folder: Path, place: Place, masks: bool = True) -> list[str]:
-    """images/, sparse/0, lists that some readers know, and keep masks under COLMAP's names."""
+    """Write images/, sparse/0, lists that some readers know, and keep masks under COLMAP's names."""
     for view in scene.views:
         place(view.image_path, folder / "images" / _stored(view))
     write_model(folder / "sparse" / "0", _sized_model(scene))
@@ -129,13 +127,13 @@ def _colmap(scene: Scene, folder: Path, place: Place, masks: bool = True) -> lis
 
 
 def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
-    """As COLMAP, with nb-info.json and keep masks of training photos under its own names."""
+    """Write the COLMAP layout with nb-info.json and with keep masks where NerfBaselines looks for them."""
     _colmap(scene, folder, place, masks=False)
     masked = [view for view in scene.train if view.keep_path is not None]
     for view in masked:
         _write_mask(view, folder / "masks" / f"{without_suffix(view.name)}.png")
     if masked:
-        # NerfBaselines wants a mask for every photo, or none; white uses all of a photo.
+        # NerfBaselines needs a mask for every photo, or none; a white mask uses all of a photo.
         for view in scene.views:
             target = folder / "masks" / f"{without_suffix(view.name)}.png"
             if not target.is_file():
@@ -152,19 +150,19 @@ def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
 
 
 def _half(scene: Scene) -> bool:
-    known = scene.info.get("evaluation")
-    return isinstance(known, dict) and known.get("protocol") == "half"
+    evaluation = scene.info.get("evaluation")
+    return isinstance(evaluation, dict) and evaluation.get("protocol") == "half"
 
 
 def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
-    """transforms.json with lists, points and masks; read with `--data FOLDER nerfstudio-data`."""
+    """Write transforms.json with lists, points and masks, for `--data FOLDER nerfstudio-data`."""
     frames = []
     masked = any(view.keep_path for view in scene.train)
     for view in scene.views:
         name = f"images/{_stored(view)}"
         place(view.image_path, folder / name)
         frame = {"file_path": name, **_intrinsics(view), "transform_matrix": _camera_to_world(view)}
-        if masked:  # nerfstudio wants a mask for every photo, or none
+        if masked:  # nerfstudio needs a mask for every photo, or none
             mask = f"masks/{without_suffix(view.name)}.png"
             _write_mask(view, folder / mask)
             frame["mask_path"] = mask
@@ -183,14 +181,14 @@ def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
 
 
 def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
-    """images/, transforms.json, split.json with positions among the names sorted by base name.
+    """Write images/, transforms.json, and split.json with positions among the names sorted by base name.
 
-    Readers of this layout reduce the photos themselves, so they are full size where the scene has them.
+    Readers of this layout reduce photos themselves, so they are written at full size if the scene has them.
     """
     bases = Counter(PurePosixPath(v.name).stem for v in scene.views)
 
     def flat(view: View) -> str:
-        """The base name, with its folders where another photo has the same."""
+        """Return the base name, with its folders if another photo has the same."""
         name = PurePosixPath(_stored(view))
         return name.name if bases[name.stem] == 1 else "_".join(name.parts)
 
@@ -224,14 +222,14 @@ def _protocol_lost(scene: Scene) -> list[str]:
     return ["the half-photo protocol"] if _half(scene) else []
 
 
-def _intrinsics(view: View) -> dict[str, Any]:
+def _intrinsics(view: View) -> dict[str, object]:
     c = view.camera
     lens = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
     return {"w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, **lens}
 
 
 def _camera_to_world(view: View) -> list[list[float]]:
-    """[4, 4] with OpenGL axes."""
+    """Return the camera-to-world matrix [4, 4] with OpenGL axes."""
     return (np.linalg.inv(view.camera.cam_from_world) @ _OPENGL).tolist()
 
 
@@ -243,7 +241,7 @@ def _write_mask(view: View, target: Path) -> None:
     write_png(target, pixels)
 
 
-def _write_json(path: Path, data: Mapping[str, Any]) -> None:
+def _write_json(path: Path, data: Mapping[str, object]) -> None:
     path.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

@@ -1,9 +1,7 @@
 """The catalogue of public datasets (`public.yaml`), and their download.
 
-A download is resumed after a break, checked by length and hash, and unpacked safely.
-
-The server is not trusted: it may break off, lie about the length, ignore a wish to resume, or serve another
-file on another day.
+A download is resumed after a break, checked by length and hash, and unpacked safely. The server is not
+trusted: it may break off, state a wrong length, ignore a request to resume, or serve another file later.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from ambiguous_wild.io.files import check_output, sha256_file, write_json
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 CATALOGUE = Path(__file__).with_name("public.yaml")
-RECORD = "downloads.json"  # beside the archives: name -> what was downloaded first
+RECORD = "downloads.json"  # file beside the archives: name -> record of the first download
 TRIES = 5
 WAIT_S = 2.0  # before the second try; doubles
 STALL_S = 60.0  # without a byte, a connection counts as broken
@@ -41,13 +39,13 @@ MOST_BYTES = 200_000_000_000
 
 @dataclass(frozen=True)
 class PublicData:
-    """One archive, or a page that leads to one."""
+    """A public dataset: an archive, or a page that leads to one."""
 
     name: str
     page: str
     license: str
     note: str
-    url: str = ""  # empty: only a page
+    url: str = ""  # of the archive; empty = there is only a page
     layout: str = ""
     size_mb: str = ""  # as stated; empty = not stated
     sha256: str = ""  # empty = the publisher states none
@@ -55,30 +53,30 @@ class PublicData:
 
 @cache
 def public_data() -> dict[str, PublicData]:
-    """By name, in the order of the file."""
-    data: dict[str, Any] = read_mapping(CATALOGUE)
+    """Read the catalogue, by name, in the order of the file."""
+    data = read_mapping(CATALOGUE)
     rows = [*data["datasets"], *data["pages"]]
     return {row["name"]: PublicData(**{k: str(v) for k, v in row.items()}) for row in rows}
 
 
 def find_public(name: str) -> PublicData:
-    """The dataset of that name.
+    """Return the dataset of a name.
 
     Raises:
         AwError: there is none, or it has no archive to download.
     """
-    known = public_data()
-    if name not in known:
-        raise unknown("dataset", name, known, "'aw fetch --list' lists them")
-    if not known[name].url:
+    catalogue = public_data()
+    if name not in catalogue:
+        raise unknown("dataset", name, catalogue, "'aw fetch --list' lists them")
+    if not catalogue[name].url:
         raise AwError(
-            f"{name} has no fixed archive: download it from {known[name].page}, then 'aw import' it"
+            f"{name} has no fixed archive: download it from {catalogue[name].page}, then 'aw import' it"
         )
-    return known[name]
+    return catalogue[name]
 
 
 class Download(TypedDict):
-    """What the first download of an archive was."""
+    """Record of the first download of an archive."""
 
     url: str
     sha256: str
@@ -87,17 +85,17 @@ class Download(TypedDict):
 
 @dataclass(frozen=True)
 class Fetched:
-    """An archive on this disk."""
+    """A downloaded archive."""
 
     archive: Path
-    folder: Path | None  # unpacked; None where that was not asked for
+    folder: Path | None  # of the unpacked files; None if it was not unpacked
     sha256: str
-    first: bool  # the hash was recorded now, as none was known
-    downloaded: int  # bytes that came over the network in this call
+    first: bool  # it is the first download, whose hash was recorded
+    downloaded: int  # bytes downloaded in this call
 
 
 class _Broken(Exception):
-    """The transfer stopped before its end; another try may go on."""
+    """The transfer stopped before its end; another try may continue it."""
 
 
 def fetch(
@@ -112,20 +110,20 @@ def fetch(
 ) -> Fetched:
     """Download into `output`/archives and unpack into `output`/NAME.
 
-    A call that was broken off goes on where it stopped. The hash of the first download is kept in
-    downloads.json; another file later is refused.
+    An interrupted call continues where it stopped. The hash of the first download is kept in downloads.json;
+    another file later is refused.
 
     Args:
-        data: of the catalogue.
+        data: dataset of the catalogue.
         output: folder of datasets.
         unpack: also unpack.
-        tries: attempts before giving up; what came stays.
+        tries: attempts before giving up; the downloaded part is kept.
         wait_s: seconds before the second attempt, doubled for each further one.
-        tick: told bytes so far and in all, None where the server does not say.
-        say: told why a try failed.
+        tick: called with bytes so far and in total, None if the server does not state it.
+        say: called with the reason why a try failed.
 
     Raises:
-        AwError: no connection, a file with another hash or length than is known, or a hostile archive.
+        AwError: no connection, another hash or length than recorded, or a hostile archive.
     """
     if urlsplit(data.url).scheme not in ("http", "https"):
         raise AwError(f"{data.name}: its address {data.url[:80]!r} is neither http nor https")
@@ -133,32 +131,32 @@ def fetch(
     check_output(folder / "file")
     archive = folder / _file_name(data)
     with build_lock(archive):
-        known = _read_record(folder).get(data.name)
-        digest = data.sha256 or (known["sha256"] if known is not None else "")
+        prior = _read_record(folder).get(data.name)
+        digest = data.sha256 or (prior["sha256"] if prior is not None else "")
         moved, first = 0, False
         if not archive.is_file():
-            moved = _download(data, archive, known, tries, wait_s, tick, say)
-        found = sha256_file(archive)
-        if digest and found != digest:
+            moved = _download(data, archive, prior, tries, wait_s, tick, say)
+        actual = sha256_file(archive)
+        if digest and actual != digest:
             os.replace(archive, archive.with_suffix(archive.suffix + ".refused"))
             where = "the registry" if data.sha256 else f"{folder / RECORD}, from the first download,"
             raise AwError(
-                f"{data.name}: {archive.name} has sha256 {found[:16]}..., but {where} states "
+                f"{data.name}: {archive.name} has sha256 {actual[:16]}..., but {where} states "
                 f"{digest[:16]}...: the "
                 "server serves another file, or it was changed here; it is kept as .refused, remove "
                 "it to try again"
             )
-        if known is None:
+        if prior is None:
             first = not data.sha256
-            _record(folder, data, archive, found)
+            _record(folder, data, archive, actual)
         target = output / data.name if unpack else None
         if target is not None and not target.is_dir():
             extract(archive, target)
-    return Fetched(archive, target, found, first, moved)
+    return Fetched(archive, target, actual, first, moved)
 
 
 def _file_name(data: PublicData) -> str:
-    """The archive's name here: the dataset's, with the ending of the address."""
+    """Return the archive's file name: the dataset's name with the extension of the address."""
     base = urlsplit(data.url).path.rpartition("/")[2]
     ending = re.search(r"(\.tar)?\.(zip|gz|bz2|tar|tgz)$", base)
     return data.name + (ending[0] if ending else ".archive")
@@ -167,13 +165,13 @@ def _file_name(data: PublicData) -> str:
 def _download(
     data: PublicData,
     archive: Path,
-    known: Download | None,
+    prior: Download | None,
     tries: int,
     wait_s: float,
     tick: Callable[[int, int | None], None],
     say: Callable[[str], None],
 ) -> int:
-    """Bytes that came over the network; the archive is complete afterwards."""
+    """Complete the archive, and return the number of bytes downloaded."""
     part = archive.with_suffix(archive.suffix + ".part")
     state = archive.with_suffix(archive.suffix + ".part.json")
     moved = 0
@@ -182,7 +180,7 @@ def _download(
             time.sleep(wait_s * 2 ** (attempt - 1))
         before = part.stat().st_size if part.is_file() else 0
         try:
-            _transfer(data, part, state, known, tick)
+            _transfer(data, part, state, prior, tick)
             moved += part.stat().st_size - before
             os.replace(part, archive)
             state.unlink(missing_ok=True)
@@ -191,7 +189,7 @@ def _download(
             now = part.stat().st_size if part.is_file() else 0
             moved += max(0, now - before)
             reason = str(error)
-            say(f"{data.name}: {reason}; {now} bytes are here, try {attempt + 1} of {tries}")
+            say(f"{data.name}: {reason}; {now} bytes downloaded so far, try {attempt + 1} of {tries}")
     raise AwError(
         f"{data.name}: {data.url} broke off {tries} times, last: {reason}; what came is kept: run the "
         "same command "
@@ -200,13 +198,13 @@ def _download(
 
 
 def _transfer(
-    data: PublicData, part: Path, state: Path, known: Download | None, tick: Callable[[int, int | None], None]
+    data: PublicData, part: Path, state: Path, prior: Download | None, tick: Callable[[int, int | None], None]
 ) -> None:
-    """One request; appends to `part`.
+    """Make one request, and append its bytes to `part`.
 
     Raises:
         _Broken: it ended early, or the connection failed.
-        AwError: the server refuses, or announces another file than the known one.
+        AwError: the server refuses, or announces another file than the first download.
     """
     have = part.stat().st_size if part.is_file() else 0
     tag = _read_state(state) if have else ""
@@ -222,10 +220,10 @@ def _transfer(
             length = reply.headers.get("Content-Length")
             total = start + int(length) if length and length.isdigit() else None
             etag = reply.headers.get("ETag") or ""
-            if known is not None and total is not None and total != known["bytes"]:
+            if prior is not None and total is not None and total != prior["bytes"]:
                 raise AwError(
                     f"{data.name}: the server now announces {total} bytes, the first download had "
-                    f"{known['bytes']}: "
+                    f"{prior['bytes']}: "
                     f"it is another file; remove the entry in {RECORD} if you trust it"
                 )
             write_json(state, {"etag": "" if etag.startswith("W/") else etag})
@@ -234,7 +232,7 @@ def _transfer(
                 f.truncate()
                 _copy(reply, f, start, total, tick)
     except urllib.error.HTTPError as error:
-        if error.code == 416:  # all of it is here, or more than all: start again
+        if error.code == 416:  # the part has all bytes or too many: start again
             part.unlink(missing_ok=True)
             raise _Broken("the server has no further bytes") from error
         if error.code >= 500 or error.code in (408, 429):
@@ -249,7 +247,7 @@ def _transfer(
 
 
 def _start_of(reply: Any, have: int) -> int:
-    """Where the bytes of the reply begin in the file; 0 where the server sends all of it again."""
+    """Return where the bytes of the reply begin in the file; 0 if the server sends all of it again."""
     if reply.status != 206:
         return 0
     match = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", reply.headers.get("Content-Range") or "")
@@ -280,7 +278,7 @@ def _copy(
 
 
 def _read_state(path: Path) -> str:
-    """The server's tag of the part that is here; empty where it is unknown."""
+    """Read the server's tag of the downloaded part; empty if it is not known."""
     try:
         return str(json.loads(path.read_text(encoding="utf-8")).get("etag", ""))
     except (OSError, ValueError, AttributeError):
@@ -292,10 +290,10 @@ def _read_record(folder: Path) -> dict[str, Download]:
     if not path.is_file():
         return {}
     try:
-        known = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads(path.read_text(encoding="utf-8"))
         return {
             name: Download(url=str(e["url"]), sha256=str(e["sha256"]), bytes=int(e["bytes"]))
-            for name, e in known.items()
+            for name, e in record.items()
         }
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise AwError(

@@ -1,4 +1,4 @@
-"""A scene in somebody else's layout, read but not yet written as a scene folder."""
+"""A scene in another layout than ours, read but not yet written as a scene folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
 
 
 class Evaluation(TypedDict, total=False):
-    """How the dataset's papers measure: scene.json's key "evaluation", which `aw bench` follows."""
+    """How the dataset's papers measure; the key "evaluation" of scene.json, which `aw bench` follows."""
 
     protocol: Literal["full", "half"]
     effects: list[str]  # fitted on the left half of a test photo
@@ -29,35 +29,32 @@ class Evaluation(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class ForeignScene:
-    """What every reader gives.
-
-    Names are those of the model, relative to the folder of photos.
-    """
+    """A scene as every reader returns it, with the model's names, relative to the folder of photos."""
 
     kind: str  # the layout, a key of `readers.READERS`
     root: Path
     model: Model  # poses and cameras at full size; may have no points
     photos: Path  # folder that the model's names refer to
     split: dict[str, Split]  # photos of neither side are left out
-    factor: int = 1  # as published
+    factor: int = 1  # downsampling in the published tables
     missing: dict[Split, list[str]] = field(default_factory=dict)  # listed names that the model lacks
     masks: dict[str, Path] = field(default_factory=dict)  # keep masks of training photos, white = keep
     max_width: int | None = None  # px; wider photos are reduced to it
     background: tuple[int, int, int] | None = None  # RGB, put behind photos with alpha
-    dataset: str = ""  # as result tables call it
+    dataset: str = ""  # its name in result tables
     evaluation: Evaluation = field(default_factory=Evaluation)
-    points: Literal["model", "triangulate", "random"] = "model"  # where initial points come from
-    notes: tuple[str, ...] = ()  # what was decided or left out
+    points: Literal["model", "triangulate", "random"] = "model"  # source of the initial points
+    notes: tuple[str, ...] = ()  # decisions and omissions, for the user
 
 
 def inside(name: str, root: Path) -> str:
-    """A relative name of the dataset, checked to stay below its folder.
+    """Return a relative name of the dataset after checking that it stays below its folder.
 
     Raises:
         AwError: it is absolute, empty or holds "..".
     """
     pure = PurePosixPath(name)
-    if not name.isprintable():  # lists hold one name a line, in UTF-8
+    if not name.isprintable():  # the split lists hold one name a line, in UTF-8
         raise AwError(f"{root} has a photo called {ascii(name)[:80]}, which no list can hold; rename it")
     if pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or "\0" in name:
         raise AwError(f"{root} names a file outside itself: {name[:80]!r}; do not use this dataset")
@@ -65,7 +62,7 @@ def inside(name: str, root: Path) -> str:
 
 
 def read_text(path: Path) -> str:
-    """A text file in UTF-8, with or without byte order mark.
+    """Read a text file in UTF-8, with or without byte order mark.
 
     Raises:
         AwError: unreadable, too large, or another encoding.
@@ -81,12 +78,12 @@ def read_text(path: Path) -> str:
 
 
 def without_suffix(name: str) -> str:
-    """The name without its last extension."""
+    """Return the name without its last extension."""
     return str(PurePosixPath(name).with_suffix(""))
 
 
 def plain(name: str) -> str:
-    """A scene's name without what its spellings differ in: Patio-High, patio_high."""
+    """Normalise a scene's name, so that spellings like Patio-High and patio_high are equal."""
     return "".join(c for c in name.casefold() if c.isalnum())
 
 
@@ -96,13 +93,13 @@ def split_by_lists(
     where: Path,
     key: Callable[[str], str] = without_suffix,
 ) -> tuple[dict[str, Split], dict[Split, list[str]]]:
-    """Sides of the model's photos by lists of names, with or without extension or folder.
+    """Split the model's photos by lists of names, with or without extension or folder.
 
     Args:
-        names: of the model.
+        names: the model's names.
         listed: names by side.
-        where: of the lists, for messages.
-        key: what two spellings of one photo share.
+        where: file or folder of the lists, for messages.
+        key: normalises a name, so that two spellings of one photo are equal.
 
     Returns:
         Sides by name, and per side the listed names that the model lacks.
@@ -110,31 +107,31 @@ def split_by_lists(
     Raises:
         AwError: a photo is on both sides, a spelling fits two photos, or a side has no photo in the model.
     """
-    known = list(names)
+    in_model = list(names)
     exact, by_key, by_base = (
-        set(known),
-        _index(known, key),
-        _index(known, lambda n: key(PurePosixPath(n).name)),
+        set(in_model),
+        _index(in_model, key),
+        _index(in_model, lambda n: key(PurePosixPath(n).name)),
     )
     split: dict[str, Split] = {}
     missing: dict[Split, list[str]] = {}
     for side in SIDES:
         missing[side] = []
         for name in listed[side]:
-            found = [name] if name in exact else by_key.get(key(name)) or by_base.get(key(name), [])
-            if len(found) > 1:
+            fits = [name] if name in exact else by_key.get(key(name)) or by_base.get(key(name), [])
+            if len(fits) > 1:
                 raise AwError(
-                    f"{where}: {name!r} fits {shortlist(found, 3)}; write the extension or the folder"
+                    f"{where}: {name!r} fits {shortlist(fits, 3)}; write the extension or the folder"
                 )
-            if not found:
+            if not fits:
                 missing[side].append(name)
-            elif split.setdefault(found[0], side) != side:
+            elif split.setdefault(fits[0], side) != side:
                 raise AwError(f"{where}: {name!r} is in the training and in the test list; keep it in one")
     for side in SIDES:
         if side not in split.values():
             raise AwError(
                 f"{where}: none of the {len(listed[side])} {side} photos is in the model "
-                f"({shortlist(listed[side], 3)}; the model has {shortlist(sorted(known), 3)}): the "
+                f"({shortlist(listed[side], 3)}; the model has {shortlist(sorted(in_model), 3)}): the "
                 "list belongs "
                 "to another scene"
             )
@@ -142,24 +139,25 @@ def split_by_lists(
 
 
 def _index(names: Iterable[str], key: Callable[[str], str]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
+    names_of: dict[str, list[str]] = {}
     for name in names:
-        found.setdefault(key(name), []).append(name)
-    return found
+        names_of.setdefault(key(name), []).append(name)
+    return names_of
 
 
 def every_nth(names: Iterable[str]) -> tuple[dict[str, Split], str]:
-    """Sides where the dataset states none: every 8th photo tests; and the note that says so."""
+    """Split a dataset without a split, every 8th photo into the test set; also return a note about it."""
     sides: dict[str, Split] = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(sorted(names))}
-    return sides, f"no test set given: every {TEST_EVERY}th photo tests, distractors in it count as truth"
+    note = f"no test set given: every {TEST_EVERY}th is a test photo; distractors in it count as truth"
+    return sides, note
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
-    """The photo's file below `folder`, under another extension where it must be; None where it is absent."""
+    """Find the photo's file below `folder`, if need be with another extension; None if it is absent."""
     exact = folder / name
     if exact.is_file():
         return exact
-    # A copy may have been saved in another format; names with several dots keep all but the last part.
+    # A copy may be saved in another format; of a name with several dots only the last part is replaced.
     base = exact.with_suffix("") if exact.suffix in SUFFIXES else exact
     for suffix in SUFFIXES:
         path = base.with_name(base.name + suffix)
@@ -169,7 +167,7 @@ def find_photo(folder: Path, name: str) -> Path | None:
 
 
 def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
-    """[4, 4] camera-to-world with OpenGL axes (y up, z back) to cam_from_world with OpenCV axes.
+    """Convert camera-to-world [4, 4] with OpenGL axes (y up, z back) to cam_from_world with OpenCV axes.
 
     Raises:
         AwError: it is no rigid motion.
@@ -189,7 +187,7 @@ def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
 
 
 def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """[3, 3] to (w, x, y, z), w >= 0; source: Shepperd 1978."""
+    """Convert a rotation [3, 3] to (w, x, y, z) with w >= 0; source: Shepperd 1978."""
     m = np.asarray(rotation, dtype=np.float64)
     trace = np.trace(m)
     choice = int(np.argmax([trace, m[0, 0], m[1, 1], m[2, 2]]))

@@ -20,15 +20,16 @@ from typing import Any
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
+from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
-from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, ambiguity_line, card, croissant
+from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
 from ambiguous_wild.io.files import atomic_dir, check_output, list_names, refuse_foreign_files
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
 FIXED = ("README.md", "croissant.json", "files.csv", "photos.csv", "checksums.sha256", "checksums.md5")
-_TIME = (1980, 1, 1, 0, 0, 0)  # the earliest that zip can hold
+_TIME = (1980, 1, 1, 0, 0, 0)  # the earliest time that zip can hold
 _DROPPED = ("seconds",)  # keys of scene.json that differ between two builds of one scene
 _PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic")
 
@@ -62,7 +63,7 @@ def package_scenes(
         output: the folder to make; an earlier package in it is replaced.
         info: licence, consent and the rest.
         keep_metadata: leave EXIF with places and serial numbers in the photos.
-        look_for_people: run the detectors of `people`.
+        look_for_people: run the person detectors of `privacy`.
         jobs: threads.
         progress: show bars.
 
@@ -87,21 +88,20 @@ def package_scenes(
     stripped = 0
     with atomic_dir(output) as folder:
         for root, name, scene_info in opened:
-            found = _people(root, scene_info, jobs, bar) if look_for_people else {}
+            detections = _people(root, jobs, bar) if look_for_people else {}
             rows, photos = _pack(root, name, scene_info, folder / f"{name}.zip", keep_metadata, bar)
             file_rows += rows
             for photo in photos:
                 stripped += bool(photo[5])
-                photo_rows.append([*photo, found.get(photo[1], "")])
+                photo_rows.append([*photo, detections.get(photo[1], "")])
             packed.append(_described(folder / f"{name}.zip", "application/zip"))
         for table, head, rows in (("files.csv", FILES, file_rows), ("photos.csv", PHOTOS, photo_rows)):
             (folder / table).write_text(_csv(head, rows), encoding="utf-8")
             packed.append(_described(folder / table, "text/csv"))
         people = [f"{r[0]}/{r[1]}" for r in photo_rows if r[6]] if look_for_people else None
         facts = [_facts(name, scene_info) for _, name, scene_info in opened]
-        lines = [ambiguity_line(f["name"], f["ambiguity"]) for f in facts]
-        made = croissant(info, names, packed, {"files.csv": FILES, "photos.csv": PHOTOS}, lines)
-        (folder / "croissant.json").write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n", "utf-8")
+        data = croissant(info, facts, packed, {"files.csv": FILES, "photos.csv": PHOTOS})
+        (folder / "croissant.json").write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", "utf-8")
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):
             every = [*packed, *(_described(folder / n, "") for n in ("croissant.json", "README.md"))]
@@ -114,7 +114,7 @@ def package_scenes(
     )
 
 
-def _open(root: Path) -> tuple[Path, str, dict[str, Any]]:
+def _open(root: Path) -> tuple[Path, str, SceneInfo]:
     info = read_scene_json(root)
     if info is None:
         raise AwError(
@@ -122,29 +122,29 @@ def _open(root: Path) -> tuple[Path, str, dict[str, Any]]:
         )
     verify_files(root, info)
     load_scene(root, verify=False)
-    return root, check_name("scene name", str(info.get("name", root.name))), dict(info)
+    return root, check_name("scene name", str(info.get("name", root.name))), info
 
 
-def _people(root: Path, info: dict[str, Any], jobs: int, bar: Bar) -> dict[str, str]:
-    """Photo -> what the detectors found; only photos with a find."""
+def _people(root: Path, jobs: int, bar: Bar) -> dict[str, str]:
+    """Run the detectors: photo -> "person", "face" or both, of photos with a detection."""
     views = load_scene(root, verify=False).views
     bar.start("looking for people", len(views))
 
     def one(path: Path) -> str:
-        found = may_show_person(path)
+        detection = may_show_person(path)
         bar.step()
-        return found
+        return detection
 
     with ThreadPoolExecutor(jobs) as pool:
-        found = list(pool.map(one, [v.image_path for v in views]))
+        detections = list(pool.map(one, [v.image_path for v in views]))
     bar.finish()
-    return {v.name: text for v, text in zip(views, found) if text}
+    return {v.name: text for v, text in zip(views, detections) if text}
 
 
 def _pack(
-    root: Path, name: str, info: dict[str, Any], archive: Path, keep_metadata: bool, bar: Bar
+    root: Path, name: str, info: SceneInfo, archive: Path, keep_metadata: bool, bar: Bar
 ) -> tuple[list[list[Any]], list[list[Any]]]:
-    """Write one archive; rows of files.csv and of photos.csv."""
+    """Write one archive; return its rows of files.csv and of photos.csv."""
     split = {
         line: side
         for side in ("train", "test")
@@ -178,10 +178,10 @@ def _pack(
             [name, archive.name, "scene.json", "record", "", hashlib.sha256(data).hexdigest(), len(data)]
         )
     bar.finish()
-    known: Any = info.get("photos")
+    photo_facts: Any = info.get("photos")
     photos = []
     for photo, side in sorted(split.items()):
-        fact = known.get(photo) if isinstance(known, dict) else None
+        fact = photo_facts.get(photo) if isinstance(photo_facts, dict) else None
         fact = fact if isinstance(fact, dict) else {}
         done = "; ".join(map(str, fact.get("notes") or [])) or "undistorted and stored as PNG where needed"
         dropped_here = ", ".join(sorted(removed.get(photo, ())))
@@ -200,7 +200,7 @@ def _is_photo(path: str) -> bool:
 
 
 def _photo_of(path: str, stems: dict[str, str]) -> str | None:
-    """The listed photo that a file under images*/ or masks/train is of."""
+    """Return the listed photo that a file under images*/ or masks/train belongs to."""
     parts = PurePosixPath(path).parts
     if len(parts) < 2 or not parts[0].startswith(("images", "masks")):
         return None
@@ -216,13 +216,14 @@ def _role(path: str) -> str:
     return roles.get(top, "list" if path.endswith(".txt") else "record")
 
 
-def _facts(name: str, info: dict[str, Any]) -> dict[str, Any]:
+def _facts(name: str, info: SceneInfo) -> SceneFacts:
+    counts, ambiguity = info.get("counts"), info.get("ambiguity")
     return {
         "name": name,
         "license": str(info.get("license", "not stated")),
-        "counts": info.get("counts") if isinstance(info.get("counts"), dict) else {},
+        "counts": counts if isinstance(counts, dict) else {},
         "factor": info["factor"],
-        "ambiguity": info.get("ambiguity") if isinstance(info.get("ambiguity"), dict) else None,
+        "ambiguity": ambiguity if isinstance(ambiguity, dict) else None,
     }
 
 
@@ -237,7 +238,7 @@ def _described(path: Path, kind: str) -> PackedFile:
 
 
 def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """CSV whose cells no spreadsheet takes for formulas."""
+    """Write CSV whose cells no spreadsheet takes for formulas."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(head)

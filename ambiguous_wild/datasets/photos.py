@@ -1,4 +1,4 @@
-"""Photos of an imported scene: linked where they can be used as they are, else undistorted or reduced."""
+"""Photos of an imported scene: linked if they can be used unchanged, else undistorted or reduced."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from ambiguous_wild.io.images import (
 )
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-ENOUGH_POINTS = 20  # in a photo, to see by their colours which way it was turned
-TURNED = 0.7  # of the difference of colours: points of a photo that was turned differ by less
+ENOUGH_POINTS = 20  # points in a photo whose colours show which way it was turned
+TURNED = 0.7  # a photo was turned if that reduces the difference of colours below this share
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 
 @dataclass(frozen=True)
 class PhotoPlan:
-    """What is done to one photo."""
+    """How one photo is put into the scene."""
 
     image: ModelImage
     source: Path
     camera: ModelCamera  # at the size of `source`
     small: Path | None  # a downsampled copy that is linked
-    only_small: bool  # the dataset ships downsampled photos alone
+    only_small: bool  # the dataset has downsampled photos only
     convert: bool  # its pixels change, so a PNG is written
     turn: int = 1  # EXIF orientation that the model's photo was turned by; COLMAP does not turn photos
 
 
 @dataclass(frozen=True)
 class PlacedPhoto:
-    """A photo in the scene."""
+    """A photo that is in the scene folder."""
 
     image: ModelImage  # with its new name and positions
     camera: ModelCamera  # pinhole
@@ -58,10 +58,10 @@ class PlacedPhoto:
 
 
 def at_photo_size(scene: ForeignScene) -> tuple[ForeignScene, float]:
-    """The scene with its cameras and positions at the size of its photos, where these are of another size.
+    """Scale the scene's cameras and observations to the size of its photos.
 
     Returns:
-        It, and how many times smaller than their cameras the photos are: the median, 1 for the same size.
+        The scene, and how many times smaller than their cameras the photos are: the median; 1 = same size.
     """
     folder = scene.photos if scene.photos.is_dir() else scene.root / f"images_{scene.factor}"
     cameras, taken = dict(scene.model.cameras), dict[tuple[int, int, int], int]()
@@ -72,7 +72,7 @@ def at_photo_size(scene: ForeignScene) -> tuple[ForeignScene, float]:
         photo = find_photo(folder, image.name) if image.name in scene.split else None
         size = header_size(photo) if photo is not None else None
         if size is None or not _same_shape(size, (camera.width, camera.height)):
-            continue  # `plan_photos` says so
+            continue  # `plan_photos` reports it
         ratios.append(camera.width / size[0])
         if abs(ratios[-1] - 1) < 0.02:
             continue
@@ -92,7 +92,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     """Find every photo of the split and check its size.
 
     Raises:
-        AwError: photos are absent, no images, or of another shape than their cameras.
+        AwError: photos are absent, are no images, or have another shape than their cameras.
     """
     only_small = not scene.photos.is_dir()
     folder = scene.root / f"images_{scene.factor}" if only_small else scene.photos
@@ -114,8 +114,8 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
             )
         elif (turn := _turn(scene.model, image, source, size)) is None:
             turned = ", turned" if _same_shape(size[::-1], (camera.width, camera.height)) else ""
-            told = f"its camera {camera.width}x{camera.height}{turned}"
-            wrong.append(f"{image.name} ({size[0]}x{size[1]}, {told})")
+            needed = f"its camera {camera.width}x{camera.height}{turned}"
+            wrong.append(f"{image.name} ({size[0]}x{size[1]}, {needed})")
         else:
             size = size[::-1] if turn > 4 else size
             plans.append(_plan(scene, image, source, camera, size, only_small, turn))
@@ -136,9 +136,9 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
 
 
 def _turn(model: Model, image: ModelImage, source: Path, size: tuple[int, int]) -> int | None:
-    """The photo's EXIF orientation where the model was made of the upright photo, else 1; None: neither fits.
+    """Return the EXIF orientation if the model was made of the upright photo, else 1; None: neither fits.
 
-    The shape of the camera tells, and where it is the same both ways, the colours of the points.
+    The shape of the camera decides; where both shapes fit, the colours of the points do.
     """
     tag, camera = orientation(source), model.cameras[image.camera_id]
     shape = (camera.width, camera.height)
@@ -146,7 +146,7 @@ def _turn(model: Model, image: ModelImage, source: Path, size: tuple[int, int]) 
     if not all(fits):
         return 1 if fits[0] else tag if fits[1] else None
     lens = lens_of(resized(camera, *size))
-    # Projected, as not every model has observations.
+    # Points are projected, because not every model has observations.
     xyz = model.points.xyz @ image.cam_from_world()[:3, :3].T + image.tvec
     front = xyz[:, 2] > 0
     xyz, colours = xyz[front], model.points.rgb[front].astype(float)
@@ -163,7 +163,7 @@ def _turn(model: Model, image: ModelImage, source: Path, size: tuple[int, int]) 
 
 
 def _refuse_same_stems(scene: ForeignScene) -> None:
-    """Two photos that differ in their extension alone would be one PNG."""
+    """Raise AwError where two photos differ in their extension only, as both would be one PNG."""
     seen: dict[str, str] = {}
     for name in sorted(scene.split):
         other = seen.setdefault(without_suffix(name), name)
@@ -203,7 +203,7 @@ def _plan(
 
 @lru_cache(maxsize=4)  # a map of a photo of 12 megapixels takes 98 MB
 def lens_of(camera: ModelCamera) -> Lens:
-    """The camera's lens; most datasets have one for all photos."""
+    """Return the lens of a camera; cached, because most datasets have one camera for all photos."""
     if camera.model not in PINHOLES:
         return make_lens(camera)
     size = (camera.width, camera.height)
@@ -216,13 +216,13 @@ def _same_shape(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
 
 
 def resized(camera: ModelCamera, width: int, height: int) -> ModelCamera:
-    """The camera of the same photo at another size; lens distortion does not depend on it."""
+    """Return the camera of the same photo at another size, which does not change lens distortion."""
     if (camera.width, camera.height) == (width, height):
         return camera
     sx, sy = width / camera.width, height / camera.height
     values = list(camera.params)
     if camera.model in ONE_FOCAL:
-        # One focal length for both axes: their sizes differ by rounding only.
+        # The model has one focal length for both axes, whose scales differ by rounding only.
         values[0] *= (sx + sy) / 2
         values[1], values[2] = values[1] * sx, values[2] * sy
     else:
@@ -232,12 +232,12 @@ def resized(camera: ModelCamera, width: int, height: int) -> ModelCamera:
 
 
 def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPhoto:
-    """Put the photo into the scene folder at full size and at the factor; what is there already stays.
+    """Put the photo into the scene folder at full size and at the factor; existing files stay.
 
     Args:
-        plan: of `plan_photos`.
-        scene: the dataset's.
-        folder: the scene folder that is being made.
+        plan: what `plan_photos` decided.
+        scene: the dataset's scene.
+        folder: the unfinished scene folder.
     """
     stem = without_suffix(plan.image.name)
     lens = lens_of(plan.camera)
@@ -269,7 +269,7 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
     if plan.turn > 1:
         notes.insert(0, f"turned upright (EXIF orientation {plan.turn})")
     if scene.background is not None:
-        notes.insert(0, "put before a background of {}, {}, {}".format(*scene.background))
+        notes.insert(0, "composited over a background of {}, {}, {}".format(*scene.background))
     small = folder / f"images_{factor}" / name
     if not (full / name).is_file() or (factor > 1 and not small.is_file()):
         pixels = lens.remap(upright(_read(plan.source, scene.background), plan.turn), nearest=False)
@@ -294,7 +294,7 @@ def _placed(
 
 
 def _stored_name(plan: PhotoPlan) -> str:
-    """The photo's name; with the file's extension where that is another one."""
+    """Return the photo's name with the extension of its file."""
     return _as(plan.image.name, plan.source.suffix)
 
 
@@ -303,14 +303,14 @@ def _as(name: str, suffix: str) -> str:
 
 
 def _points_at(plan: PhotoPlan, scene: ForeignScene, lens: Lens) -> np.ndarray:
-    """[K, 2] px of the model's camera to px of the pinhole camera."""
-    known = scene.model.cameras[plan.image.camera_id]
-    scale = np.array([plan.camera.width / known.width, plan.camera.height / known.height])
+    """Map observations [K, 2] px of the model's camera to px of the pinhole camera."""
+    camera = scene.model.cameras[plan.image.camera_id]
+    scale = np.array([plan.camera.width / camera.width, plan.camera.height / camera.height])
     return lens.undistort_points(plan.image.xys * scale)
 
 
 def _read(path: Path, background: tuple[int, int, int] | None) -> np.ndarray:
-    """[H, W, 3] uint8; alpha is put before the background."""
+    """Read [H, W, 3] uint8; a photo with alpha is composited over the background."""
     if background is None:
         return read_png_rgb(path)
     data = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -330,10 +330,10 @@ def _reduce(pixels: np.ndarray, path: Path, factor: int) -> None:
 
 
 def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, folder: Path) -> bool:
-    """Write the keep mask of a photo, its file times its alpha, at the size that is trained on.
+    """Write the keep mask of a photo, mask file times alpha, at the size that is trained on.
 
     Returns:
-        Whether the photo's alpha hides something.
+        Whether the photo's alpha hides pixels.
 
     Raises:
         AwError: it has another size than its photo, or is no mask.
@@ -380,6 +380,6 @@ def link_file(source: Path, target: Path) -> None:
         try:
             link(real, target)
             return
-        except OSError:  # another disk, or a file system without links
+        except OSError:  # the target is on another disk, or its file system has no links
             continue
     shutil.copyfile(real, target)

@@ -1,4 +1,4 @@
-"""Initial points of imported scenes: from PLY files, random, triangulated; those of test photos dropped."""
+"""Initial points of imported scenes: random or triangulated points, and points of test photos dropped."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from ambiguous_wild.core.scene import Split, near_others
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoints, points_without_tracks
 
-RANDOM_POINTS = 100_000  # as 3DGS has for Blender scenes, and gsplat for its random start
+RANDOM_POINTS = 100_000  # as in 3DGS for Blender scenes and in gsplat's random start
 BLENDER_SIDE = 1.3  # half the side of 3DGS's cube for Blender scenes
-CAMERA_SIDE = 3.0  # half the side of gsplat's cube, over the largest distance of a camera from their mean
-LEAST_POINTS = 100  # fewer triangulated points are no start
+CAMERA_SIDE = 3.0  # half the side of gsplat's cube over the largest distance of a camera from their mean
+LEAST_POINTS = 100  # smallest number of triangulated points to start from
 
 
 def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int]:
-    """The model without points that no training photo sees, and how many those were.
+    """Return the model without points that no training photo sees, and the number of dropped points.
 
-    Points without any track stay: who sees them is not known.
+    Points without a track are kept, because the photos that see them are not known.
     """
     points = model.points
     train = [i.image_id for i in model.images.values() if split.get(i.name) == "train"]
@@ -49,13 +49,13 @@ def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int
 
 
 def random_points(model: Model, split: Mapping[str, Split], *, blender: bool, seed: int = 0) -> ModelPoints:
-    """Points of random place and colour, as the reference trainers start without a model.
+    """Return points of random position and colour, as the reference trainers use without a model.
 
     Args:
-        model: its training cameras place the cube, except for Blender's, which is fixed.
+        model: its training cameras set the cube of points, unless `blender`.
         split: sides by name.
-        blender: 3DGS's cube of side 2.6 about the origin.
-        seed: of the generator.
+        blender: use 3DGS's cube of side 2.6 about the origin.
+        seed: seed of the generator.
     """
     generator = np.random.default_rng(seed)
     centre, half = np.zeros(3), BLENDER_SIDE
@@ -79,19 +79,19 @@ def triangulate(
     jobs: int,
     bar: Bar,
 ) -> Model:
-    """Points by matching the photos and triangulating with the known poses, which stay as they are.
+    """Match the photos and triangulate points with the known poses, which do not change.
 
     Args:
-        folder: empty, for COLMAP's files.
+        folder: empty folder for COLMAP's files.
         model: cameras and poses.
         photos: folder that the model's names refer to.
         split: photos of neither side are not used.
-        seed: of matching.
+        seed: seed of matching.
         jobs: threads of features and matching.
         bar: progress.
 
-    Returns:
-        The same cameras and poses; no points where fewer than `LEAST_POINTS` were found.
+        Returns:
+            The same cameras and poses, with points; without any if fewer than `LEAST_POINTS` were found.
     """
     used = {i.name: i for i in model.images.values() if i.name in split}
     database = _match_posed(folder, model, photos, split, "thorough", seed, jobs, bar)
@@ -107,11 +107,11 @@ def triangulate(
     bar.start("triangulating", None)
     run_job(job, folder, lambda: None)
     bar.finish()
-    found = read_model(folder / "points")
-    if len(found.points.ids) < LEAST_POINTS:
+    triangulated = read_model(folder / "points")
+    if len(triangulated.points.ids) < LEAST_POINTS:
         return model
-    # Poses as given, not as they come back from COLMAP's files.
-    by_name: dict[str, ModelImage] = {i.name: i for i in found.images.values()}
+    # The given poses are kept, not the rounded ones of COLMAP's files.
+    by_name: dict[str, ModelImage] = {i.name: i for i in triangulated.images.values()}
     images = {
         by_name[name].image_id: dataclasses.replace(
             by_name[name], qvec=i.qvec, tvec=i.tvec, camera_id=i.camera_id
@@ -119,24 +119,24 @@ def triangulate(
         for name, i in used.items()
         if name in by_name
     }
-    return Model(model.cameras, images, found.points)
+    return Model(model.cameras, images, triangulated.points)
 
 
 def find_motion(
     scene: Path, scratch: Path, train: Sequence[str], *, seed: int, jobs: int, bar: Bar
 ) -> MotionResult:
-    """Match the train photos of a scene folder and write what moves in them (motion.npz) into it.
+    """Match the train photos of a scene folder and write their motion points (motion.npz) into it.
 
     Args:
         scene: folder with images/ and sparse/0, undistorted.
-        scratch: for COLMAP's files; emptied first.
+        scratch: folder for COLMAP's files; emptied first.
         train: names of the photos.
-        seed: of matching.
+        seed: seed of matching.
         jobs: threads.
         bar: progress.
 
-    Returns:
-        Numbers of features that stay and move.
+        Returns:
+            Numbers of static and moving features.
 
     Raises:
         AwError: the poses do not fit the photos' own matches.
@@ -157,13 +157,13 @@ def find_motion(
     run_job(job, scratch, lambda: None)
     bar.finish()
     names = {name: name for name in train}
-    found = write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
-    if 2 * found["silent"] > len(names):
+    stats = write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
+    if 2 * stats["silent"] > len(names):
         raise AwError(
-            f"in {found['silent']} of {len(names)} train photos no matches fit the given poses, so nothing "
-            "tells what moves; import without --motion, or place the photos anew with 'aw build-scene'"
+            f"in {stats['silent']} of {len(names)} train photos no matches fit the given poses, so it is "
+            "unknown what moves; import without --motion, or place the photos anew with 'aw build-scene'"
         )
-    return found
+    return stats
 
 
 def _match_posed(
@@ -176,7 +176,7 @@ def _match_posed(
     jobs: int,
     bar: Bar,
 ) -> Path:
-    """COLMAP's database of the photos in `split`, matched, with known cameras; known/ has their poses."""
+    """Make COLMAP's database of the matched photos in `split` with known cameras; write poses to known/."""
     used = {i.name: i for i in model.images.values() if i.name in split}
     facts = [
         cast(ScreenedPhoto, {"work_name": name, "source": name, "side": split[name]}) for name in sorted(used)
@@ -193,7 +193,7 @@ def _match_posed(
 
 
 def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, ModelImage]) -> None:
-    """Give the database the known cameras, and write the model with the database's numbers."""
+    """Write the known cameras to the database, and the model with the database's ids to `known`."""
     with closing(sqlite3.connect(database)) as db, db:
         rows = db.execute("SELECT name, image_id, camera_id FROM images").fetchall()
         sizes = {n: (w, h) for n, w, h in db.execute("SELECT camera_id, width, height FROM cameras")}

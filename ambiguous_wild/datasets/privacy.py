@@ -1,8 +1,8 @@
-"""What photos tell about people: metadata that is taken out, and photos that may show a person.
+"""Protect people in photos: take out metadata, and list photos that may show a person.
 
 GPS positions and serial numbers stand in EXIF, XMP, IPTC, comments and embedded previews, some in forms that
-only the maker knows, so whole blocks go; the pixels stay bit for bit, and colour profiles stay. Persons are
-looked for by weak classical detectors: a list to look through, no guarantee.
+only the maker knows, so whole blocks are dropped; pixels stay bit for bit, and colour profiles stay. Persons
+are found by weak classical detectors: the list helps to look through the photos, but guarantees nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.images import read_png_rgb
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-# Chunks that decide the pixels or their colours; the others are metadata.
+# Chunks that pixels or their colours depend on; the others are metadata.
 _PNG_KEPT = frozenset(b"IHDR PLTE IDAT IEND tRNS gAMA cHRM sRGB iCCP sBIT bKGD pHYs cICP".split())
 _WEBP_DROPPED = (b"EXIF", b"XMP ")
 SIDE = 800  # px, longer side
@@ -34,18 +34,18 @@ HOW_WEAK = (
     "is not listed "
     "may show people: look at every photo before release."
 )
-_LEAST_WEIGHT = 0.5  # of the SVM; below, most finds are wrong
+_LEAST_WEIGHT = 0.5  # smallest weight of the SVM; below, most detections are wrong
 
 
 def strip_metadata(data: bytes, name: str) -> tuple[bytes, list[str]]:
-    """The file without metadata, and the names of the blocks that were taken out.
+    """Return the file without metadata, and the names of the blocks that were taken out.
 
     Args:
-        data: of a JPEG, PNG or WebP file.
+        data: bytes of a JPEG, PNG or WebP file.
         name: for messages.
 
     Raises:
-        AwError: damaged, or a format whose metadata is not known here.
+        AwError: damaged, or another format.
     """
     try:
         if data.startswith(b"\xff\xd8\xff"):
@@ -63,7 +63,7 @@ def strip_metadata(data: bytes, name: str) -> tuple[bytes, list[str]]:
 
 
 def _jpeg(data: bytes) -> tuple[bytes, list[str]]:
-    """Segments of ITU T.81 B.1; whatever follows the end of the picture is dropped too."""
+    """Copy the segments (ITU T.81 B.1) but metadata; bytes after the end of the picture are dropped too."""
     out, dropped, at = [data[:2]], [], 2
     while at < len(data):
         if data[at] != 0xFF:
@@ -95,24 +95,24 @@ def _jpeg(data: bytes) -> tuple[bytes, list[str]]:
 
 
 def _jpeg_block(marker: int, body: bytes) -> str | None:
-    """Name of a metadata segment; None for one that the picture needs."""
+    """Return the name of a metadata segment; None for one that the picture needs."""
     if marker == 0xFE:
         return "comment"
     if not 0xE0 <= marker <= 0xEF:
         return None
-    # JFIF, colour profile, Adobe's colour transform
+    # The picture needs JFIF without a preview, the colour profile, and Adobe's colour transform.
     if marker == 0xE0 and body.startswith(b"JFIF\0") and not body[12:14].strip(b"\0"):
         return None
     if (marker == 0xE2 and body.startswith(b"ICC_PROFILE\0")) or (
         marker == 0xEE and body.startswith(b"Adobe")
     ):
         return None
-    known = {b"Exif": "EXIF", b"http://ns.adobe.com": "XMP", b"Photoshop": "IPTC", b"MPF": "previews"}
-    return next((n for k, n in known.items() if body.startswith(k)), f"APP{marker - 0xE0}")
+    names = {b"Exif": "EXIF", b"http://ns.adobe.com": "XMP", b"Photoshop": "IPTC", b"MPF": "previews"}
+    return next((n for k, n in names.items() if body.startswith(k)), f"APP{marker - 0xE0}")
 
 
 def _scan_end(data: bytes, at: int) -> int:
-    """Where the entropy-coded data ends: the next marker that is neither stuffed nor a restart."""
+    """Return where the entropy-coded data ends: at the next marker that is neither stuffed nor a restart."""
     while True:
         at = data.find(b"\xff", at)
         if at < 0 or at + 1 >= len(data):
@@ -174,23 +174,23 @@ def _detectors() -> tuple[Any, Any]:
 
 
 def may_show_person(path: Path) -> str:
-    """What was found: "person", "face", "person and face", or "" for nothing."""
+    """Run the detectors on a photo: "person", "face", "person and face", or "" for nothing."""
     rgb = read_png_rgb(path)
     scale = SIDE / max(rgb.shape[:2])
     if scale < 1:
         rgb = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     hog, cascade = _detectors()
-    found = []
+    detected = []
     if gray.shape[0] >= 128 and gray.shape[1] >= 64:
         _, weights = hog.detectMultiScale(gray, winStride=(8, 8), scale=1.1)
         if np.size(weights) and float(np.max(weights)) >= _LEAST_WEIGHT:
-            found.append("person")
+            detected.append("person")
     if min(gray.shape) >= 24:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             faces = cascade.detect_multi_scale(
                 img=gray, scale_factor=1.3, step_ratio=2, min_size=(24, 24), max_size=(400, 400)
             )
-        found += ["face"] if len(faces) else []
-    return " and ".join(found)
+        detected += ["face"] if len(faces) else []
+    return " and ".join(detected)

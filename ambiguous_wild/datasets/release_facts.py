@@ -1,4 +1,4 @@
-"""What a package says about itself: facts that a person states, Croissant metadata, and the data card."""
+"""Describe a package: facts that a person states, Croissant metadata, and the data card."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import AwError, shortlist
@@ -14,7 +14,7 @@ from ambiguous_wild.datasets.privacy import HOW_WEAK
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 VERSION = "http://mlcommons.org/croissant/1.1"
-_OTHER_TERMS: dict[str, Any] = {
+_OTHER_TERMS: dict[str, str | dict[str, str]] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
     "conformsTo": "dct:conformsTo",
@@ -58,7 +58,7 @@ limitations: ""        # what the data should not be used for
 
 @dataclass(frozen=True)
 class ReleaseInfo:
-    """Fields of the file; see `TEMPLATE`."""
+    """Facts about a release that a person states in a file like `TEMPLATE`."""
 
     title: str = ""
     description: str = ""
@@ -81,7 +81,7 @@ class ReleaseInfo:
 
     @property
     def license_url(self) -> str:
-        """The licence as a URL where it has one."""
+        """URL of the licence; "" if it is not known."""
         if self.license.startswith(("http://", "https://")):
             return self.license
         return (
@@ -92,21 +92,31 @@ class ReleaseInfo:
 
 
 def read_release_info(path: Path) -> ReleaseInfo:
-    """Read the file.
+    """Read the facts of a release.
 
     Raises:
         AwError: unreadable, an unknown key, or a value of another type.
     """
     data = read_mapping(path)
-    known = {f.name for f in fields(ReleaseInfo)}
+    names = {f.name for f in fields(ReleaseInfo)}
     # YAML reads 2026-11-23 as a date and 1.0 as a number.
-    plain = {k: str(v) if k in known and k not in ("creators", "keywords") else v for k, v in data.items()}
+    plain = {k: str(v) if k in names and k not in ("creators", "keywords") else v for k, v in data.items()}
     info = from_plain(ReleaseInfo, {k: v for k, v in plain.items() if v != "None"}, str(path))
     if info.date and not re.fullmatch(r"\d{4}-\d{2}-\d{2}", info.date):
         raise AwError(f"{path}: date {info.date!r} must be written YYYY-MM-DD")
     if not re.fullmatch(r"\d+\.\d+\.\d+", info.version):
         raise AwError(f"{path}: version {info.version!r} must be written MAJOR.MINOR.PATCH")
     return info
+
+
+class SceneFacts(TypedDict):
+    """Facts of one scene for the data card."""
+
+    name: str
+    license: str
+    counts: dict[str, object]
+    factor: int
+    ambiguity: dict[str, object] | None  # measured scores by name
 
 
 @dataclass(frozen=True)
@@ -122,23 +132,22 @@ class PackedFile:
 
 def croissant(
     info: ReleaseInfo,
-    scenes: Sequence[str],
+    scenes: Sequence[SceneFacts],
     files: Sequence[PackedFile],
     tables: dict[str, tuple[str, ...]],
-    ambiguity: Sequence[str],
-) -> dict[str, Any]:
-    """The file's content.
+) -> dict[str, object]:
+    """Return the content of croissant.json.
 
     Args:
-        info: as a person stated it.
-        scenes: names.
+        info: facts that a person stated.
+        scenes: facts of each scene.
         files: the archives and tables.
         tables: CSV file -> columns; each becomes a record set.
-        ambiguity: a sentence a scene.
     """
     title = info.title or "Untitled scenes"
     lacking = f"{NOT_FOR_RELEASE}: {', '.join(info.lacking)} not stated. " if info.lacking else ""
-    data: dict[str, Any] = {
+    ambiguity = " ".join(ambiguity_line(scene["name"], scene["ambiguity"]) for scene in scenes)
+    data: dict[str, object] = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "name": title,
@@ -154,8 +163,8 @@ def croissant(
         "rai:personalSensitiveInformation": f"Consent: {info.consent or 'not stated'}. {HOW_WEAK}",
         "rai:dataLimitations": info.limitations or "not stated",
         "rai:dataUseCases": "Training and measuring novel view synthesis with moving distractors.",
-        "rai:dataAnnotationAnalysis": " ".join(ambiguity) or "ambiguity was not measured",
-        "distribution": [_file_object(f) for f in files] + [_photos(scene) for scene in scenes],
+        "rai:dataAnnotationAnalysis": ambiguity or "ambiguity was not measured",
+        "distribution": [_file_object(f) for f in files] + [_photos(scene["name"]) for scene in scenes],
         "recordSet": [_record_set(name, columns) for name, columns in tables.items()],
     }
     if info.date:
@@ -165,7 +174,7 @@ def croissant(
     return data
 
 
-def _file_object(file: PackedFile) -> dict[str, Any]:
+def _file_object(file: PackedFile) -> dict[str, str]:
     return {
         "@type": "cr:FileObject",
         "@id": file.name,
@@ -178,7 +187,7 @@ def _file_object(file: PackedFile) -> dict[str, Any]:
     }
 
 
-def _photos(scene: str) -> dict[str, Any]:
+def _photos(scene: str) -> dict[str, object]:
     return {
         "@type": "cr:FileSet",
         "@id": f"{scene}-photos",
@@ -190,7 +199,7 @@ def _photos(scene: str) -> dict[str, Any]:
     }
 
 
-def _record_set(table: str, columns: tuple[str, ...]) -> dict[str, Any]:
+def _record_set(table: str, columns: tuple[str, ...]) -> dict[str, object]:
     name = table.removesuffix(".csv")
     return {
         "@type": "cr:RecordSet",
@@ -211,36 +220,36 @@ def _record_set(table: str, columns: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def ambiguity_line(name: str, scores: Mapping[str, Any] | None) -> str:
-    """The scene's measured ambiguity with 95 % intervals, as one sentence."""
+def ambiguity_line(name: str, scores: Mapping[str, object] | None) -> str:
+    """Return a sentence with the scene's measured ambiguity and its 95 % intervals."""
     if not scores:
-        return f"{name}: ambiguity was not measured ('aw ambiguity-report' does)."
+        return f"{name}: ambiguity was not measured; 'aw ambiguity-report' measures it."
     parts = []
     for key, score in scores.items():
         if isinstance(score, dict) and isinstance(score.get("value"), (int, float)):
             span = [score.get("low"), score.get("high")]
-            known = all(isinstance(v, (int, float)) for v in span)
+            has_interval = all(isinstance(v, (int, float)) for v in span)
             parts.append(
-                f"{key} {score['value']:.3f}" + (f" [{span[0]:.3f}, {span[1]:.3f}]" if known else "")
+                f"{key} {score['value']:.3f}" + (f" [{span[0]:.3f}, {span[1]:.3f}]" if has_interval else "")
             )
     return f"{name}: {scores.get('class', 'no class')}; {', '.join(parts) or 'no score'}."
 
 
 def card(
     info: ReleaseInfo,
-    scenes: Sequence[Mapping[str, Any]],
+    scenes: Sequence[SceneFacts],
     people: Sequence[str] | None,
     stripped: int,
     keep_metadata: bool,
 ) -> str:
-    """Markdown.
+    """Return the data card in Markdown.
 
     Args:
-        info: as a person stated it.
-        scenes: name, license, counts, factor, ambiguity, split of each.
-        people: photos in which a person may be seen; None = nobody looked.
-        stripped: photos that lost metadata.
-        keep_metadata: metadata was asked for.
+        info: facts that a person stated.
+        scenes: facts of each scene.
+        people: photos in which a person may be seen; None = the detectors were not run.
+        stripped: number of photos that lost metadata.
+        keep_metadata: metadata was kept on request.
     """
     lines = [f"# {_text(info.title or 'Untitled scenes')}", ""]
     if info.lacking:
@@ -310,6 +319,6 @@ def card(
 
 
 def _text(value: str) -> str:
-    """Plain text in Markdown: one line, no HTML, no table columns."""
+    """Turn a value into plain text for Markdown: one line, no HTML, no table columns."""
     flat = " ".join(str(value).split())
     return flat.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("|", "\\|")

@@ -1,4 +1,4 @@
-"""Suites: the scenes of a published table, where they lie in a folder, and how they are measured."""
+"""Suites: the scenes of published tables, their folders, and how they are measured."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist, unknown
 from ambiguous_wild.datasets.foreign import plain
@@ -18,11 +18,11 @@ SLACK = 0.1  # undistorting crops a photo by less than this
 
 @dataclass(frozen=True)
 class Suite:
-    """One dataset's table."""
+    """The scenes of one dataset, and how its tables measure them."""
 
     name: str
-    dataset: str  # as the tables call it
-    tables: dict[str, list[str]]  # which table has which scenes
+    dataset: str  # its name in result tables
+    tables: dict[str, list[str]]  # table -> scenes
     aliases: dict[str, list[str]]  # scene -> other spellings
     factor: int  # 0 = as published, by scene
     iterations: int
@@ -37,24 +37,23 @@ class Suite:
         return list(dict.fromkeys(scene for names in self.tables.values() for scene in names))
 
     def spellings(self, scene: str) -> set[str]:
-        """Folder names of a scene, plain."""
+        """Return all names that a scene's folder may have, in plain spelling."""
         return {plain(scene), *(plain(other) for other in self.aliases.get(scene, ()))}
 
 
 def scene_id(scene: str) -> str:
-    """The scene's name in runs: "Patio-High" -> "patio-high"."""
+    """Return the scene's name in runs: "Patio-High" -> "patio-high"."""
     return "-".join(scene.casefold().replace("-", " ").split())
 
 
 @cache
 def suites() -> dict[str, Suite]:
-    """By name."""
-    rows: list[dict[str, Any]] = read_mapping(FILE)["suites"]
-    return {row["name"]: Suite(**row) for row in rows}
+    """Read all suites, by name."""
+    return {row["name"]: Suite(**row) for row in read_mapping(FILE)["suites"]}
 
 
 def get_suite(name: str) -> Suite:
-    """The suite of that name.
+    """Return the suite of a name.
 
     Raises:
         AwError: there is none.
@@ -65,7 +64,7 @@ def get_suite(name: str) -> Suite:
 
 
 def find_scenes(suite: Suite, root: Path) -> tuple[dict[str, Path], list[str]]:
-    """Folders of the suite's scenes, directly in `root` or one folder deeper; and the scenes that are absent.
+    """Find the folders of the suite's scenes in `root` or one folder deeper, and name the absent scenes.
 
     Raises:
         AwError: no folder, no scene of the suite, or two folders of one scene.
@@ -97,7 +96,7 @@ def find_scenes(suite: Suite, root: Path) -> tuple[dict[str, Path], list[str]]:
 
 
 def _is_scene(folder: Path) -> bool:
-    """Whether it holds more than photos: images/ of a scene called "train" is none."""
+    """Tell a scene from a folder of photos: images/ of a scene called "train" is no scene."""
     names = (
         "scene.json",
         "sparse",
@@ -111,7 +110,7 @@ def _is_scene(folder: Path) -> bool:
 
 
 def suite_of(dataset: str, folder: Path) -> Suite | None:
-    """The suite of a dataset's name, or of the folder that the scene's folder lies in."""
+    """Return the suite of a dataset's name, or of the folder that the scene's folder lies in."""
     for suite in suites().values():
         own = plain(suite.dataset)
         if plain(dataset) == own or (not dataset and plain(folder.parent.name) == own):
@@ -120,7 +119,7 @@ def suite_of(dataset: str, folder: Path) -> Suite | None:
 
 
 def differences(suite: Suite, scene: str, sizes: Sequence[tuple[int, int]], factor: int) -> list[str]:
-    """How a copy differs from what the suite states.
+    """List how a copy of a scene differs from what the suite states.
 
     Args:
         suite: the suite.
@@ -128,11 +127,11 @@ def differences(suite: Suite, scene: str, sizes: Sequence[tuple[int, int]], fact
         sizes: (width, height) of the cameras, px, at full size.
         factor: downsampling of the copy.
     """
-    found = []
+    notes = []
     if not any(plain(scene) in suite.spellings(name) for name in suite.scenes):
-        found.append(f"{suite.dataset} has no scene {scene!r}; it has {shortlist(suite.scenes, 20)}")
+        notes.append(f"{suite.dataset} has no scene {scene!r}; it has {shortlist(suite.scenes, 20)}")
     if suite.factor and factor != suite.factor:
-        found.append(f"factor {factor}; {suite.dataset} is measured at {suite.factor}")
+        notes.append(f"factor {factor}; {suite.dataset} is measured at {suite.factor}")
     if suite.width:
         longer, shorter = max(suite.width, suite.height), min(suite.width, suite.height)
         odd = [
@@ -143,5 +142,5 @@ def differences(suite: Suite, scene: str, sizes: Sequence[tuple[int, int]], fact
         ]
         if odd:
             names = shortlist(dict.fromkeys(odd), 3)
-            found.append(f"photos of {names} px; {suite.dataset} has {suite.width}x{suite.height}")
-    return found
+            notes.append(f"photos of {names} px; {suite.dataset} has {suite.width}x{suite.height}")
+    return notes

@@ -1,4 +1,4 @@
-"""`aw verify`: check a package, or one archive of it, that may come from anybody."""
+"""`aw verify`: check a package, or one archive of it, from an untrusted source."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _LARGEST = 50_000_000  # bytes of a text file of a package
 
 @dataclass
 class Verified:
-    """What was checked."""
+    """Scenes and files that were checked."""
 
     scenes: list[str] = field(default_factory=list)
     files: int = 0
-    warnings: list[str] = field(default_factory=list)  # it is whole, but not ready for release
+    warnings: list[str] = field(default_factory=list)  # why a whole package is not ready for release
 
 
 def verify(path: Path, *, scratch: Path | None = None) -> Verified:
@@ -42,17 +42,17 @@ def verify(path: Path, *, scratch: Path | None = None) -> Verified:
         scratch: where to unpack; None = the system's temporary folder.
 
     Raises:
-        AwError: the first thing that is wrong, with its file.
+        AwError: the first error, with its file.
     """
     if path.is_file():
-        found = Verified()
-        _scene(path, None, found, scratch)
-        return found
+        verified = Verified()
+        _scene(path, None, verified, scratch)
+        return verified
     if not path.is_dir():
         raise AwError(f"there is no package {path}")
     absent = [name for name in FIXED if not (path / name).is_file()]
     if absent:
-        raise AwError(f"{path} is no whole package: {shortlist(absent)} absent; copy it again")
+        raise AwError(f"{path} is no complete package: {shortlist(absent)} absent; copy it again")
     sums = _checksums(path / "checksums.sha256")
     extra = sorted(set(list_names(path)) - set(sums) - {"checksums.sha256", "checksums.md5"})
     if extra:
@@ -64,19 +64,19 @@ def verify(path: Path, *, scratch: Path | None = None) -> Verified:
         if not file.is_file() or file.is_symlink():
             raise AwError(f"{file} is absent or a link; copy the package again")
         if sha256_file(file) != digest:
-            raise AwError(f"{file} is not what checksums.sha256 recorded: damaged or changed; copy it again")
+            raise AwError(f"{file} differs from checksums.sha256: it is damaged or changed; copy it again")
     _check_md5(path)
     _check_croissant(path, sums)
     rows = _rows(path / "files.csv")
-    found = Verified()
+    verified = Verified()
     for name in sorted(sums):
         if name.endswith(".zip"):
-            _scene(path / name, {r["path"]: r for r in rows if r["archive"] == name}, found, scratch)
-    if not found.scenes:
+            _scene(path / name, {r["path"]: r for r in rows if r["archive"] == name}, verified, scratch)
+    if not verified.scenes:
         raise AwError(f"{path} holds no scene")
     if NOT_FOR_RELEASE in (path / "README.md").read_text(encoding="utf-8"):
-        found.warnings.append("licence, consent or other fields are not stated: not for release")
-    return found
+        verified.warnings.append("licence, consent or other fields are not stated: not for release")
+    return verified
 
 
 def _checksums(path: Path, digits: int = 64) -> dict[str, str]:
@@ -128,7 +128,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
     except csv.Error as error:
         raise AwError(f"{path} is malformed: {error}") from error
     if tuple(reader.fieldnames or ()) != FILES or any(None in r or None in r.values() for r in rows):
-        raise AwError(f"{path} has not the columns {', '.join(FILES)}")
+        raise AwError(f"{path} does not have the columns {', '.join(FILES)}")
     return rows
 
 
@@ -172,7 +172,7 @@ def _scene(
             for view in scene.views:
                 image_size(view.image_path)
         except AwError as error:
-            # The temporary folder's name tells nobody anything.
+            # The error names the archive, because the temporary folder is gone afterwards.
             raise AwError(str(error).replace(str(folder), str(archive))) from error
         if rows is not None:
             hashes = {n: sha256_file(root / n) for n in names}

@@ -1,4 +1,4 @@
-"""Write a dataset's scene as a scene folder: `aw import`."""
+"""`aw import`: write a scene of a dataset as a scene folder."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict, cast
 
 from ambiguous_wild.builder.downsample import check_factor
 from ambiguous_wild.builder.masks import alpha_warning
@@ -20,6 +21,7 @@ from ambiguous_wild.builder.report import point_checks
 from ambiguous_wild.builder.workspace import build_lock, content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
+from ambiguous_wild.core.scene import SceneInfo, Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
 from ambiguous_wild.datasets.photos import (
     PhotoPlan,
@@ -33,13 +35,13 @@ from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_p
 from ambiguous_wild.datasets.readers import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.colmap_model import write_model
-from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.colmap_records import Model, ModelCamera
 from ambiguous_wild.io.files import check_output, refuse_foreign_files, sweep, write_json, write_text
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
-LARGER = 1.5  # times; cameras that are so much larger than their photos are those of other files
-SMALL_SIDE = 100  # px; below, a training shows little of what a method can do
+LARGER = 1.5  # times; cameras that are this much larger than their photos belong to other files
+SMALL_SIDE = 100  # px; training on smaller photos says little about a method
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,34 @@ class ImportSettings:
     """Settings of `import_scene`."""
 
     kind: str | None = None  # the layout; None = recognised
-    factor: int | None = None  # downsampling; None = as published
-    name: str = ""  # of the scene; empty = the output folder's
+    factor: int | None = None  # downsampling; None = as in the published tables
+    name: str = ""  # of the scene; empty = the output folder's name
     license: str = ""  # of the photos
-    dataset: str = ""  # as result tables call it; empty = the layout's
+    dataset: str = ""  # its name in result tables; empty = given by the layout
     drop_test_only_points: bool = False  # points that no training photo sees leak the test photos
     seed: int = 0  # of matching and of random points
     motion: bool = False  # match the photos and keep what moves
-    model: str = ""  # of several COLMAP models; empty = the one with most photos
+    model: str = ""  # name of one of several COLMAP models; empty = the one with most photos
     masks: bool = True  # use keep masks, the photos' alpha among them
+
+
+class Imported(TypedDict):
+    """Layout and folder of the dataset, and notes on reading it."""
+
+    layout: str
+    folder: str
+    notes: list[str]  # decisions and omissions
+
+
+class ImportRecord(SceneInfo):
+    """scene.json of an imported scene."""
+
+    schema: str
+    split: str
+    imported: Imported
+    counts: dict[str, int]
+    photos: dict[str, dict[str, str | list[str]]]  # name -> source, split and notes
+    seconds: NotRequired[dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -63,7 +84,7 @@ class ImportResult:
     """A finished import."""
 
     scene: Path
-    info: dict[str, Any]  # scene.json
+    info: ImportRecord
     why: str  # the evidence for the layout
     up_to_date: bool
 
@@ -79,8 +100,8 @@ def import_scene(
 ) -> ImportResult:
     """Make a scene folder from a scene of a public dataset, in the layout it was published in.
 
-    Photos are linked unless they must be undistorted or reduced; the dataset is not changed. After a kill
-    the same call goes on with the photos that are left. The output appears complete or not at all.
+    Photos are linked unless they must be undistorted or reduced; the dataset is not changed. After a kill the
+    same call continues with the remaining photos. The output appears complete or not at all.
 
     Args:
         source: the folder of one scene.
@@ -108,29 +129,29 @@ def import_scene(
     elif foreign.masks:
         folders = sorted({mask.parent.relative_to(root).as_posix() for mask in foreign.masks.values()})
         trained = sum(side == "train" for side in foreign.split.values())
-        told = (
+        note = (
             f"keep masks of {len(foreign.masks)} of {trained} training photos in {shortlist(folders)} are "
             "used; --no-masks leaves them out"
         )
-        foreign = dataclasses.replace(foreign, notes=(*foreign.notes, told))
+        foreign = dataclasses.replace(foreign, notes=(*foreign.notes, note))
     for side in SIDES:
         if side not in foreign.split.values():
             raise AwError(
                 f"{root} has no {side} photo: {counted(len(foreign.split), 'photo')} in the split; add "
                 "photos, or write train_list.txt and test_list.txt"
             )
-    foreign = _sized(foreign, settings)
+    foreign = _at_photo_size(foreign, settings)
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)
     target = check_output(target)
     with build_lock(target):
-        known = _existing(target, key, overwrite)
-        if known is not None:
-            return ImportResult(target, known, why, True)
+        existing = _existing(target, key, overwrite)
+        if existing is not None:
+            return ImportResult(target, existing, why, True)
         work = target.parent / f".{target.name}.import-{key[:16]}"
         bar = Bar(progress)
         try:
-            _fill(work, foreign, plans, settings, name, key, jobs or os.cpu_count() or 1, bar)
+            _write_scene(work, foreign, plans, settings, name, key, jobs or os.cpu_count() or 1, bar)
         except AwError:
             shutil.rmtree(work, ignore_errors=True)
             raise
@@ -149,12 +170,12 @@ def import_scene(
     return ImportResult(target, info, why, False)
 
 
-def _sized(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
-    """The scene with cameras at the size of its photos, and what is left of the factor."""
-    alone = not foreign.photos.is_dir()  # images_N without images: N says where they lie
+def _at_photo_size(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
+    """Return the scene with cameras at the size of its photos, and with the factor that then remains."""
+    alone = not foreign.photos.is_dir()  # there is images_N without images/, so N must stay
     foreign, times = at_photo_size(foreign)
     if times > LARGER and not alone:
-        # The published factor is that of the cameras; photos that were reduced before are not reduced again.
+        # The published factor refers to the cameras; photos that were reduced before are not reduced again.
         note = f"photos are {times:.3g} times smaller than the model's cameras: intrinsics are scaled to them"
         factor = max(1, round(foreign.factor / times))
         foreign = dataclasses.replace(foreign, factor=factor, notes=(*foreign.notes, note))
@@ -166,7 +187,7 @@ def _sized(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
 
 
 def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings, name: str) -> str:
-    """Hash of what the result follows from; photos by name, size and time, as their hashes take long."""
+    """Hash what the result depends on; photos by name, size and time, because hashing them takes long."""
     model = foreign.model
     files = [p.source for p in plans] + [p.small for p in plans if p.small] + list(foreign.masks.values())
     states = [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files if f.exists()]
@@ -178,7 +199,7 @@ def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings
     return content_key(versions(), states, cameras, poses, split, kept, points)
 
 
-def _existing(target: Path, key: str, overwrite: bool) -> dict[str, Any] | None:
+def _existing(target: Path, key: str, overwrite: bool) -> ImportRecord | None:
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return None
     info = read_scene_json(target) if target.is_dir() else None
@@ -186,7 +207,7 @@ def _existing(target: Path, key: str, overwrite: bool) -> dict[str, Any] | None:
         raise AwError(f"{target} exists and is no scene of 'aw import'; choose another -o")
     if info.get("build_key") == key:
         verify_files(target, info, quick=True)
-        return dict(info)
+        return cast(ImportRecord, info)  # the key shows that this code wrote it
     if not overwrite:
         raise AwError(
             f"{target} exists, from other files or settings; pass --overwrite to replace it, or "
@@ -196,7 +217,7 @@ def _existing(target: Path, key: str, overwrite: bool) -> dict[str, Any] | None:
     return None
 
 
-def _fill(
+def _write_scene(
     work: Path,
     foreign: ForeignScene,
     plans: list[PhotoPlan],
@@ -241,7 +262,7 @@ def _fill(
     if settings.motion:
         train = sorted(n for n, s in sides.items() if s == "train")
         motion = find_motion(folder, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)
-        notes.append(f"{motion['static']} features of train photos stay, {motion['moving']} move")
+        notes.append(f"{motion['static']} features of train photos are static, {motion['moving']} move")
     for side in SIDES:
         lines = sorted(n for n, s in sides.items() if s == side)
         write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))
@@ -250,7 +271,7 @@ def _fill(
         info["evaluation_protocol"] = "nerfw"
     write_json(folder / "nb-info.json", info)
     record = _record(foreign, settings, name, sides, scene_model, placed, notes, key)
-    sweep(folder)  # of calls that were killed
+    sweep(folder)  # remove temporary files of killed calls
     record["files"] = list_files(folder, jobs)
     record["seconds"] = {"import": round(time.perf_counter() - begun, 3)}
     write_json(folder / "scene.json", record)
@@ -277,16 +298,16 @@ def _with_points(
 
 
 def _write_model(folder: Path, model: Model, placed: list[PlacedPhoto]) -> Model:
-    """Write sparse/0 with the placed photos; cameras that stayed equal keep their number."""
-    cameras: dict[int, Any] = {}
+    """Write sparse/0 with the placed photos; a camera whose photos share one size keeps its number."""
+    cameras: dict[int, ModelCamera] = {}
     images = {}
-    taken: dict[tuple[Any, ...], int] = {}
+    taken: dict[tuple[int, int, int, tuple[float, ...]], int] = {}
     for photo in placed:
         camera = photo.camera
         same = (camera.camera_id, camera.width, camera.height, camera.params)
         if same not in taken:
             number = camera.camera_id
-            while number in cameras:  # one camera whose photos have several sizes
+            while number in cameras:  # another size of the same camera
                 number = max(max(cameras), max(model.cameras)) + 1
             taken[same] = number
             cameras[number] = dataclasses.replace(camera, camera_id=number)
@@ -300,13 +321,13 @@ def _record(
     foreign: ForeignScene,
     settings: ImportSettings,
     name: str,
-    sides: dict[str, Any],
+    sides: Mapping[str, Split],
     model: Model,
     placed: list[PlacedPhoto],
     notes: list[str],
     key: str,
-) -> dict[str, Any]:
-    """scene.json without its files and times."""
+) -> ImportRecord:
+    """Assemble scene.json without its files and times."""
     tests = {n for n, s in sides.items() if s == "test"}
     only_test, short = point_checks(model, {n: n for n in sides}, tests)
     warnings = [
@@ -324,7 +345,7 @@ def _record(
     if suite is not None:
         full = {(c.width, c.height) for c in foreign.model.cameras.values()}
         warnings += differences(suite, settings.name or foreign.root.name, sorted(full), foreign.factor)
-    record: dict[str, Any] = {
+    record: ImportRecord = {
         "schema": "ambiguous_wild.scene",
         "schema_version": SCENE_SCHEMA,
         "name": name,

@@ -174,7 +174,7 @@ def _read_model(run: Path) -> TrainedModel:
     model = Model(
         label=result["method"],
         ply=ply,
-        look=look,
+        render_settings=look,
         psnr={name: float(value) for name, value in psnr.items() if value is not None},
         masks=run / MASKS if (run / MASKS).is_dir() else None,
         reference=knows_truth(result["method"]),

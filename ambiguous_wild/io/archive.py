@@ -29,9 +29,9 @@ _ZIP_METHODS = (
     zipfile.ZIP_STORED,
     zipfile.ZIP_DEFLATED,
     zipfile.ZIP_BZIP2,
-)  # others allocate what a header says
-_LONGEST = 255  # bytes of a name, what file systems hold
-_DEEPEST = 32  # folders inside each other
+)  # other methods allocate as much as a header says
+_LONGEST = 255  # bytes of a name that file systems can hold
+_DEEPEST = 32  # levels of folders
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def extract(archive: Path | str, target: Path | str, limits: Limits | None = Non
         Names of the files, relative to the target, sorted.
 
     Raises:
-        AwError: another format, damaged, or refused; names the member.
+        AwError: another format, damaged, or refused; the message names the member.
     """
     source, out = Path(archive), Path(target)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -74,7 +74,7 @@ def unpack(
     *,
     wanted: Callable[[str], bool] = lambda name: True,
 ) -> list[str]:
-    """As `extract`, into an existing folder that the caller removes after an error.
+    """Unpack as `extract` into an existing folder, which the caller removes after an error.
 
     Args:
         source: the archive's path, or its bytes.
@@ -104,9 +104,9 @@ def unpack(
 
 
 def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
-    """The files below a folder as an uncompressed tar, without names that begin with a dot.
+    """Pack the files below a folder into an uncompressed tar, except names that begin with a dot.
 
-    Links are followed: the receiver may not have their targets.
+    Links are followed, because the receiver may not have their targets.
 
     Args:
         folder: what to pack.
@@ -172,14 +172,14 @@ class _Target:
         if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
             raise _refused(self.archive, name, "a path that leads out of the folder")
         if not name.isprintable() or len(path.parts) > _DEEPEST:
-            raise _refused(self.archive, name, "no fit file name")
+            raise _refused(self.archive, name, "an invalid file name")
         if any(len(part.encode("utf-8", errors="surrogateescape")) > _LONGEST for part in path.parts):
             raise _refused(self.archive, name, "a name that is too long")
         if data is None:
             (self.folder / path).mkdir(parents=True, exist_ok=True)
             return
         if not path.parts:
-            raise _refused(self.archive, name, "without a name")
+            raise _refused(self.archive, name, "a file without a name")
         if len(self.names) >= self.files:
             raise AwError(f"{self.archive} holds more than {self.files} files; unpack a part of it")
         # Some file systems take two such names for one file, and one would overwrite the other.
@@ -211,7 +211,7 @@ class _Target:
 
 
 def _zip_members(raw: IO[bytes], source: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
-    """Names and contents; None for a folder."""
+    """Yield names and contents of a zip; None for a folder."""
     with zipfile.ZipFile(raw) as archive:
         for member in archive.infolist():
             mode = member.external_attr >> 16
@@ -229,7 +229,7 @@ def _zip_members(raw: IO[bytes], source: Path) -> Iterator[tuple[str, IO[bytes] 
 
 
 def _tar_members(raw: IO[bytes], source: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
-    """As `_zip_members`. tarfile's data filter would rename and repair what is refused here."""
+    """Yield names and contents of a tar, with our own checks: tarfile's data filter renames and repairs."""
     head = raw.read(6)
     raw.seek(0)
     stream = raw

@@ -34,7 +34,7 @@ from ambiguous_wild.io.files import atomic_path
 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length
-# id, seven numbers, id of the camera, and a name that is no number; observations are x, y, id of a point
+# An image's line has id, seven numbers, camera id and a name that is no number; observations are numbers.
 _IMAGE_LINE = re.compile(r"\s*\d+(\s+\S+){7}\s+\d+\s+(?![-+.\d]+(\s|$))\S")
 _POINT_ROW = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
@@ -42,7 +42,7 @@ _POINT_ROW = np.dtype(
 
 
 def read_model(folder: Path | str) -> Model:
-    """Read cameras, images and points3D, which may be absent, of a model folder: .bin if there, else .txt.
+    """Read cameras, images and, if present, points3D of a model folder: .bin files if it has them, else .txt.
 
     Raises:
         AwError: files are missing, damaged or contradictory.
@@ -75,7 +75,7 @@ def read_model(folder: Path | str) -> Model:
             )
         if image.name in names:
             raise AwError(
-                f"{root}: image {image.name!r} is there twice: the model is damaged; build it again"
+                f"{root} lists the image {image.name!r} twice: the model is damaged; build it again"
             )
         names.add(image.name)
     ids, counts = np.unique(model.points.ids, return_counts=True)
@@ -91,11 +91,11 @@ def read_model(folder: Path | str) -> Model:
 
 
 def check_camera(root: Path, camera: ModelCamera) -> None:
-    """Raise AwError for an impossible size or focal length, before it is divided by or allocated.
+    """Raise AwError for an impossible size or focal length, before it is used.
 
     Args:
-        root: where the camera is stated, for the message.
-        camera: of a model.
+        root: file or folder of the camera, for the message.
+        camera: camera of a model.
     """
     size = (camera.width, camera.height)
     whole = all(0 < side <= LARGEST_SIDE for side in size) and bool(np.isfinite(camera.params).all())
@@ -128,7 +128,7 @@ class _Reader:
         return struct.unpack(layout, self.take(struct.calcsize(layout)))
 
     def count(self, least_bytes: int) -> int:
-        """A uint64 count of records; refused where that many cannot fit in what is left."""
+        """Read a uint64 count of records; refuse one that the rest of the file cannot hold."""
         (number,) = self.unpack("<Q")
         if number * least_bytes > len(self.data) - self.at:
             raise AwError(
@@ -146,7 +146,7 @@ class _Reader:
 
 
 def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
-    """cameras.bin."""
+    """Read cameras.bin."""
     reader = _Reader(path)
     cameras: dict[int, ModelCamera] = {}
     for _ in range(reader.count(24)):
@@ -158,7 +158,7 @@ def _binary_cameras(path: Path) -> dict[int, ModelCamera]:
 
 
 def _binary_images(path: Path) -> dict[int, ModelImage]:
-    """images.bin."""
+    """Read images.bin."""
     reader = _Reader(path)
     images: dict[int, ModelImage] = {}
     for _ in range(reader.count(73)):
@@ -183,7 +183,7 @@ def _add(path: Path, records: dict[int, _Record], number: int, record: _Record) 
 
 
 def _binary_points(path: Path) -> ModelPoints:
-    """points3D.bin."""
+    """Read points3D.bin."""
     reader = _Reader(path)
     total = reader.count(_POINT.size)
     ids, xyz = np.empty(total, np.int64), np.empty((total, 3))
@@ -192,7 +192,7 @@ def _binary_points(path: Path) -> ModelPoints:
     if len(reader.data) - reader.at == total * _POINT.size:  # no tracks: rows of one size
         rows = np.frombuffer(reader.take(total * _POINT.size), _POINT_ROW)
         if rows["track"].any() or (rows["id"] >= 2**63).any():
-            raise AwError(f"{path} is damaged: its ids or tracks are not what its size allows; copy it again")
+            raise AwError(f"{path} is damaged: its ids or tracks do not fit its size; copy it again")
         none = np.zeros(0, np.int64)
         return ModelPoints(
             rows["id"].astype(np.int64),
@@ -217,7 +217,7 @@ def _binary_points(path: Path) -> ModelPoints:
 
 
 def _text_cameras(path: Path) -> dict[int, ModelCamera]:
-    """cameras.txt."""
+    """Read cameras.txt."""
     cameras: dict[int, ModelCamera] = {}
     for number, fields in _rows(path):
         try:
@@ -232,14 +232,17 @@ def _text_cameras(path: Path) -> dict[int, ModelCamera]:
                 f"model_converter to one of {', '.join(MODELS)}"
             )
         if len(params) != MODELS[model][1]:
-            told = f"{model} has {MODELS[model][1]} parameters, not {len(params)}"
-            raise AwError(f"{path}, line {number}: {told}; copy or build the model again")
+            problem = f"{model} has {MODELS[model][1]} parameters, not {len(params)}"
+            raise AwError(f"{path}, line {number}: {problem}; copy or build the model again")
         _add(path, cameras, camera_id, ModelCamera(camera_id, model, width, height, params))
     return cameras
 
 
 def _text_images(path: Path) -> dict[int, ModelImage]:
-    """images.txt: two lines an image; the second, of observations, may be empty, or absent from all."""
+    """Read images.txt: two lines an image, of which the second, of observations, may be empty.
+
+    A file may also lack the second line of all images.
+    """
     lines = [(n, text) for n, text in enumerate(_lines(path), 1) if not text.startswith("#")]
     while lines and not lines[0][1].strip():
         lines.pop(0)
@@ -266,7 +269,7 @@ def _text_images(path: Path) -> dict[int, ModelImage]:
 
 
 def _text_points(path: Path) -> ModelPoints:
-    """points3D.txt."""
+    """Read points3D.txt."""
     ids, xyz, rgb, error_px, lengths, tracks = [], [], [], [], [], []
     for number, fields in _rows(path):
         try:
@@ -304,7 +307,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _damaged(path: Path, number: int) -> AwError:
-    return AwError(f"{path}, line {number}, is not what COLMAP writes; copy or build the model again")
+    return AwError(f"{path}, line {number}, is not in COLMAP's format; copy or build the model again")
 
 
 _BINARY = (_binary_cameras, _binary_images, _binary_points)
@@ -319,7 +322,7 @@ def write_model(folder: Path, model: Model) -> None:
 
 
 def write_views(folder: Path, views: Sequence[View], points: Points) -> None:
-    """As `write_model`, of these views, a pinhole camera each at the views' size; without tracks."""
+    """Write a model with a pinhole camera a view, at the views' size, and points without tracks."""
     from scipy.spatial.transform import Rotation
 
     cameras, images, none = {}, {}, np.zeros(0, np.int64)

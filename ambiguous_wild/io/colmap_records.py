@@ -1,4 +1,4 @@
-"""What a COLMAP sparse model holds, and the names and ids of its camera models."""
+"""Records of a COLMAP sparse model, and the names and ids of COLMAP's camera models."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MODELS = {
     "SIMPLE_FISHEYE": (14, 3),
     "FISHEYE": (15, 4),
     "EUCM": (16, 6),
-    "EQUIRECTANGULAR": (17, 2),  # named only, see `check_camera`
+    "EQUIRECTANGULAR": (17, 2),  # refused by name, see `check_camera`
 }
 LARGEST_SIDE = 1_000_000  # px
 LARGEST_COORDINATE = 1e18  # world units; its square is finite in float32
@@ -51,7 +51,7 @@ class ModelCamera:
     shear: float = 0.0  # px that x moves right per px below cy, after the lens; Metashape's b2, not COLMAP's
 
     def pinhole(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) in px.
+        """Return (fx, fy, cx, cy) in px.
 
         Raises:
             AwError: the camera has lens distortion; training needs undistorted photos.
@@ -81,7 +81,7 @@ class ModelImage:
     point_ids: np.ndarray  # [K] int64, -1 = no point
 
     def cam_from_world(self) -> np.ndarray:
-        """[4, 4] float64, rigid."""
+        """Return the rigid transform [4, 4] float64."""
         pose = np.eye(4)
         pose[:3, :3] = rotation_from_quaternion(self.qvec)
         pose[:3, 3] = self.tvec
@@ -102,7 +102,7 @@ class ModelPoints:
 
     @property
     def owners(self) -> np.ndarray:
-        """[L] int64, the point of every observation, as an index into `ids`."""
+        """Index into `ids` of every observation's point, [L] int64."""
         return np.repeat(np.arange(len(self.ids)), np.diff(self.track_offsets))
 
     def subset(
@@ -110,7 +110,7 @@ class ModelPoints:
         points: np.ndarray,  # [M] bool
         observations: np.ndarray,  # [L] bool
     ) -> ModelPoints:
-        """These points, with these of their observations."""
+        """Return some of the points, with some of their observations."""
         rows = points[self.owners] & observations
         lengths = np.bincount(self.owners[rows], minlength=len(points))[points]
         return ModelPoints(
@@ -124,7 +124,7 @@ class ModelPoints:
         )
 
     def seen_in(self, image_ids: Collection[int]) -> ModelPoints:
-        """All points, with their observations in these images alone."""
+        """Return all points, with their observations in some images only."""
         return self.subset(np.ones(len(self.ids), bool), np.isin(self.track_image_ids, sorted(image_ids)))
 
 
@@ -141,7 +141,7 @@ def points_without_tracks(
     xyz: ArrayLike = (),  # [M, 3] world
     rgb: ArrayLike = (),  # [M, 3] uint8
 ) -> ModelPoints:
-    """Points that no photo is known to see; without arguments none."""
+    """Make points without observations; without arguments there are none."""
     positions, none = np.asarray(xyz, np.float64).reshape(-1, 3), np.zeros(0, np.int64)
     count = len(positions)
     return ModelPoints(
@@ -156,7 +156,7 @@ def points_without_tracks(
 
 
 def rotation_from_quaternion(q: np.ndarray) -> np.ndarray:
-    """[3, 3] rotation of the quaternion (w, x, y, z); it is normalised first."""
+    """Return the rotation [3, 3] of the quaternion (w, x, y, z), which is normalised first."""
     norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or norm == 0.0:
         raise AwError(f"pose with the quaternion {[float(v) for v in q]}: the COLMAP model is damaged")
@@ -171,7 +171,7 @@ def rotation_from_quaternion(q: np.ndarray) -> np.ndarray:
 
 
 def model_of_id(number: int, where: str) -> tuple[str, int]:
-    """(name, number of parameters) of COLMAP's camera model id.
+    """Return name and number of parameters of COLMAP's camera model id.
 
     Raises:
         AwError: an unknown id.

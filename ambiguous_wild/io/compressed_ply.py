@@ -1,4 +1,4 @@
-"""PlayCanvas's compressed PLY: chunks of 256 Gaussians, 16 bytes each, 8 bits a coefficient of harmonics.
+"""PlayCanvas's compressed PLY: chunks of 256 Gaussians, 16 bytes a Gaussian and 8 bits a harmonic.
 
 Layout and quantisation as in PlayCanvas's splat-transform (compressed-chunk.ts, write-compressed-ply.ts).
 """
@@ -16,11 +16,11 @@ from ambiguous_wild.io.ply import place_comments
 from ambiguous_wild.io.splat_arrays import (
     SH_C0,
     Arrays,
-    along_curve,
     finite,
     from_largest,
     largest_first,
     logit,
+    morton_order,
     read_bytes,
     rounded,
     sigmoid,
@@ -41,15 +41,15 @@ _MOST_BYTES = 1 << 33
 
 
 def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
-    """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
+    """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
 
     Args:
-        path: the file, by custom NAME.compressed.ply.
+        path: the file, usually NAME.compressed.ply.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
-        place: of their scene, told in comments.
+        place: place of their scene, written as comments.
     """
     kept = finite(gaussians)
-    order = along_curve(kept["means"])
+    order = morton_order(kept["means"])
     kept = {name: value[order] for name, value in kept.items()}
     n, rest = kept["sh_rest"].shape[:2]
     colour = kept["sh0"] * SH_C0 + 0.5
@@ -80,7 +80,7 @@ def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: Place = 
 
 
 def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
-    """Raw parameters of a compressed PLY, float32, as `io.ply.read_splat_ply` gives them.
+    """Read the raw parameters of a compressed PLY, float32, as `io.ply.read_splat_ply` does.
 
     Raises:
         AwError: no compressed PLY, or cut short.
@@ -90,7 +90,7 @@ def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
     lines = [] if end < 0 else [line for line in data[:end].decode("latin-1").splitlines() if line]
     lines = [line for line in lines if not line.startswith("comment")]
     text = "\n".join(lines)
-    found = re.fullmatch(
+    header = re.fullmatch(
         r"ply\nformat binary_little_endian 1.0\nelement chunk (\d{1,9})\n"
         + "".join(f"property float {name}\n" for name in _BOUNDS[:12])
         + "("
@@ -101,15 +101,15 @@ def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
         + r"(?:\nelement sh \d{1,9}((?:\nproperty uchar f_rest_\d+)*))?",
         text,
     )
-    if found is None:
+    if header is None:
         raise AwError(f"{path} is no compressed PLY as 'aw export' and splat-transform write it")
-    n, rest = int(found[3]), (found[4] or "").count("\n") // 3
+    n, rest = int(header[3]), (header[4] or "").count("\n") // 3
     if rest not in (0, 3, 8, 15):
         raise AwError(f"{path} has {3 * rest} f_rest columns; degree 0 to 3 have 0, 9, 24 or 45")
     chunks, start = -(-n // _CHUNK), end + len(b"end_header\n")
-    ends = 6 if found[2] else 4  # SuperSplat's first files have no bounds of colours
+    ends = 6 if header[2] else 4  # SuperSplat's first files have no bounds of colours
     size = chunks * 12 * ends + n * (16 + 3 * rest)
-    if int(found[1]) != chunks or len(data) - start < size:
+    if int(header[1]) != chunks or len(data) - start < size:
         raise AwError(f"{path} is cut short: {size} bytes announced, {len(data) - start} present")
     bounds = np.frombuffer(data, "<f4", chunks * 3 * ends, start).reshape(chunks, ends, 3)
     start += bounds.nbytes
@@ -133,7 +133,7 @@ def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def _in_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values in [0, 1] between bounds of their chunk [N, 3], and these bounds [chunks, 6], low then high."""
+    """Scale values [N, 3] to [0, 1] in the range of their chunk; return them and the ranges [chunks, 6]."""
     n = len(values)
     starts = np.arange(0, n, _CHUNK)
     if not n:

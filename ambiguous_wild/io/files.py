@@ -1,11 +1,9 @@
-"""Atomic writes: files and folders appear under their name complete or not at all, and replace ours only.
+"""Safe writes: files and folders appear complete or not at all, replace only ours, and can be locked.
 
-`place_of` decides for all commands what may lie where an output goes: nothing, a file, or a link to one.
-Devices and pipes are written into, everything else is refused.
-
-sha256 of files and arrays: what a scene, a run and a cache entry are known by.
-
-Folder locks: one command at a time on one folder; on every system, through filelock.
+`place_of` decides for all commands where an output may go: to a new name, over a file, or over a link to one.
+Devices and pipes are written into, everything else is refused. Folder locks let one command at a time work on
+a folder, on every system, through filelock. Scenes, runs and cache entries are identified by the sha256 of
+their files and arrays.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from filelock import FileLock, Timeout
 
 from ambiguous_wild.core.errors import AwError
 
-# Long enough to look again where the holder unlinked the file between our open and our lock.
+# Time to try again, for the case that the holder unlinked the file between our open and our lock.
 _TRY_S, _AGAIN_S = 0.05, 0.005
 
 
@@ -75,10 +73,10 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
 def patient_lock(
     folder: Path | str, doing: str, patience_s: float, waiting: Callable[[str], None] | None = None
 ) -> Iterator[None]:
-    """As `folder_lock`, but wait for up to `patience_s` seconds; `waiting` is told once who holds it.
+    """Lock as `folder_lock`, but wait up to `patience_s` seconds; `waiting` is called once with the holder.
 
     Raises:
-        Busy: it is locked even then.
+        Busy: it is still locked after that time.
     """
     deadline = time.monotonic() + patience_s
     with ExitStack() as stack:
@@ -97,13 +95,13 @@ def patient_lock(
 
 
 def lock_path(folder: Path) -> Path:
-    """The file that is locked for a folder."""
+    """Return the file that is locked for a folder."""
     return folder.parent / f".{folder.name}.lock"
 
 
 @contextmanager
 def file_lock(path: Path, text: str) -> Iterator[None]:
-    """Lock a file and write `text` into it, for whoever finds it locked; it is removed afterwards.
+    """Lock a file, and write `text` into it for a process that waits; it is removed afterwards.
 
     Raises:
         Held: another process, or another call of this one, holds it.
@@ -119,7 +117,7 @@ def file_lock(path: Path, text: str) -> Iterator[None]:
             path.write_text(text, encoding="utf-8")
         yield
     finally:
-        # Unlinked while it is locked: no stale file is left. Where the system refuses that, afterwards.
+        # It is unlinked while locked, so no stale file is left; afterwards if the system refuses that.
         with contextlib.suppress(OSError):
             path.unlink()
         lock.release()
@@ -133,13 +131,13 @@ def _read(path: Path) -> str:
 
 
 def sha256_file(path: Path | str) -> str:
-    """sha256 of the file's bytes, 64 hex digits."""
+    """Return the sha256 of the file's bytes, 64 hex digits."""
     with open(path, "rb") as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 
 def sha256_array(array: np.ndarray) -> str:
-    """sha256 over dtype, shape and bytes."""
+    """Return the sha256 of the array's dtype, shape and bytes."""
     contiguous = np.ascontiguousarray(array)
     digest = hashlib.sha256(f"{contiguous.dtype.str}{contiguous.shape}".encode())
     digest.update(contiguous.tobytes())
@@ -147,9 +145,9 @@ def sha256_array(array: np.ndarray) -> str:
 
 
 def place_of(path: Path | str) -> tuple[Path, bool]:
-    """Where an output called `path` goes, links followed, and whether it is written into what is there.
+    """Return where an output to `path` goes, links followed, and whether it is a device or a pipe.
 
-    Into it: character devices and pipes. All else is replaced whole; the caller tells a file from a folder.
+    Those are written into; a file or a folder is replaced whole, which the caller decides.
 
     Raises:
         AwError: a link to nowhere, a disk or a socket.
@@ -160,7 +158,7 @@ def place_of(path: Path | str) -> tuple[Path, bool]:
         return Path(path), False
     kind = os.stat(path).st_mode
     if stat.S_ISCHR(kind) or stat.S_ISFIFO(kind):
-        return Path(path), True  # not its real path: that of a pipe behind /dev/stdout is no path
+        return Path(path), True  # links are not followed: /dev/stdout may lead to a pipe without a path
     if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
         raise AwError(f"cannot write {path}: a disk or a socket lies there; choose another -o")
     return Path(os.path.realpath(path) if os.path.islink(path) else path), False
@@ -175,7 +173,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
     Raises:
         AwError: a folder, a link to nowhere, a disk, a socket or a pipe that nobody reads lies there.
-        OSError: it cannot be written; names `path`, not the temporary file.
+        OSError: it cannot be written; the error names `path`, not the temporary file.
     """
     target, into = place_of(path)
     if target.is_dir():
@@ -193,12 +191,12 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb") as f:
             os.fsync(f.fileno())
-        # mkstemp makes private files; here the user's umask applies.
+        # mkstemp makes private files, but the output is to have the permissions of the user's umask.
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)
         if into:
-            _pour(temporary, target)
+            _write_into(temporary, target)
             temporary.unlink()
         else:
             os.replace(temporary, target)
@@ -206,12 +204,12 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno and error.filename in (None, name, temporary):
             raise _named(error, target) from error
-        if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' own class
+        if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' class for OSError
             raise OSError(int(full[1]), os.strerror(int(full[1])), str(target)) from error
         raise
 
 
-def _pour(source: Path, target: Path) -> None:
+def _write_into(source: Path, target: Path) -> None:
     """Write the bytes of a file into a device or a pipe."""
     try:
         handle = os.open(target, os.O_WRONLY | os.O_NONBLOCK)  # a pipe without a reader would block for ever
@@ -228,7 +226,7 @@ def _pour(source: Path, target: Path) -> None:
 
 
 def _named(error: OSError, target: Path) -> OSError:
-    """The same error with the target's name; OSError chooses the subclass."""
+    """Return the same error with the target's name; OSError chooses the subclass."""
     return OSError(error.errno, error.strerror, str(target))
 
 
@@ -239,7 +237,7 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
     If `path` is a link, its target is replaced, not the link.
 
     Raises:
-        AwError: `path` is a file or a link to nowhere; without `replace`, somebody made it meanwhile.
+        AwError: `path` is a file or a link to nowhere; without `replace`, it was created meanwhile.
     """
     target = Path(os.path.realpath(place_of(path)[0]))
     refuse_file(path)
@@ -252,7 +250,7 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
         yield temporary
         if not replace:
             try:
-                os.rename(temporary, target)  # onto an empty folder at most
+                os.rename(temporary, target)  # fails unless the target is absent or an empty folder
             except OSError as error:
                 if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                     raise
@@ -272,7 +270,7 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
 
 
 def refuse_file(path: Path | str) -> None:
-    """Raise AwError where `path`, a folder to be made, is a file."""
+    """Raise AwError if `path`, a folder to be made, is a file."""
     if os.path.exists(path) and not os.path.isdir(path):
         raise AwError(f"cannot make the folder {path}: a file lies there; move it, or choose another -o")
 
@@ -287,7 +285,7 @@ def sweep(folder: Path | str) -> None:
 
 
 def sweep_killed(path: Path | str) -> None:
-    """Remove temporary files of `atomic_path(path)` whose processes are gone; the folder may be a user's."""
+    """Remove temporary files of `atomic_path(path)` whose processes ended; other files are left alone."""
     target = Path(path)
     start = f".{target.stem}."
     for left in target.parent.glob(glob.escape(start) + "*-*.tmp" + glob.escape(target.suffix)):
@@ -338,12 +336,12 @@ def check_output(path: Path | str) -> Path:
 
 def list_names(folder: Path) -> list[str]:
     """Files and links below a folder, sorted, as paths relative to it with slashes."""
-    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
-    return sorted(path.relative_to(folder).as_posix() for path in found)
+    files = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in files)
 
 
 def refuse_foreign_files(folder: Path, ours: Collection[str]) -> None:
-    """Raise AwError where the folder holds a file that is not in `ours` and would be lost."""
+    """Raise AwError if the folder holds a file that is not in `ours` and would be lost."""
     for name in list_names(folder):
         if name not in ours:
             raise AwError(
@@ -353,7 +351,7 @@ def refuse_foreign_files(folder: Path, ours: Collection[str]) -> None:
 
 
 def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> None:
-    """Raise AwError where one of these files, which a command is to write, is in the folder already.
+    """Raise AwError if the folder already holds one of the files that a command is to write.
 
     `flag` is the option that replaces it.
     """
@@ -364,7 +362,7 @@ def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> No
 
 
 def is_record(path: Path, key: str) -> bool:
-    """Whether a file is a JSON object with this key: the mark of what a command wrote before."""
+    """Tell whether a file is a JSON object with this key, which shows that a command of ours wrote it."""
     try:
         return key in json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, TypeError, RecursionError):

@@ -1,6 +1,6 @@
 """Binary glTF 2.0 with KHR_gaussian_splatting: float32 attributes, nothing quantised.
 
-Names and values as the extension's specification has them: opacities after the sigmoid, scales after exp,
+Names and values follow the extension's specification: opacities after the sigmoid, scales after exp,
 quaternions x, y, z, w. A node turns the splat PLY's axes (y down) by 180 degrees about z, so that y is up.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,12 +40,12 @@ def _harmonics(rest: int) -> list[str]:
 
 
 def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
-    """Write a .glb atomically. Returns how many Gaussians were written.
+    """Write a .glb atomically and return how many Gaussians were written.
 
     Args:
         path: the file, NAME.glb.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
-        place: of their scene; its offset becomes the node's translation.
+        place: place of their scene; its offset becomes the node's translation.
     """
     kept = finite(gaussians)
     n, rest = kept["sh_rest"].shape[:2]
@@ -63,14 +62,14 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": kept["sh0"],
     }
     columns |= {f"{EXTENSION}:{name}": kept["sh_rest"][:, k] for k, name in enumerate(_harmonics(rest))}
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, int]] = []
+    accessors: list[dict[str, object]] = []
     attributes: dict[str, int] = {}
     parts: list[bytes] = []
     offset = 0
     for name, values in columns.items():
         data = values if values.dtype == np.uint8 else values.astype("<f4")
-        accessor: dict[str, Any] = {
+        accessor: dict[str, object] = {
             "bufferView": len(views),
             "componentType": _BYTE if data.dtype == np.uint8 else _FLOAT,
             "count": n,
@@ -84,7 +83,7 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": data.nbytes, "target": _ARRAY_BUFFER})
         accessors.append(accessor)
         parts.append(np.ascontiguousarray(data).tobytes())
-        offset += data.nbytes  # of whole words: every row has 4 bytes or a multiple
+        offset += data.nbytes  # every row has a multiple of 4 bytes, so views stay aligned
     body = b"".join(parts)
     extension = {
         "kernel": "ellipse",
@@ -94,11 +93,11 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -
     }
     x, y, z = place.centre
     node = {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
-    if place.turn != UNMOVED.turn:  # the caller turned it: its y is up
+    if place.turn != UNMOVED.turn:  # the caller turned the model so that y is up
         node = {"mesh": 0}
-    told = {"extras": place_facts(place)} if place != UNMOVED else {}
+    extras = {"extras": place_facts(place)} if place != UNMOVED else {}
     head = {
-        "asset": {"version": "2.0", "generator": "ambiguous_wild", **told},
+        "asset": {"version": "2.0", "generator": "ambiguous_wild", **extras},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -127,14 +126,14 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -
 
 
 def gltf_place(path: Path | str) -> Place:
-    """Where the scene of a file that `read_gltf` has read lies."""
+    """Return the place of the scene of a file that `read_gltf` has read."""
     data = read_bytes(path, _MOST_BYTES)
     (length,) = struct.unpack_from("<I", data, 12)
     return place_from(json.loads(data[20 : 20 + length])["asset"].get("extras"))
 
 
 def read_gltf(path: Path | str) -> dict[str, np.ndarray]:
-    """Raw parameters of a .glb that `write_gltf` wrote, float32.
+    """Read the raw parameters of a .glb that `write_gltf` wrote, float32.
 
     Raises:
         AwError: no such file, or another layout.
@@ -154,8 +153,8 @@ def read_gltf(path: Path | str) -> dict[str, np.ndarray]:
             width = next(k for k, v in _TYPES.items() if v == accessor["type"])
             start = body + int(head["bufferViews"][accessor["bufferView"]]["byteOffset"])
             count = int(accessor["count"])
-            found = np.frombuffer(data, "<f4", count * width, start).reshape(count, width)
-            return found[:, 0] if width == 1 else found
+            rows = np.frombuffer(data, "<f4", count * width, start).reshape(count, width)
+            return rows[:, 0] if width == 1 else rows
 
         rest = sum(name.startswith(f"{EXTENSION}:SH_DEGREE_") for name in attributes) - 1
         means = column("POSITION")

@@ -1,4 +1,4 @@
-"""Read and write the images of a scene, through OpenCV, which the first image imports.
+"""Read and write the images of a scene through OpenCV, which is imported with the first image.
 
 For photos of any kind (EXIF, CMYK, damaged files) see `io/photos.py`.
 """
@@ -71,14 +71,14 @@ def load_image_codes(
 
 
 def as_float(codes: np.ndarray) -> np.ndarray:
-    """Codes of `load_image_codes` as float32 in [0, 1]."""
+    """Convert codes of `load_image_codes` to float32 in [0, 1]."""
     if codes.dtype == np.float32:
         return codes
     return codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """[H, W, 3] float to 8 bits, clipped to [0, 1] and rounded to nearest."""
+    """Convert [H, W, 3] floats to 8 bits, clipped to [0, 1] and rounded to nearest."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
@@ -96,9 +96,9 @@ def read_keep_map(
 def read_mask(
     path: Path | str,
 ) -> np.ndarray:  # [H, W] uint8 in {0, 255}
-    """Read a mask by its values: black and white, with the grey edges of smoothing and JPEG, or 0 and 1.
+    """Read a mask of black and white, perhaps with the grey edges of smoothing and JPEG, or of 0 and 1.
 
-    Alpha is the mask where it varies and the colours do not tell another one; else it is left out.
+    Alpha is the mask where it varies and the colours are not another mask; else it is left out.
 
     Raises:
         AwError: the file does not decode, or holds other values: a label map, a photo.
@@ -127,25 +127,25 @@ def read_mask(
             (values[k].tolist(), 100 * counts[k] / counts.sum())
             for k in np.argsort(-counts, kind="stable")[:5]
         ]
-        told = ", ".join(f"{value} ({share:.2g} %)" for value, share in most)
+        shares = ", ".join(f"{value} ({share:.2g} %)" for value, share in most)
         raise AwError(
-            f"{path} is no mask of black and white, or of 0 and 1: it holds {len(values)} values, {told}; "
+            f"{path} is no mask of black and white, or of 0 and 1: it holds {len(values)} values, {shares}; "
             "write 255 where the photo is kept and 0 elsewhere, or leave the masks out"
         )
     return shown
 
 
-_SLACK = {"JPEG": 8}  # of black and white; 2 in formats without losses
+_SLACK = {"JPEG": 8}  # tolerance of black and white; 2 in lossless formats
 
 
 def _black_and_white(grey: np.ndarray, slack: int) -> np.ndarray | None:
-    """[H, W] uint8 to {0, 255}; None where other values than black, white and their edges are there."""
+    """Convert [H, W] uint8 to {0, 255}; None if it holds more than black, white and edges between them."""
     import cv2
 
     top = grey.max(initial=0)
     if top <= 1:
         return grey * np.uint8(255)
-    if top >= 128 and not ((grey > slack) & (grey < top)).any():  # a light grey alone is a white
+    if top >= 128 and not ((grey > slack) & (grey < top)).any():  # a single light grey stands for white
         return np.where(grey == top, 255, 0).astype(np.uint8)
     between = (grey > slack) & (grey < 255 - slack)
     # The grey of edges is thin and uneven; labels are areas of one value.
@@ -166,7 +166,7 @@ def _varying_alpha(image: np.ndarray) -> np.ndarray | None:
 def read_alpha(
     path: Path | str,
 ) -> np.ndarray | None:  # [H, W] uint8 in {0, 255}
-    """What a photo's alpha keeps; None without alpha, or where it is the same everywhere.
+    """Read a photo's alpha as a keep mask; None without alpha, or where it is the same everywhere.
 
     Raises:
         AwError: the file is missing or does not decode.
@@ -175,7 +175,7 @@ def read_alpha(
         with pillow().open(path, formats=_FORMATS) as image:
             if "A" not in image.getbands() and "transparency" not in image.info:
                 return None
-    except Exception:  # as in `header_size`; who reads the pixels says what is wrong
+    except Exception:  # as in `header_size`; reading the pixels reports what is wrong
         return None
     pixels = _decode(path, "whole")
     return _varying_alpha(pixels // 257 if pixels.dtype == np.uint16 else pixels)
@@ -187,7 +187,7 @@ def _form(path: Path | str) -> str:
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
-    """(width, height) in px; PNG: from the header, other formats: by decoding.
+    """Return (width, height) in px; of a PNG from the header, of other formats by decoding.
 
     Raises:
         AwError: the file is missing or does not decode.
@@ -199,9 +199,9 @@ def image_size(path: Path | str) -> tuple[int, int]:
 
 
 def header_size(source: Path | str | bytes) -> tuple[int, int] | None:
-    """(width, height) in px from the header of a file or its bytes; None where it is absent or no image.
+    """Return (width, height) in px from the header of a file or its bytes; None if it is absent or no image.
 
-    A decoder allocates what the header says, so the size is checked before.
+    A decoder allocates as much as the header says, so the size is checked first.
     """
     opened = BytesIO(source) if isinstance(source, bytes) else source
     try:
@@ -212,7 +212,7 @@ def header_size(source: Path | str | bytes) -> tuple[int, int] | None:
 
 
 def orientation(path: Path | str) -> int:
-    """EXIF orientation of a photo, 1 to 8; 1 = as stored, also where nothing or nonsense is stated."""
+    """Return the EXIF orientation of a photo, 1 to 8; 1 = as stored, also where it is absent or invalid."""
     try:
         with pillow().open(path, formats=_FORMATS) as image:
             value = image.getexif().get(0x0112, 1)
@@ -234,7 +234,7 @@ def upright(image: np.ndarray, orientation: int) -> np.ndarray:
 
 @functools.cache
 def pillow() -> Any:
-    """Pillow's Image, without its own limit of pixels: `MAX_PIXELS` is ours, checked before decoding."""
+    """Return Pillow's Image without its limit of pixels: `MAX_PIXELS` is checked before decoding."""
     from PIL import Image
 
     Image.MAX_IMAGE_PIXELS = None
@@ -264,7 +264,7 @@ def _encode_png(path: Path | str, image: np.ndarray) -> bytes:
     import cv2
 
     pixels = image[:, :, ::-1] if image.ndim == 3 else image
-    # one filter for all rows: about as small as choosing by row, and faster
+    # One filter for all rows is faster than choosing it by row, and the file is about as small.
     options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), options)
     if not done:
@@ -277,7 +277,7 @@ def decode(
     flags: int,  # of cv2.imdecode
     where: str,  # the file's name, for the message
 ) -> np.ndarray | None:
-    """`cv2.imdecode`, None where the bytes are damaged. The header's size is checked before decoding.
+    """Decode with `cv2.imdecode`; None where the bytes are damaged. The header's size is checked first.
 
     Raises:
         AwError: the header announces too many pixels.
@@ -293,7 +293,7 @@ def decode(
 
 
 def _sound(data: np.ndarray, where: str) -> bool:
-    """Whether the format is supported; raises AwError where the header announces too many pixels."""
+    """Tell whether the format is supported; raise AwError where the header announces too many pixels."""
     size = header_size(data.tobytes())
     if size is None:  # OpenCV decodes a dozen more formats, which are not needed
         return False
@@ -307,12 +307,12 @@ def _sound(data: np.ndarray, where: str) -> bool:
 
 def _decode(
     path: Path | str,
-    # 8-bit colour, 8-bit grey, colour at the file's own depth, all channels at this depth
+    # 8-bit colour, 8-bit grey, colour at the file's depth, all channels at the file's depth
     kind: Literal["rgb", "grey", "deep", "whole"],
 ) -> np.ndarray:
     import cv2
 
-    # Not cv2.imread: non-ASCII names on every platform, and our own error messages.
+    # cv2.imread cannot open non-ASCII names on every platform, and does not say why a file is not read.
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""motion.npz of a scene: features that fit the place in other train photos, and those that move."""
+"""motion.npz of a scene: features that are static by other train photos, and features that move."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.files import atomic_path
 
 FILE = "motion.npz"  # in the scene's folder
-_MOST_BYTES = 1 << 28  # unpacked: a thousand photos have about 2e7
-# what numpy and zipfile raise for a damaged file, besides their own
+_MOST_BYTES = 1 << 28  # largest unpacked size; a thousand photos have about 2e7
+# Exceptions that numpy and zipfile raise for a damaged file, besides their own.
 _DAMAGE = (ValueError, LookupError, OSError, EOFError, TypeError, AttributeError, RuntimeError, MemoryError,
            OverflowError)  # fmt: skip
 
@@ -25,19 +25,19 @@ class MotionPoints:
     """Features of one photo that other train photos show too."""
 
     xy: np.ndarray  # [N, 2] float32, share of the photo's width and height
-    static: np.ndarray  # [N] uint8, photos in which it is where the place puts it
-    # [N] uint8, photos in which it fits another rigid motion, and not the place, or that see through it
+    static: np.ndarray  # [N] uint8, photos in which it lies where the static scene puts it
+    # [N] uint8, photos in which it fits only another rigid motion, or that see through it
     moving: np.ndarray
     motion: np.ndarray  # [N] int16, from 1: features of the photo that move together; 0 = does not move
 
     @property
     def moves(self) -> np.ndarray:
-        """[N] bool: more photos say that it moves than say that it does not."""
+        """[N] bool: more photos call the feature moving than static."""
         return self.moving > self.static
 
 
 def write_motion_points(path: Path, photos: Mapping[str, MotionPoints]) -> None:
-    """Write the points of all photos, by the names that the scene gives them."""
+    """Write the points of all photos, by their names in the scene."""
     points = list(photos.values())
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(
@@ -52,7 +52,7 @@ def write_motion_points(path: Path, photos: Mapping[str, MotionPoints]) -> None:
 
 
 def read_motion_points(scene: Path) -> dict[str, MotionPoints]:
-    """Name -> points, of a scene's folder; empty where it has no such file.
+    """Read name -> points from a scene's folder; empty where it has no such file.
 
     Raises:
         AwError: the file is damaged.

@@ -1,4 +1,4 @@
-"""Numba's cache of compiled kernels on disk."""
+"""Repair Numba's cache of compiled kernels on disk."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def rebuild_damaged_cache(dispatcher: Any) -> Any:
     """
     cache: Any = getattr(dispatcher, "_cache", None)
     if not hasattr(cache, "load_overload") or not hasattr(cache, "flush"):
-        return dispatcher  # without a cache, or another version of Numba
+        return dispatcher  # it has no cache, or this is another version of Numba
     load = cache.load_overload
 
     def load_overload(*args: Any) -> Any:

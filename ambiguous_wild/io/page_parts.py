@@ -1,4 +1,4 @@
-"""Parts of pages that are one file: a template with everything put in, JPEGs, data: addresses."""
+"""Make web pages that are one file: fill a template, encode JPEGs and data: addresses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from ambiguous_wild.core.errors import AwError
 
 def fill_page(
     folder: Path,
-    data: Mapping[str, Any],
+    data: Mapping[str, object],
     scripts: Sequence[str],
     *,
     title: str = "",
@@ -28,20 +27,20 @@ def fill_page(
     parts: Mapping[str, str] | None = None,
     sort_keys: bool = False,
 ) -> str:
-    """The template FOLDER/page.html with style, scripts and data in it; texts can be anything and stay text.
+    """Fill the template FOLDER/page.html with style, scripts and data; texts are escaped.
 
-    Its policy allows this style, these scripts and what is named here; the page loads nothing else.
+    The page's content security policy allows this style, these scripts and the sources given, nothing else.
 
     Args:
-        folder: of the template, its style and its scripts.
-        data: for the scripts, as JSON.
+        folder: folder of the template, its style and its scripts.
+        data: data for the scripts, as JSON.
         scripts: names of files, in order.
-        title: of the page.
-        images: where pictures may come from.
+        title: title of the page.
+        images: sources of pictures in the policy.
         more_sources: further directives of the policy.
-        more_scripts: other sources of scripts.
-        parts: what else the template asks for, by its /*NAME*/.
-        sort_keys: of the JSON.
+        more_scripts: further sources of scripts in the policy.
+        parts: texts for other places /*NAME*/ of the template, by NAME.
+        sort_keys: sort the keys of the JSON.
     """
     style = (folder / "page.css").read_text(encoding="utf-8")
     script = "\n".join((folder / name).read_text(encoding="utf-8") for name in scripts)
@@ -52,11 +51,11 @@ def fill_page(
         f"default-src 'none'; img-src {images}; style-src {_digest(style)}; {more_sources}"
         f"script-src {_digest(script)}{more_scripts}; base-uri 'none'; form-action 'none'"
     )
-    known = {"POLICY": policy, "TITLE": html.escape(title), "STYLE": style, "SCRIPT": script, "DATA": text}
-    known |= parts or {}
-    # In one pass: what is put in is not looked at again.
+    texts = {"POLICY": policy, "TITLE": html.escape(title), "STYLE": style, "SCRIPT": script, "DATA": text}
+    texts |= parts or {}
+    # One pass, so that a text which is put in is not searched for places again.
     template = (folder / "page.html").read_text(encoding="utf-8")
-    return re.sub(r"/\*([A-Z]+)\*/", lambda found: known[found[1]], template)
+    return re.sub(r"/\*([A-Z]+)\*/", lambda place: texts[place[1]], template)
 
 
 def _digest(text: str) -> str:
@@ -64,7 +63,7 @@ def _digest(text: str) -> str:
 
 
 def jpeg_bytes(image: np.ndarray, quality: int, *, full_colour: bool = False) -> bytes:
-    """[H, W, 3] uint8 RGB as JPEG without metadata; `full_colour` halves no resolution of colours.
+    """Encode [H, W, 3] uint8 RGB as JPEG without metadata; `full_colour` keeps colours at full resolution.
 
     Raises:
         AwError: too large for a JPEG.
@@ -81,7 +80,7 @@ def jpeg_bytes(image: np.ndarray, quality: int, *, full_colour: bool = False) ->
 
 
 def narrowed(image: np.ndarray, width: int) -> np.ndarray:
-    """The image [H, W] or [H, W, C], not wider than so many px."""
+    """Reduce an image [H, W] or [H, W, C] to at most `width` px."""
     import cv2
 
     if image.shape[1] <= width:
@@ -91,5 +90,5 @@ def narrowed(image: np.ndarray, width: int) -> np.ndarray:
 
 
 def data_uri(kind: str, data: bytes) -> str:
-    """A data: address of a picture; `kind` is "jpeg" or "png"."""
+    """Return a data: address of a picture; `kind` is "jpeg" or "png"."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -53,12 +53,12 @@ class Exif:
 
     @property
     def camera(self) -> str | None:
-        """Make and model as one name."""
+        """Make and model, joined."""
         parts = [p for p in (self.make, self.model) if p]
         return " ".join(parts) or None
 
     def focal_px(self, width: int, height: int) -> float | None:
-        """Focal length in px of a width x height photo from the 35 mm equivalent, or None."""
+        """Return the focal length in px of a photo of this size, by its 35 mm equivalent; None without."""
         if self.focal_35mm is None:
             return None
         return self.focal_35mm * math.hypot(width, height) / _DIAGONAL_35MM
@@ -130,9 +130,9 @@ def read_photo(
 
 
 def _read_heic(source: Path) -> tuple[Photo, np.ndarray]:
-    """HEIC and HEIF, as phones make them, through libheif (extra [heic]) as a plugin of Pillow.
+    """Read HEIC and HEIF photos of phones through libheif (extra [heic]), a plugin of Pillow.
 
-    libheif applies the file's own rotation; by the standard EXIF's orientation is then not applied again.
+    libheif applies the rotation in the file, so by the standard EXIF's orientation is not applied again.
     """
     if not _register_heif():
         raise UnreadablePhoto(source, f"HEIC photos need the extra [heic]: {install_command('heic')}")
@@ -170,7 +170,7 @@ def _register_heif() -> bool:
 
 
 def _block_exif(raw: object) -> Exif:
-    """EXIF of a block without a photo: read as that of a JPEG with one pixel; a damaged block is none."""
+    """Read a bare EXIF block by putting it into a JPEG of one pixel; a damaged block gives an empty Exif."""
     import OpenImageIO as oiio
 
     if not isinstance(raw, bytes):
@@ -223,7 +223,7 @@ def _sniff(path: Path) -> str:
 
 
 def _raw(path: Path) -> str:
-    """DNG is read where OpenImageIO was built with LibRaw; its TIFF reader would return the small preview."""
+    """Refuse raw photos unless OpenImageIO has LibRaw: its TIFF reader returns a DNG's small preview."""
     import OpenImageIO as oiio
 
     if "raw" not in str(oiio.get_string_attribute("format_list")).split(","):
@@ -234,7 +234,7 @@ def _raw(path: Path) -> str:
 
 
 def _check_whole(path: Path, form: str) -> None:
-    """Refuse a file without its end: decoders fill the rest with grey and report no error."""
+    """Refuse a file that is cut short: decoders fill the rest with grey and report no error."""
     if form == "jpeg":
         data = path.read_bytes()
         scan = _first_scan(data)
@@ -249,7 +249,7 @@ def _check_whole(path: Path, form: str) -> None:
 
 
 def _first_scan(data: bytes) -> int:
-    """Offset of the first start-of-scan marker outside header thumbnails; -1 without."""
+    """Return the offset of the first start-of-scan marker outside header thumbnails; -1 without one."""
     at = 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
@@ -276,7 +276,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 
 def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list[str]]:
-    """[H, W, C] uint8 to [H, W, 3], with notes on the conversion."""
+    """Convert [H, W, C] uint8 to [H, W, 3], with notes on the conversion."""
     notes = []
     if str(spec.format) == "uint16":
         notes.append("16 bits reduced to 8")
@@ -297,7 +297,7 @@ def _alpha_note(alpha: np.ndarray) -> str:
 def _three_channels(
     path: Path, pixels: np.ndarray, names: tuple[str, ...], space: str
 ) -> tuple[np.ndarray, list[str]]:
-    """[H, W, C] without alpha to [H, W, 3]; `names` of the file's channels, `space` of its colours."""
+    """Convert [H, W, C] without alpha to [H, W, 3], by the file's channel names and colour space."""
     channels = pixels.shape[2]
     if channels == 1:
         return np.repeat(pixels, 3, axis=2), ["grey repeated as RGB"]
@@ -311,12 +311,12 @@ def _three_channels(
 
 
 def _one_line(text: object) -> str:
-    """The end of a library's message."""
+    """Return the end of a library's message as one line."""
     return " ".join(str(text).split())[-120:]
 
 
 def exif_from_spec(spec: Any) -> Exif:
-    """The EXIF part of an OpenImageIO ImageSpec; damaged values count as absent."""
+    """Read EXIF from an OpenImageIO ImageSpec; damaged values count as absent."""
     orientation = _number(spec, "Orientation")
     balance = _number(spec, "Exif:WhiteBalance")
     return Exif(

@@ -39,7 +39,7 @@ class PlainLoader(yaml.SafeLoader):
             if key.tag == "tag:yaml.org,2002:merge":
                 raise AwError(f"line {key.start_mark.line + 1}: merged keys (<<) are not supported")
             if key.value in seen:
-                raise AwError(f"line {key.start_mark.line + 1}: the key {key.value!r} is there twice")
+                raise AwError(f"line {key.start_mark.line + 1}: the key {key.value!r} occurs twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -56,10 +56,10 @@ PlainLoader.add_constructor("tag:yaml.org,2002:int", PlainLoader.construct_yaml_
 
 
 def parse(text: str) -> Any:
-    """The plain data of a YAML text.
+    """Parse a YAML text into plain data.
 
     Raises:
-        AwError: no YAML, or something that is not supported; names the line.
+        AwError: no YAML, or something that is not supported; the message names the line.
     """
     try:
         return yaml.load(text, Loader=PlainLoader)
@@ -68,20 +68,20 @@ def parse(text: str) -> Any:
         line = f" in line {mark.line + 1}" if mark else ""
         problem = " ".join(str(getattr(error, "problem", None) or "it does not parse").split())
         raise AwError(f"not YAML{line}: {problem}") from None
-    # Raised for 2025-99-99, numbers of ten thousand digits, a thousand brackets, and by bugs of PyYAML.
+    # PyYAML raises these for 2025-99-99, numbers of ten thousand digits, a thousand brackets, and some bugs.
     except (ValueError, TypeError, RecursionError, KeyError, AttributeError, IndexError) as error:
         raise AwError(f"not YAML that is supported: {error or type(error).__name__}") from None
 
 
 def read_text(path: Path) -> str:
-    """The text of a YAML file.
+    """Read the text of a YAML file.
 
     Raises:
         AwError: it cannot be read, is no UTF-8, or too large.
     """
     try:
         if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB, which no file of ours is")
+            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB, the limit for YAML files")
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
@@ -89,7 +89,7 @@ def read_text(path: Path) -> str:
 
 
 def read_mapping(path: Path) -> dict[Any, Any]:
-    """A file that holds one mapping.
+    """Read a file that holds one mapping.
 
     Raises:
         AwError: it cannot be read, or holds something else.

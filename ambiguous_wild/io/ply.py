@@ -1,4 +1,4 @@
-"""PLY files: point clouds, and the splat PLY that every 3DGS viewer reads, one vertex a Gaussian."""
+"""Read and write PLY: point clouds, and the splat PLY of every 3DGS viewer, one vertex a Gaussian."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def _columns(rest: int) -> list[str]:
 def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray], place: Place = UNMOVED) -> None:
     """Write Gaussians atomically.
 
-    Of a scene that was moved, the file has the units of the scene's files; what is to be added to its
-    positions for their coordinates, which float32 does not hold, is a comment of the header.
+    If the scene was moved, the file has the units of the scene's files, and a comment in the header gives the
+    offset to add to its positions for their coordinates, which float32 cannot hold.
 
     Args:
         path: the file.
         gaussians: raw parameters as `splat.Gaussians` holds them: means [N, 3], quats [N, 4] (w, x, y,
             z), log_scales [N, 3], opacity_logits [N], sh0 [N, 3], sh_rest [N, K, 3] with K of 0, 3, 8, 15.
-        place: of the scene that they were trained on, in whose inner coordinates they are.
+        place: place of the scene that they were trained on, in whose inner coordinates they are.
 
     Raises:
         AwError: an array is missing or has another shape.
@@ -80,7 +80,7 @@ def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray], place
 
 
 def rescaled(gaussians: Mapping[str, np.ndarray], factor: float) -> Mapping[str, np.ndarray]:
-    """Gaussians in other units: means and scales times `factor`."""
+    """Return the Gaussians in other units: means and scales times `factor`."""
     if factor == 1.0:
         return gaussians
     means, log_scales = gaussians["means"], gaussians["log_scales"]
@@ -89,19 +89,19 @@ def rescaled(gaussians: Mapping[str, np.ndarray], factor: float) -> Mapping[str,
 
 
 def place_comments(place: Place) -> list[str]:
-    """Header lines of a PLY that tell where its scene lies."""
+    """Return header lines of a PLY that record the place of its scene."""
     values = {"offset": place.centre, "training_scale": (place.scale,), "rotation": place.turn}
     if place.turn == UNMOVED.turn:
         del values["rotation"]
-    told = [f"comment {name} {' '.join(map(repr, numbers))}" for name, numbers in values.items()]
-    return [] if place == UNMOVED else told
+    lines = [f"comment {name} {' '.join(map(repr, numbers))}" for name, numbers in values.items()]
+    return [] if place == UNMOVED else lines
 
 
 def read_place(path: Path | str) -> Place:
-    """Where the scene of a splat PLY of `write_splat_ply` lies; another tool's: where it is.
+    """Return the place of the scene of a splat PLY; `UNMOVED` if another tool wrote it.
 
     Raises:
-        AwError: its numbers are none.
+        AwError: the numbers in its comments are invalid.
     """
     with open(path, "rb") as f:
         head = f.read(_MAX_HEADER).partition(b"end_header")[0]
@@ -119,26 +119,25 @@ def read_place(path: Path | str) -> Place:
 
 
 def checked_place(offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn) -> Place:
-    """The place that a file tells of.
+    """Return the place that a file records.
 
     Raises:
-        ValueError: the numbers are none.
+        ValueError: the numbers are invalid.
     """
     (x, y, z), (a, b, c, d) = offset, turn
     if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(turn)):
-        raise ValueError("a place that is none")
+        raise ValueError("invalid place")
     return Place((float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d)))
 
 
 def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
 
-    A model of a scene that was moved comes back in the scene's inner coordinates.
-
-    Columns may have any order and scalar type; unknown ones are ignored.
+    A model of a scene that was moved is returned in the scene's inner coordinates. Columns may have any order
+    and scalar type; unknown ones are ignored.
 
     Raises:
-        AwError: no splat PLY, cut short, missing columns, or harmonics of no degree from 0 to 3.
+        AwError: no splat PLY, cut short, missing columns, or harmonics of a degree above 3.
     """
     path = Path(path)
     table = _vertices(path)
@@ -160,7 +159,7 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     if rest:
         channels = columns([f"f_rest_{i}" for i in range(rest)]).reshape(count, 3, rest // 3)
         higher = np.ascontiguousarray(channels.transpose(0, 2, 1))
-    found = {
+    arrays = {
         "means": columns(["x", "y", "z"]),
         "quats": columns([f"rot_{i}" for i in range(4)]),
         "log_scales": columns([f"scale_{i}" for i in range(3)]),
@@ -168,11 +167,11 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
-    return dict(rescaled(found, read_place(path).scale))
+    return dict(rescaled(arrays, read_place(path).scale))
 
 
 def has_splats(path: Path) -> bool:
-    """Whether a file may be one of splats, and no PLY of plain points.
+    """Tell whether a file may hold splats, unlike a PLY of plain points.
 
     Raises:
         AwError: it cannot be read.
@@ -186,7 +185,7 @@ def has_splats(path: Path) -> bool:
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [M, 3] float64 and colours [M, 3] uint8 of a point cloud.
+    """Read positions [M, 3] float64 and colours [M, 3] uint8 of a point cloud.
 
     Raises:
         AwError: unreadable, damaged, or without x, y, z.
@@ -212,7 +211,7 @@ def write_point_ply(
     rgb: np.ndarray,  # [M, 3] uint8
 ) -> None:
     """Write a point cloud, binary."""
-    # Coordinates of a map have more digits than float32.
+    # Coordinates of maps have more digits than float32, so these are written as doubles.
     middle = np.median(xyz, axis=0) if len(xyz) else np.zeros(3)
     far = len(xyz) and np.abs(middle).max() > 100 * np.median(np.abs(xyz - middle))
     form, kind = ("<f8", "double") if far else ("<f4", "float")
@@ -226,7 +225,7 @@ def write_point_ply(
 
 
 def splat_count(path: Path | str) -> int:
-    """Number of Gaussians, from the file's header.
+    """Return the number of Gaussians, from the file's header.
 
     Raises:
         AwError: no such file, or no splat PLY.
@@ -240,7 +239,7 @@ def splat_count(path: Path | str) -> int:
 
 
 def _vertices(path: Path) -> np.ndarray:
-    """The first element's rows, [M] with a field a property.
+    """Read the rows of the first element: [M], with a field for each property.
 
     Raises:
         AwError: no PLY file, or cut short.
@@ -269,7 +268,7 @@ def _ascii_rows(path: Path, lines: IO[bytes], count: int, dtype: np.dtype) -> np
         values = np.array(rows).reshape(count, width)
     except ValueError as error:
         raise AwError(f"{path} is cut short or damaged; copy it again") from error
-    # a text may have more digits than float32
+    # Numbers in text may have more digits than float32.
     table = np.empty(count, [(n, "<f8" if dtype[n].kind == "f" else dtype[n]) for n in dtype.names or ()])
     for index, name in enumerate(dtype.names or ()):
         column = values[:, index]
@@ -280,7 +279,7 @@ def _ascii_rows(path: Path, lines: IO[bytes], count: int, dtype: np.dtype) -> np
 
 
 def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int, str]:
-    """Number of vertices, their dtype, the offset of the data, and its form."""
+    """Parse the header: number of vertices, their dtype, offset of the data, and format."""
     if not head.startswith(b"ply"):
         raise AwError(f"{path} is no PLY file: it does not start with 'ply'")
     end = head.find(b"end_header")

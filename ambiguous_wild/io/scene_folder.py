@@ -1,4 +1,4 @@
-"""Scene folders: ours (with scene.json), and any plain COLMAP scene as gsplat and 3DGS read it."""
+"""Read scene folders: ours (with scene.json), and plain COLMAP scenes as gsplat and 3DGS read them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ambiguous_wild.io.colmap_records import Model, ModelImage
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import image_size
 
-SCENE_SCHEMA = 1  # of scene.json; raised when a reader of the old one would be wrong
-MOST_FACTOR = 1000  # of downsampling; the builder allows 64
-TEST_EVERY = 8  # test photos of scenes without lists, as in 3DGS and gsplat
+SCENE_SCHEMA = 1  # version of scene.json, raised when an older reader would misread it
+MOST_FACTOR = 1000  # largest downsampling factor; the builder allows 64
+TEST_EVERY = 8  # in scenes without lists every 8th photo is a test photo, as in 3DGS and gsplat
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-OWN_MASKS = "masks.json"  # beside it lie instances of a segmentation, not keep masks
+OWN_MASKS = "masks.json"  # marks a folder with instances of a segmentation, not keep masks
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
@@ -43,8 +43,8 @@ def load_scene(
         path: our scene folder, or a plain COLMAP scene (``images/`` and ``sparse/0``).
         factor: 1 opens ``images/``, n opens ``images_n/``; None: the factor of scene.json.
         verify: True compares the sha256 of every file in scene.json, "quick" the sizes, False nothing.
-        raw: the files' own coordinates; else a scene far from the origin, or of a size that float32 and the
-            nearest depth do not suit, is moved and scaled (`Scene.place`).
+        raw: keep the files' coordinates; else a scene far from the origin, or too large or small for float32
+            and the nearest depth, is moved and scaled (`Scene.place`).
 
     Returns:
         The scene: views ordered by name, intrinsics at the size of the loaded files, tracks in px of these
@@ -62,12 +62,12 @@ def load_scene(
     read = read_scene_json(root)
     if read is not None and verify:
         verify_files(root, read, quick=verify == "quick")
-    # The model first: a folder of photos alone is told that it has none.
+    # The model is looked for first, so that the error for a folder of mere photos says that it has none.
     sparse = model_folder(root)
     chosen = _default_factor(root, read) if factor is None else factor
     folder = _image_folder(root, chosen)
     info: SceneInfo = {} if read is None else read.copy()
-    # Runs are written to a folder of this name, and the scene may be somebody else's.
+    # Runs are written to a folder of this name, so the name in a downloaded scene must be safe.
     name = check_name(f"scene name in {root}", info.get("name", root.resolve().name))
     model = read_model(sparse)
     info["loaded_factor"] = chosen
@@ -78,8 +78,8 @@ def load_scene(
         for side, names in missing.items()
         if names
     ]
-    if read is None and (told := several_models(models_in(root), sparse)):
-        info["warnings"].append(told)
+    if read is None and (note := several_models(models_in(root), sparse)):
+        info["warnings"].append(note)
     masks: dict[str, Path] = {}
     if read is None and not (root / "masks" / OWN_MASKS).is_file():
         masks = find_masks(root / "masks", [name for name, side in split.items() if side == "train"])
@@ -102,10 +102,10 @@ def load_scene(
 
 
 def read_scene_json(root: Path | str) -> SceneInfo | None:
-    """scene.json, or None where there is none.
+    """Read scene.json; None if the scene has none.
 
     Raises:
-        AwError: it does not parse, has a newer schema, or a key that is read here has the wrong type.
+        AwError: it does not parse, has a newer schema, or a key that readers need has the wrong type.
     """
     path = Path(root) / "scene.json"
     if not path.is_file():
@@ -125,8 +125,8 @@ def read_scene_json(root: Path | str) -> SceneInfo | None:
     return cast(SceneInfo, info)
 
 
-def _check_fields(path: Path, info: dict[str, Any]) -> None:
-    """Raise AwError where a key that is read here has the wrong type."""
+def _check_fields(path: Path, info: dict[str, object]) -> None:
+    """Raise AwError where a key that readers need has the wrong type."""
     factor, name, files = info.get("factor"), info.get("name", ""), info.get("files")
     wrong = []
     if not _is_count(factor) or not 1 <= factor <= MOST_FACTOR:
@@ -145,8 +145,8 @@ def _check_fields(path: Path, info: dict[str, Any]) -> None:
 
 
 def _is_file_entry(entry: Any) -> bool:
-    known = entry if isinstance(entry, dict) else {}
-    return isinstance(known.get("sha256"), str) and _is_count(known.get("bytes"))
+    fields = entry if isinstance(entry, dict) else {}
+    return isinstance(fields.get("sha256"), str) and _is_count(fields.get("bytes"))
 
 
 def _is_count(value: Any) -> TypeGuard[int]:
@@ -167,10 +167,10 @@ def verify_files(root: Path | str, info: SceneInfo, *, quick: bool = False) -> N
     Args:
         root: the scene folder.
         info: from `read_scene_json`.
-        quick: sizes only.
+        quick: compare sizes only.
 
     Raises:
-        AwError: names the files that are missing or changed.
+        AwError: files are missing or changed; the message names them.
     """
     base, files = Path(root), info["files"]
     wrong = []
@@ -182,15 +182,15 @@ def verify_files(root: Path | str, info: SceneInfo, *, quick: bool = False) -> N
             wrong.append(f"{name} (changed)")
     if wrong:
         raise AwError(
-            f"{len(wrong)} of {len(files)} files of {base} are not what scene.json recorded: "
+            f"{len(wrong)} of {len(files)} files of {base} differ from what scene.json recorded: "
             f"{shortlist(wrong)}; restore them, or build the scene again with "
             "'aw build-scene PHOTOS -o SCENE --overwrite'"
         )
 
 
 def read_list(path: Path) -> list[str]:
-    """Names of a split list, one a line; empty lines are skipped."""
-    # Some editors write a byte order mark, which is no part of the first name.
+    """Read the names of a split list, one a line; empty lines are skipped."""
+    # Some editors write a byte order mark, which utf-8-sig keeps out of the first name.
     lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     return [line.strip() for line in lines if line.strip()]
 
@@ -203,45 +203,45 @@ def _inside(name: str, root: Path) -> str:
 
 
 def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
-    """Mask files by photo's name; photos without one are absent.
+    """Find mask files by the name of the photo; photos without one are absent.
 
-    Names: `a.jpg.png` (COLMAP's) or `a.png`, in any format and case, under the photo's path or, where no
-    other photo has this base name, directly in `folder`.
+    A mask of a.jpg is named a.jpg.png (as in COLMAP) or a.png, in any format and case, and lies under the
+    photo's path or, if no other photo has this base name, directly in `folder`.
     """
     there: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in MASK_SUFFIXES and path.is_file():
             there.setdefault(path.relative_to(folder).as_posix().casefold(), path)
-    known = [PurePosixPath(name) for name in names]
-    bases = Counter(pure.name for pure in known)
-    found: dict[str, Path] = {}
-    for pure in known if there else ():
+    photos = [PurePosixPath(name) for name in names]
+    bases = Counter(pure.name for pure in photos)
+    masks: dict[str, Path] = {}
+    for pure in photos if there else ():
         spellings = [str(pure), str(pure.with_suffix(""))]
         spellings += [pure.name, pure.stem] if bases[pure.name] == 1 else []
         for key in (f"{spelling}{suffix}".casefold() for spelling in spellings for suffix in MASK_SUFFIXES):
             if key in there:
-                found[str(pure)] = there[key]
+                masks[str(pure)] = there[key]
                 break
-    return found
+    return masks
 
 
 def models_in(root: Path, places: Iterable[str] = ("sparse", "colmap/sparse")) -> list[tuple[Path, int]]:
-    """COLMAP models of the first place that has one, with their numbers of photos, the largest first."""
+    """List the COLMAP models of the first place that has any, with numbers of photos, largest first."""
     for place in places:
         inner = sorted((root / place).glob("*/"), key=lambda p: (p.name != "0", p.name))
         for folders in (inner, [root / place]):
-            found = [
+            models = [
                 (folder, registered(folder))
                 for folder in folders
                 if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
             ]
-            if found:
-                return sorted(found, key=lambda item: -item[1])
+            if models:
+                return sorted(models, key=lambda item: -item[1])
     return []
 
 
 def registered(folder: Path) -> int:
-    """Photos of a COLMAP model, from the head of its file; 0 where it cannot be read."""
+    """Return the number of photos of a COLMAP model from the head of its file; 0 if it cannot be read."""
     try:
         if (folder / "images.bin").is_file():
             with open(folder / "images.bin", "rb") as f:
@@ -253,7 +253,7 @@ def registered(folder: Path) -> int:
 
 
 def several_models(models: list[tuple[Path, int]], used: Path) -> str:
-    """The line that says which of several models is read; empty for one."""
+    """Return a line that says which of several models is read; empty for a single model."""
     others = [f"{folder.name} ({count})" for folder, count in models if folder != used]
     if not others:
         return ""
@@ -265,7 +265,7 @@ def several_models(models: list[tuple[Path, int]], used: Path) -> str:
 
 
 def model_folder(root: Path) -> Path:
-    """Where the scene's COLMAP model lies, of several the one with most photos.
+    """Return the folder of the scene's COLMAP model; of several, the one with most photos.
 
     Raises:
         AwError: there is none.
@@ -302,7 +302,7 @@ def _image_folder(root: Path, factor: int) -> Path:
 
 
 def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[str, list[str]]]:
-    """name -> side of the registered photos; per side the listed names that the model lacks."""
+    """Return name -> side of the registered photos, and per side the listed names that the model lacks."""
     paths: dict[Split, Path] = {"train": root / "train_list.txt", "test": root / "test_list.txt"}
     present = [p for p in paths.values() if p.is_file()]
     if not present:
@@ -310,15 +310,15 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
         return {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(ordered)}, {}
     if len(present) == 1:
         raise AwError(f"{root} has {present[0].name} but not the other list; write both or neither")
-    # Some releases list names with their extension, some without.
+    # Some published scenes list names with their extension, some without.
     by_stem = {str(PurePosixPath(n).with_suffix("")): n for n in registered}
-    known = set(registered)
+    in_model = set(registered)
     split: dict[str, Split] = {}
     missing: dict[str, list[str]] = {}
     for side, path in paths.items():
         missing[side] = []
         for name in read_list(path):
-            match = name if name in known else by_stem.get(name)
+            match = name if name in in_model else by_stem.get(name)
             if match is None:
                 missing[side].append(name)
             elif split.setdefault(match, side) != side:
@@ -327,7 +327,7 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
 
 
 def _refuse_same_stems(root: Path, views: tuple[View, ...]) -> None:
-    """Raise AwError where two photos differ in their extension only: their renders are one PNG."""
+    """Raise AwError where two photos differ in their extension only: their renders would be one PNG."""
     seen: dict[tuple[str, str], str] = {}
     for view in views:
         key = (view.split, str(PurePosixPath(view.name).with_suffix("")))
@@ -366,7 +366,7 @@ def _image_path(folder: Path, name: str) -> Path:
 
 
 def _points(model: Model, views: tuple[View, ...]) -> Points:
-    """The model's points with tracks in view indices and px of the loaded files."""
+    """Return the model's points, with tracks in view indices and px of the loaded files."""
     points = model.points
     count = len(points.track_image_ids)
     track_views = np.full(count, -1, dtype=np.int32)
@@ -395,5 +395,5 @@ def _points(model: Model, views: tuple[View, ...]) -> Points:
 
 
 def without_keep(scene: Scene) -> Scene:
-    """The scene without keep masks, for methods that find distractors themselves."""
+    """Return the scene without keep masks, for methods that find distractors themselves."""
     return replace(scene, views=tuple(replace(v, keep_path=None) for v in scene.views))

@@ -1,7 +1,7 @@
 """PlayCanvas's SOG, version 2: WebP textures, codebooks and a palette of harmonics in one zip file.
 
-Layout as in PlayCanvas's specification and its splat-transform (write-sog.ts). The palette comes from halving
-the set of harmonics at medians, not from k-means: k-means over 60 000 rows takes half an hour without a GPU.
+Layout as in PlayCanvas's specification and its splat-transform (write-sog.ts). The palette is made by halving
+the set of harmonics at medians, because k-means over 60 000 rows takes half an hour without a GPU.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from ambiguous_wild.core import UNMOVED, AwError, Place
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
-    along_curve,
     finite,
     from_largest,
     largest_first,
     logit,
+    morton_order,
     place_facts,
     place_from,
     read_bytes,
@@ -33,24 +33,24 @@ from ambiguous_wild.io.splat_arrays import (
 
 _CODES = 256  # entries of a codebook
 _MOST_PALETTE = 65536
-_ROUNDS = 20  # of Lloyd's algorithm on values
+_ROUNDS = 20  # rounds of Lloyd's algorithm
 _BINS = 1 << 14
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the archive, so that the same model gives the same bytes
-_ROW = 64  # palette entries a row of their texture
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # fixed time of files in the archive: the same model gives the same bytes
+_ROW = 64  # palette entries in a row of their texture
 _MOST_BYTES, _MOST_TEXTURE = 1 << 32, 1 << 28
 _LOSSLESS = 101  # WebP quality above 100
 
 
 def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
-    """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
+    """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
 
     Args:
         path: the file, NAME.sog.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
-        place: of their scene, told in meta.json.
+        place: place of their scene, written to meta.json.
     """
     kept = finite(gaussians)
-    order = along_curve(kept["means"])
+    order = morton_order(kept["means"])
     kept = {name: value[order] for name, value in kept.items()}
     n, rest = kept["sh_rest"].shape[:2]
     if not n:
@@ -71,7 +71,7 @@ def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) ->
         "quats.webp": _texture(np.column_stack([turned, 252 + largest]), shape),
         "sh0.webp": _texture(np.column_stack([tint_codes, alpha]), shape),
     }
-    meta: dict[str, Any] = {
+    meta: dict[str, object] = {
         "version": 2,
         "asset": {"generator": "ambiguous_wild", **place_facts(place)},
         "count": n,
@@ -102,7 +102,7 @@ def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) ->
 
 
 def read_sog(path: Path | str) -> dict[str, np.ndarray]:
-    """Raw parameters of a SOG file of version 2, float32.
+    """Read the raw parameters of a SOG file of version 2, float32.
 
     Raises:
         AwError: no SOG of version 2, or damaged.
@@ -118,7 +118,7 @@ def read_sog(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def sog_place(path: Path | str) -> Place:
-    """Where the scene of a file that `read_sog` has read lies."""
+    """Return the place of the scene of a file that `read_sog` has read."""
     with zipfile.ZipFile(path) as archive:
         return place_from(json.loads(_member(archive, "meta.json")).get("asset"))
 
@@ -155,13 +155,13 @@ def _decode(archive: zipfile.ZipFile, meta: Mapping[str, Any]) -> dict[str, np.n
 
 
 def _texture_shape(count: int) -> tuple[int, int]:
-    """Rows and columns, multiples of four, as the reference chooses them."""
+    """Return rows and columns, multiples of four, as the reference chooses them."""
     width = int(np.ceil(np.sqrt(count) / 4) * 4)
     return int(np.ceil(count / width / 4) * 4), width
 
 
 def _texture(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Rows of three or four codes as RGBA; opaque where there are three."""
+    """Lay out rows of three or four codes as RGBA, opaque where there are three."""
     image = np.zeros((shape[0] * shape[1], 4), np.uint8)
     image[:, 3] = 255
     image[: len(values), : values.shape[1]] = values
@@ -169,15 +169,14 @@ def _texture(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most 256 values near all of these by Lloyd's algorithm on their histogram, and the nearest one's
-    index for each."""
+    """Choose at most 256 values by Lloyd's algorithm on a histogram; return them and each value's nearest."""
     flat = values.astype(np.float64).ravel()
     low, high = flat.min(), flat.max()
     if high <= low:
         return np.full(_CODES, low), np.zeros(values.shape, np.int64)
     weight, edges = np.histogram(flat, _BINS, (low, high))
     middle = (edges[:-1] + edges[1:]) / 2
-    # Half of them lie evenly, so that rare large values keep a code, half where the values are.
+    # Half of the first values lie evenly, so that rare large values keep a code, half where most values are.
     half, total = _CODES // 2, np.cumsum(weight)
     book = np.interp((np.arange(half) + 0.5) / half * total[-1], total, middle)
     book = np.sort(np.concatenate([np.linspace(low, high, half), book]))
@@ -190,8 +189,10 @@ def _codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of clusters [K, D] and the cluster of each row [N]: the set is halved at the median of its
-    widest dimension until there are K parts, K as the reference chooses it."""
+    """Cluster rows: return the means [K, D] and the cluster of each row [N].
+
+    The set is halved at the median of its widest dimension until there are K parts; the reference sets K.
+    """
     n = len(rows)
     halvings = int(np.log2(min(_MOST_PALETTE, n)))
     order, starts = np.arange(n), np.zeros(1, np.int64)
@@ -217,7 +218,7 @@ def _webp(image: np.ndarray) -> bytes:
         raise AwError(f"SOG cannot hold {image.shape[0] * image.shape[1]:,} texels in a WebP; export as spz")
     done, data = cv2.imencode(".webp", image[:, :, [2, 1, 0, 3]], [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS])
     if not done:
-        raise AwError("OpenCV cannot write WebP here; export as spz")
+        raise AwError("this OpenCV cannot write WebP; export as spz")
     return bytes(data)
 
 

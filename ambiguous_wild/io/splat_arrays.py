@@ -1,4 +1,4 @@
-"""What the formats share: Gaussians as arrays, quantisation, order along a space-filling curve."""
+"""Shared by the splat formats: Gaussians as arrays, quantisation, order along a space-filling curve."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from ambiguous_wild.io.ply import checked_place
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
-_MOST_LOGIT = 15.0  # sigmoid differs from 0 and 1 by 3e-7 there; formats that keep alpha hold no infinity
+_MOST_LOGIT = 15.0  # its sigmoid is 3e-7 below 1; formats that store alpha cannot hold an infinite logit
 
 
 def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
-    """The Gaussians that can be drawn: rows with a value that is not finite are left out, quaternions have
-    norm 1."""
+    """Return the Gaussians whose values are all finite, with quaternions of norm 1."""
     sound = np.ones(len(gaussians["means"]), bool)
     for name in _NAMES:
         sound &= np.isfinite(gaussians[name]).all(axis=tuple(range(1, gaussians[name].ndim)))
@@ -35,26 +34,25 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
 
 
 def logit(alpha: np.ndarray) -> np.ndarray:
-    """Inverse of `sigmoid`, clamped to finite values."""
+    """Return the inverse of the sigmoid, clamped to finite values."""
     with np.errstate(divide="ignore"):
-        found = np.log(alpha) - np.log1p(-alpha.astype(np.float64))
-    return np.clip(found, -_MOST_LOGIT, _MOST_LOGIT).astype(np.float32)
+        logits = np.log(alpha) - np.log1p(-alpha.astype(np.float64))
+    return np.clip(logits, -_MOST_LOGIT, _MOST_LOGIT).astype(np.float32)
 
 
 def rounded(
     values: np.ndarray,
     most: int,  # largest code
 ) -> np.ndarray:  # int64 in [0, most]
-    """The nearest codes."""
+    """Round to the nearest codes."""
     return np.clip(np.floor(values.astype(np.float64) + 0.5), 0, most).astype(np.int64)
 
 
-def along_curve(means: np.ndarray) -> np.ndarray:
-    """Row order along a Morton curve of 10 bits an axis, so that neighbours in space are neighbours in the
-    file.
+def morton_order(means: np.ndarray) -> np.ndarray:
+    """Order rows along a Morton curve of 10 bits an axis: neighbours in space become neighbours in the file.
 
-    The scene comes first, then what lies more than 4, 16, 64 times as far out as half of it: a format
-    with one range for 256 rows would give a scene mixed with a skybox the skybox's range.
+    The scene comes first, then Gaussians more than 4, 16, 64 times as far out as the median: a format with
+    one range for 256 rows would otherwise give rows of the scene the range of a skybox.
     """
     if not len(means):
         return np.zeros(0, np.intp)
@@ -72,7 +70,7 @@ def along_curve(means: np.ndarray) -> np.ndarray:
 
 
 def largest_first(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index of the largest component [N], and the other three [N, 3] with the sign that makes it positive."""
+    """Return the index [N] of the largest component, and the others [N, 3], signed to make it positive."""
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
     signed = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -81,7 +79,7 @@ def largest_first(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Quaternions [N, 4] of what `largest_first` gave."""
+    """Return the quaternions [N, 4] for a result of `largest_first`."""
     quats = np.empty((len(largest), 4))
     places = np.array([[j for j in range(4) if j != i] for i in range(4)])
     np.put_along_axis(quats, places[largest], others, axis=1)
@@ -91,7 +89,7 @@ def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def read_bytes(path: Path | str, most: int) -> bytes:
-    """The whole file.
+    """Read a whole file.
 
     Raises:
         AwError: it cannot be read, or has more than `most` bytes.
@@ -105,14 +103,14 @@ def read_bytes(path: Path | str, most: int) -> bytes:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
 
 
-def place_facts(place: Place) -> dict[str, Any]:
-    """What a file tells of its scene's place: the user's coordinates are its positions / scale + offset."""
+def place_facts(place: Place) -> dict[str, float | list[float]]:
+    """Return the place as written to files: the user's coordinates are positions / scale + offset."""
     turned = {} if place.turn == UNMOVED.turn else {"rotation": list(place.turn)}
     return {} if place == UNMOVED else {"offset": list(place.centre), "scale": place.scale, **turned}
 
 
 def place_from(facts: Any) -> Place:
-    """The place of what `place_facts` gave; of anything else where it is."""
+    """Return the place for a result of `place_facts`; `UNMOVED` for anything else."""
     try:
         return checked_place(facts["offset"], facts["scale"], facts.get("rotation", UNMOVED.turn))
     except (KeyError, TypeError, ValueError, AttributeError):

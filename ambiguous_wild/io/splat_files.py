@@ -1,4 +1,4 @@
-"""Any splat file: the format is told by its first bytes, whatever its name."""
+"""Read any splat file: its first bytes tell the format, whatever its name."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _MOST_BYTES = 1 << 33
 
 @dataclass(frozen=True)
 class Splats:
-    """The Gaussians of a file that can be drawn, at least one."""
+    """The Gaussians of a file whose values are all finite, at least one."""
 
     gaussians: dict[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
-    place: Place  # of the coordinates that they are in
-    antialias: bool  # drawn with Mip-Splatting's filter, where the file says so
-    left_out: int  # Gaussians with values that are not finite
+    place: Place  # place of the scene in whose coordinates they are
+    antialias: bool  # whether the file says that it is drawn with Mip-Splatting's filter
+    left_out: int  # number of Gaussians with values that are not finite
 
 
 def read_splats(path: Path) -> Splats:
     """Read a splat PLY, a compressed PLY, SPZ, SOG, or a glTF of 'aw export'.
 
     Raises:
-        AwError: no such file, another format, damaged, or without a Gaussian that is finite.
+        AwError: no such file, another format, damaged, or no Gaussian is finite.
     """
     try:
         with open(path, "rb") as f:

@@ -20,11 +20,11 @@ from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
-    along_curve,
     finite,
     from_largest,
     largest_first,
     logit,
+    morton_order,
     place_facts,
     place_from,
     read_bytes,
@@ -34,42 +34,42 @@ from ambiguous_wild.io.splat_arrays import (
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
-_FOURTH = b"NGSP"  # the first bytes of version 4; others are zipped
+_FOURTH = b"NGSP"  # first bytes of version 4; earlier versions are one gzip stream
 _VERSION, _ANTIALIASED = 3, 1
 _FINEST = 18  # fractional bits: 4 micrometres where a unit is a metre
 _COLOUR = 0.15  # codes cover coefficients of +-3.3
 _REST = (0, 3, 8, 15)  # coefficients beyond the constant one, by degree
 _MOST_BYTES = 1 << 32
-FLIP = np.array([1.0, -1.0, -1.0], np.float32)  # of positions, PLY's axes to the file's
-# Parity of each harmonic in (y, z): the sign it takes when both change sign.
+FLIP = np.array([1.0, -1.0, -1.0], np.float32)  # signs that turn positions from a PLY's axes to the file's
+# Sign that each harmonic takes when y and z change sign.
 SH_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False, place: Place = UNMOVED) -> int:
-    """Write atomically; Gaussians lie along a Morton curve afterwards. Returns how many were written.
+    """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
 
     Args:
         path: the file, NAME.spz.
         gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
         antialias: the model is drawn with Mip-Splatting's 2D filter; a flag in the file.
-        place: of their scene, told in the comment of the gzip stream.
+        place: place of their scene, written as the comment of the gzip stream.
 
     Raises:
         AwError: positions of more than 8 million units.
     """
     with atomic_path(path) as temporary:
         data, count = spz_bytes(gaussians, antialias=antialias)
-        if told := json.dumps(place_facts(place)) if place != UNMOVED else "":
-            # the flag of a comment, which follows the 10 bytes of a gzip header
-            data = data[:3] + b"\x10" + data[4:10] + told.encode("ascii") + b"\0" + data[10:]
+        if comment := json.dumps(place_facts(place)) if place != UNMOVED else "":
+            # Set the flag of a comment, which follows the 10 bytes of a gzip header.
+            data = data[:3] + b"\x10" + data[4:10] + comment.encode("ascii") + b"\0" + data[10:]
         temporary.write_bytes(data)
     return count
 
 
 def spz_bytes(gaussians: Arrays, *, antialias: bool = False) -> tuple[bytes, int]:
-    """The file's bytes, and how many Gaussians it holds; see `write_spz`."""
+    """Return the file's bytes and how many Gaussians it holds; see `write_spz`."""
     kept = finite(gaussians)
-    order = along_curve(kept["means"])
+    order = morton_order(kept["means"])
     kept = {name: value[order] for name, value in kept.items()}
     n, rest = kept["sh_rest"].shape[:2]
     furthest = float(np.abs(kept["means"]).max(initial=1e-6))
@@ -92,7 +92,7 @@ def spz_bytes(gaussians: Arrays, *, antialias: bool = False) -> tuple[bytes, int
 
 
 def read_spz(path: Path | str) -> dict[str, np.ndarray]:
-    """Raw parameters of an SPZ file of version 2 to 4, float32, in a PLY's axes.
+    """Read the raw parameters of an SPZ file of version 2 to 4, float32, in a PLY's axes.
 
     Raises:
         AwError: no SPZ, another version, damaged, or version 4 without the package zstandard.
@@ -101,18 +101,18 @@ def read_spz(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def spz_facts(packed: bytes) -> tuple[bool, Place]:
-    """Whether the model of `spz_arrays` is drawn with Mip-Splatting's filter, and where its scene lies."""
+    """Tell whether an SPZ model is drawn with Mip-Splatting's filter, and return the place of its scene."""
     zipped = packed[:4] != _FOURTH
     head = zlib.decompressobj(wbits=31).decompress(packed, _HEADER.size) if zipped else packed
-    told = packed[10 : packed.find(b"\0", 10)] if zipped and packed[3] == 0x10 else b"0"
+    comment = packed[10 : packed.find(b"\0", 10)] if zipped and packed[3] == 0x10 else b"0"
     try:
-        return bool(head[14] & _ANTIALIASED), place_from(json.loads(told))
-    except (ValueError, RecursionError):  # a comment of somebody else
+        return bool(head[14] & _ANTIALIASED), place_from(json.loads(comment))
+    except (ValueError, RecursionError):  # another program wrote the comment
         return bool(head[14] & _ANTIALIASED), UNMOVED
 
 
 def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
-    """As `read_spz`, of a file's bytes; errors name `path`."""
+    """Read the raw parameters from the bytes of an SPZ file, as `read_spz` does; errors name `path`."""
     inflater = zlib.decompressobj(wbits=31)
     zipped = packed[:4] != _FOURTH
     try:
@@ -124,7 +124,7 @@ def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
         turned = 3 if version == 2 else 4
         widths = (9, 1, 3, 3, turned, 3 * rest)
         size = n * sum(widths)
-        # no more than announced is unpacked, whatever the stream holds
+        # No more than the header announces is unpacked, whatever the stream holds.
         if zipped:
             data = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
         else:
@@ -158,12 +158,12 @@ def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
 
 
 def _unpacked(packed: bytes, streams: int, sizes: Sequence[int], path: Path | str) -> bytes:
-    """The attributes of version 4, one after another: a table of sizes, then a Zstandard frame each."""
+    """Unpack the attributes of version 4: a table of sizes, then a Zstandard frame each."""
     try:
         import zstandard  # type: ignore[import-not-found, unused-ignore]
     except ImportError:
-        need = "needs the package zstandard"
-        raise AwError(f"{path} is SPZ of version 4, which {need}: {install_command('view')}") from None
+        install = install_command("view")
+        raise AwError(f"{path} is SPZ of version 4, which needs the package zstandard: {install}") from None
     table = struct.unpack_from("<I", packed, 16)[0]
     at, parts = table + 16 * streams, []
     for number, size in enumerate(sizes[:streams]):
@@ -180,14 +180,14 @@ def _unpacked(packed: bytes, streams: int, sizes: Sequence[int], path: Path | st
 
 
 def _second_quats(codes: np.ndarray) -> np.ndarray:
-    """Of version 2: x, y, z with 8 bits, w positive."""
+    """Unpack the quaternions of version 2: x, y, z with 8 bits, w positive."""
     xyz = codes / 127.5 - 1.0
     w = np.sqrt(np.clip(1.0 - (xyz**2).sum(axis=1), 0.0, None))
     return np.column_stack([w, xyz * FLIP]).astype(np.float32)
 
 
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
-    """Three components of x, y, z, w as sign and 9 bits, after the index of the largest; [N] uint32."""
+    """Pack quaternions, [N] uint32: index of the largest component, then sign and 9 bits of each other."""
     xyzw = quats[:, [1, 2, 3, 0]] * np.append(FLIP, 1.0)
     largest, others = largest_first(xyzw)
     packed = largest.astype(np.int64)
@@ -205,10 +205,10 @@ def _unpack_quats(packed: np.ndarray) -> np.ndarray:
 
 
 def _pack_harmonics(rest: np.ndarray) -> np.ndarray:
-    """8-bit codes, of which degree 1 uses all bits and the others 7.
+    """Quantise harmonics to 8-bit codes, of which degree 1 uses all bits and the others 7.
 
-    Niantic's default is 5 and 4 bits: that took 1.3 dB from a model of RefineSplat; these take 0.01 dB, in a
-    file 1.6 times as large. Readers take any code.
+    Niantic's default of 5 and 4 bits took 1.3 dB from a model of RefineSplat; these take 0.01 dB, in a file
+    1.6 times as large. Readers accept any code.
     """
     step = np.where(np.arange(rest.shape[1]) < 3, 1, 2)[:, None]
     codes = np.rint(rest * SH_FLIP[: rest.shape[1], None] * (128.0 / step)).astype(np.int64) * step + 128

@@ -7,7 +7,7 @@ import numpy as np
 
 from ambiguous_wild.simulate.textures import Colour, laid, octaves, scattered, step, tint
 
-PAINT: Colour = (0.52, 0.47, 0.38)  # of the room's walls
+PAINT: Colour = (0.52, 0.47, 0.38)  # colour of the room's walls
 
 
 def plaster(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:

@@ -10,7 +10,7 @@ RAW/truth/depth/<stem>.png        optional: z of the static surface, 16 bit, mil
 RAW/truth/capture.json            spec, seed, versions, label; per photo occlusion, placed distractors and
                                   drawn effects; sha256 of every file
 
-Cameras of a capture: pose and focal length of every photo.
+The cameras of a capture, with pose and focal length of every photo, are planned here too.
 """
 
 from __future__ import annotations
@@ -61,16 +61,16 @@ from ambiguous_wild.simulate.world import World
 from ambiguous_wild.simulate.yard import yard
 
 _NEAREST_WALL_M = 0.1
-_AHEAD_M = 4.0  # to what an outward camera looks at
+_AHEAD_M = 4.0  # distance to the point that an outward camera looks at
 
 
 def focal_px(spec: CaptureSpec) -> float:
-    """Focal length in px of the 35 mm equivalent: same angle over the diagonal (CIPA)."""
+    """Convert the 35 mm equivalent to a focal length in px: same angle over the diagonal (CIPA)."""
     return spec.focal_35mm / FULL_FRAME_DIAGONAL_MM * float(np.hypot(spec.width, spec.height))
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, roll_deg: float) -> np.ndarray:
-    """cam_from_world [4, 4] of a camera at `eye` that looks at `target`; z is up in the world."""
+    """Return cam_from_world [4, 4] of a camera at `eye` that looks at `target`; z is up in the world."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -85,10 +85,10 @@ def look_at(eye: np.ndarray, target: np.ndarray, roll_deg: float) -> np.ndarray:
 def plan_cameras(
     spec: CaptureSpec, world: World, rng: np.random.Generator
 ) -> tuple[list[Camera], list[Camera]]:
-    """Train cameras along an arc with varying distance and height; test cameras within their range.
+    """Plan train cameras along an arc with varying distance and height, and test cameras within their range.
 
-    Test viewpoints have other angles than the train photos, and distances and heights between theirs. An
-    outward walk goes around the hub and looks away from it.
+    Test viewpoints have other angles than the train photos, and distances and heights between those of train
+    photos. An outward walk goes around the hub and looks away from it.
 
     Raises:
         AwError: the walk leads into a wall.
@@ -139,13 +139,13 @@ def plan_cameras(
 
 
 def _zoomed(cameras: list[Camera], spec: CaptureSpec, shift: float) -> list[Camera]:
-    """The cameras at focal lengths spread over ``spec.zoom``, evenly in their logarithm."""
+    """Return the cameras with focal lengths spread over ``spec.zoom``, evenly in their logarithm."""
     low, high = spec.zoom
     if low == high == 1.0:
         return cameras
     zoomed = []
     for k, camera in enumerate(cameras):
-        share = (k * 0.6180339887 + shift) % 1.0  # multiples of the golden ratio: even and unordered
+        share = (k * 0.6180339887 + shift) % 1.0  # multiples of the golden ratio are even but unordered
         factor = low * (high / low) ** share
         zoomed.append(replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
     return zoomed
@@ -163,7 +163,7 @@ def build_world(
 ) -> World:
     """Build the place of the spec; positions and textures vary with the generator.
 
-    Objects that are left out use their random numbers all the same: the others do not change.
+    Objects that are left out still use up their random numbers, so the others do not change.
 
     Args:
         rng: source of randomness.
@@ -176,7 +176,7 @@ def build_world(
 
 
 def plan(spec: CaptureSpec, seed: int) -> tuple[World, list[PlannedPhoto]]:
-    """The world and every photo to render; world, walk and layout have independent random streams."""
+    """Plan the world and every photo to render; world, walk and layout have independent random streams."""
     paint, walk, layout = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
     world = build_world(paint, spec.detail_px_per_m, spec.samples, spec.world)
     train, test = plan_cameras(spec, world, walk)
@@ -197,12 +197,12 @@ def simulate(
     overwrite: bool = False,
     progress: PhotoProgress = iter,
 ) -> SimulatedCapture:
-    """Make the capture, or reuse an identical one; returns truth/capture.json.
+    """Make the capture, or reuse an identical one, and return truth/capture.json.
 
     Args:
-        spec: of the capture.
+        spec: spec of the capture.
         out: the folder; it appears complete or not at all.
-        seed: of world, walk, layout and effects.
+        seed: seed of world, walk, layout and effects.
         depth: also write the depth of the static surface.
         overwrite: replace an earlier capture; a folder that is no capture is never replaced.
         progress: wraps the list of photos, for a bar.
@@ -275,7 +275,7 @@ def _render(
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
-    """[H, W] or [H, W, 3] uint8 or uint16."""
+    """Write pixels [H, W] or [H, W, 3], uint8 or uint16."""
     from PIL import Image
 
     Image.fromarray(pixels).save(path, compress_level=3)
@@ -284,15 +284,15 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 def _write_photo(
     path: Path, pixels: np.ndarray, spec: CaptureSpec, camera: Camera, number: int, drawn: DrawnEffects
 ) -> None:
-    """JPEG at quality 95 without chroma subsampling, with the EXIF of a phone.
+    """Write a JPEG of quality 95 without chroma subsampling, with the EXIF of a phone.
 
     Args:
         path: the file.
         pixels: [H, W, 3] uint8.
-        spec: of the capture.
-        camera: of this photo; gives the focal length.
-        number: of the photo; gives the time, one photo every four seconds.
-        drawn: of this photo; gives exposure, ISO and white balance.
+        spec: spec of the capture.
+        camera: the photo's camera, which gives the focal length.
+        number: the photo's number, which gives the time: one photo every four seconds.
+        drawn: the photo's effects, which give exposure, ISO and white balance.
     """
     from PIL import Image
 
@@ -327,7 +327,7 @@ def _exif(spec: CaptureSpec, camera: Camera, number: int, drawn: DrawnEffects) -
 
 
 def _exposure(drawn: DrawnEffects, rational: Any) -> Any:
-    """Exposure time, s: that of the motion blur, else 1/250; longer by the stops of the exposure drift."""
+    """Return the exposure time, s: that of motion blur, else 1/250, times 2^stops of exposure drift."""
     blur, drift = drawn.get("motion_blur"), drawn.get("exposure_drift")
     seconds = 1 / 250 if blur is None else blur["exposure_s"]
     seconds *= 2.0 ** (0.0 if drift is None else drift["stops"])
@@ -340,7 +340,7 @@ def _exposure(drawn: DrawnEffects, rational: Any) -> Any:
 def _truth(
     photo: PlannedPhoto, rendered: RenderedPhoto, metres: np.ndarray | None
 ) -> Iterable[tuple[str, np.ndarray]]:
-    """Folder and pixels of every truth image of the photo."""
+    """Yield folder and pixels of every truth image of the photo."""
     if photo.split == "train":
         yield "distractor", np.where(rendered.owner > 0, 255, 0).astype(np.uint8)
         yield "clean", rendered.clean
@@ -386,9 +386,9 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
 
 
 def _code_hash() -> str:
-    """Hash of the simulator's source: a capture of another version is not reused."""
-    here = Path(__file__).parent
-    sources = sorted([*here.glob("*.py"), *here.glob("*.yaml")])
+    """Hash the simulator's source, so that a capture of another version is not reused."""
+    package = Path(__file__).parent
+    sources = sorted([*package.glob("*.py"), *package.glob("*.yaml")])
     return config_hash([__version__, *(sha256_file(p) for p in sources)])
 
 
@@ -409,7 +409,7 @@ def _camera_json(spec: CaptureSpec, camera: Camera) -> CameraRecord:
 
 
 def _earlier(out: Path, identity: str, overwrite: bool) -> CaptureTruth | None:
-    """capture.json of an identical and complete capture; None where a new one may be written.
+    """Return capture.json of an identical and complete capture; None if a new one may be written.
 
     Raises:
         AwError: the folder holds something else and may not be replaced.
@@ -422,12 +422,12 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> CaptureTruth | None:
     try:
         facts = json.loads(record.read_text(encoding="utf-8"))
         same = facts["identity"] == identity
-        made = f"preset {facts['preset']!r}, seed {facts['seed']}"
+        kind = f"preset {facts['preset']!r}, seed {facts['seed']}"
         files = {str(n): h for n, h in facts["files"].items()}
         if any(PurePosixPath(n).is_absolute() or ".." in PurePosixPath(n).parts for n in files):
             raise ValueError("a file outside the capture")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        facts, same, made, files = {}, False, "an unreadable truth/capture.json", {}
+        facts, same, kind, files = {}, False, "an unreadable truth/capture.json", {}
     if same and all((out / n).is_file() and sha256_file(out / n) == h for n, h in files.items()):
         return cast(CaptureTruth, facts)
     if overwrite:
@@ -435,4 +435,4 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> CaptureTruth | None:
             refuse_foreign_files(out, {record.relative_to(out).as_posix(), *files})
         return None
     why = "with files changed since" if same else "of other settings or another version"
-    raise AwError(f"{out} holds a capture ({made}) {why}; add --overwrite to replace it or choose another -o")
+    raise AwError(f"{out} holds a capture ({kind}) {why}; add --overwrite to replace it or choose another -o")

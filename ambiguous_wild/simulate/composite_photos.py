@@ -1,9 +1,9 @@
-"""Add distractors to plain photos, before structure from motion: a raw capture, with the truth.
+"""Add distractors to plain photos, before structure from motion: write a raw capture with the truth.
 
 RAW/train/<stem>.jpg                quality 95, upright; some with distractors
 RAW/test/<stem>.jpg                 every sixth photo, without distractors
 RAW/truth/distractor/<stem>.png     of train photos: 255 where a distractor is, else 0
-RAW/truth/clean/<stem>.png          the train photo as it was
+RAW/truth/clean/<stem>.png          the original train photo
 RAW/truth/composite.json            config, cut-outs with sha256; per photo source, pieces and coverage
 """
 
@@ -40,13 +40,13 @@ from ambiguous_wild.simulate.cutouts import (
 from ambiguous_wild.simulate.placement import CompositeConfig, natural_heights
 from ambiguous_wild.simulate.records import Spread, spread
 
-_TEST_EVERY = 6  # photos; also the fewest that make a capture
-_MOST_PIECES = 3  # of a photo
-_SPREAD = (0.5, 1.5)  # of the mean coverage: that of one photo
-_MOST_COVER = 0.6  # of a photo, in the mean of those with distractors
-_MIDDLE = (0.15, 0.85)  # of the photo's sides: where the middle of a piece lies
-_LONGEST = 1.2  # of the photo's longer side: largest piece
-_WINDOW = 0.6  # of the photo's sides: largest piece of another photo
+_TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos
+_MOST_PIECES = 3  # largest number of pieces in a photo
+_SPREAD = (0.5, 1.5)  # range of a photo's coverage, relative to the mean
+_MOST_COVER = 0.6  # largest mean coverage of photos with distractors
+_MIDDLE = (0.15, 0.85)  # range of a piece's middle, relative to the photo's sides
+_LONGEST = 1.2  # largest piece, relative to the photo's longer side
+_WINDOW = 0.6  # largest piece of another photo, relative to that photo's sides
 _PREVIEW_PX = 160
 
 
@@ -54,7 +54,7 @@ class PastedPiece(TypedDict):
     """One distractor in one plain photo."""
 
     cutout: str
-    photo: str  # that the piece was cut from; empty for cut-outs
+    photo: str  # photo that the piece was cut from; empty for cut-outs
     mirrored: bool
     x: float  # of its middle, over the photo's width
     y: float  # of its middle, over the photo's height
@@ -90,7 +90,7 @@ class PastedRecord(TypedDict):
     schema: int
     version: str
     source: PhotoFolder
-    config: dict[str, Any]  # `CompositeConfig` without pose and shadow
+    config: dict[str, object]  # `CompositeConfig` without pose and shadow
     mask: str
     cutouts: list[PastedCutout]
     occlusion: Spread
@@ -98,7 +98,7 @@ class PastedRecord(TypedDict):
 
 
 def is_photo_folder(path: Path | str) -> bool:
-    """Whether the folder holds neither scene.json nor a COLMAP model."""
+    """Tell whether the folder holds neither scene.json nor a COLMAP model."""
     root = Path(path)
     return root.is_dir() and not any((root / part).exists() for part in ("scene.json", "sparse", "colmap"))
 
@@ -110,12 +110,12 @@ def composite_photos(
     cutouts: Path | str | None = None,
     progress: Callable[[Sequence[Path]], Iterable[Path]] = iter,
 ) -> PastedRecord:
-    """Make the capture; returns truth/composite.json.
+    """Make the capture, and return truth/composite.json.
 
     Args:
         source: folder of at least six photos without distractors; every sixth becomes a test photo.
         output: the folder to write; it appears complete or not at all.
-        config: coverage, presence (share of train photos with distractors), patches and seed are used.
+        config: only coverage, presence (share of train photos with distractors), patches and seed are used.
         cutouts: folder of PNG files with alpha; may be None with ``config.patches``.
         progress: wraps the photos, for a bar.
 
@@ -127,7 +127,7 @@ def composite_photos(
     check_folders(root, target)
     if cutouts is None and not config.patches:
         raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
-    mean = config.coverage / config.presence  # of the photos with distractors
+    mean = config.coverage / config.presence  # mean coverage of photos with distractors
     if mean > _MOST_COVER:
         raise AwError(
             f"--coverage {config.coverage:g} with --presence {config.presence:g} covers {mean:.2f} of a "
@@ -180,16 +180,16 @@ def composite_photos(
 
 
 def _base(root: Path) -> Path:
-    """images/ where that holds the photos."""
+    """Return the folder images/ if it holds the photos, else the folder itself."""
     direct = any(p.suffix.lower() in PHOTO_SUFFIXES for p in root.iterdir())
     return root / "images" if not direct and (root / "images").is_dir() else root
 
 
 def _list_photos(root: Path) -> list[Path]:
-    """Those of the folder itself, else of all folders in it."""
+    """List the photos of the folder itself, else of all folders in it."""
     base = _base(root)
-    for found in (base.iterdir(), base.rglob("*")):
-        paths = sorted(p for p in found if p.suffix.lower() in PHOTO_SUFFIXES)
+    for files in (base.iterdir(), base.rglob("*")):
+        paths = sorted(p for p in files if p.suffix.lower() in PHOTO_SUFFIXES)
         paths = [p for p in paths if not any(_hidden(part) for part in p.relative_to(base).parts)]
         if paths:
             break
@@ -218,12 +218,12 @@ def _read(path: Path) -> tuple[np.ndarray, Exif]:
 
 
 def _write_jpeg(path: Path, pixels: np.ndarray, exif: Exif) -> None:
-    """JPEG at quality 95 without chroma subsampling, with the camera settings of a source photo.
+    """Write a JPEG of quality 95 without chroma subsampling, with the camera settings of a source photo.
 
     Args:
         path: the file.
         pixels: [H, W, 3] uint8, upright.
-        exif: of the source photo; its orientation and position are left out.
+        exif: EXIF of the source photo; its orientation and position are left out.
     """
     from PIL import Image, TiffImagePlugin
 
@@ -248,7 +248,7 @@ def _write_jpeg(path: Path, pixels: np.ndarray, exif: Exif) -> None:
 def _draw(
     shapes: list[Cutout], others: list[Path], area: float, patches: bool, rng: np.random.Generator
 ) -> list[tuple[Cutout, str, bool]]:
-    """One to three pieces that fill `area` px, the photo that each was cut from, whether it is mirrored."""
+    """Draw one to three pieces that fill `area` px: cut-out, photo that it was cut from, mirrored or not."""
     count = int(rng.integers(1, _MOST_PIECES + 1))
     shown = [shapes[int(rng.integers(len(shapes)))] for _ in range(count)] if shapes else blobs(rng)[:count]
     drawn = []
@@ -257,7 +257,7 @@ def _draw(
         if patches:
             path = others[int(rng.integers(len(others)))]
             photo, origin = _read(path)[0], path.name
-            # As large as it will appear, where the other photo allows it.
+            # The window is as large as the piece will appear, if the other photo allows it.
             tall = np.sqrt(area / count / (cutout.aspect * cutout.filled))
             tall = min(tall, _WINDOW * photo.shape[0], _WINDOW * photo.shape[1] / cutout.aspect)
             height, width = (max(SMALLEST_PX, round(s)) for s in (tall, tall * cutout.aspect))
@@ -272,7 +272,7 @@ def _draw(
 def _layer(
     drawn: list[tuple[Cutout, str, bool]], size: tuple[int, ...], cover: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, list[PastedPiece]]:
-    """The pieces at random places, of the size that covers `cover`, as a layer of the photo's size."""
+    """Draw the pieces at random places as a layer, at the size at which they cover `cover`."""
     cutouts, (height, width) = [cutout for cutout, _, _ in drawn], size[:2]
     middles = rng.uniform(*_MIDDLE, (len(drawn), 2))  # x and y over width and height
     places = enumerate(middles * [width / height, 1.0])
@@ -287,7 +287,7 @@ def _layer(
         low, high = (scale, high) if share < cover else (low, scale)
     heights = natural * (low + high) / 2
     over = layer(cutouts, list(heights), placements, _camera(width, height, 1.0))
-    over[over[..., 3] < TRUTH_COVER] = 0  # what the mask leaves out keeps its bytes
+    over[over[..., 3] < TRUTH_COVER] = 0  # pixels that the mask leaves out keep their bytes
     pieces = [
         PastedPiece(cutout=c.name, photo=p, mirrored=m, x=float(x), y=float(y), height=float(tall))
         for (c, p, m), (x, y), tall in zip(drawn, middles, heights, strict=True)
@@ -296,6 +296,6 @@ def _layer(
 
 
 def _camera(width: int, height: int, scale: float) -> Camera:
-    """A camera at the origin whose unit is the photo's height, so that (x, y, 1) is a place in the photo."""
+    """Make a camera at the origin in units of the photo's height: (x, y, 1) is a place in the photo."""
     w, h = max(1, round(width * scale)), max(1, round(height * scale))
     return Camera(w, h, w * height / width, float(h), 0.0, 0.0, np.eye(4))

@@ -1,8 +1,8 @@
-"""Add distractors to the train photos of a real scene: a complete scene folder, with the truth.
+"""Add distractors to the train photos of a real scene: write a complete scene folder with the truth.
 
 SCENE2/images* sparse masks lists     as in the source scene; train photos changed, test photos not
 SCENE2/truth/distractor/<stem>.png    255 where a cut-out or its shadow covers a quarter of the pixel or more
-SCENE2/truth/clean/<stem>.png         the train photo as it was
+SCENE2/truth/clean/<stem>.png         the original train photo
 SCENE2/truth/composite.json           config, cut-outs with sha256; per photo placed cut-outs and coverage
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import TypedDict, cast
 
 import numpy as np
 
@@ -49,7 +49,7 @@ from ambiguous_wild.simulate.records import Spread, spread
 
 
 class PlacedCutout(TypedDict):
-    """One cut-out in one photo: `layers.CutoutPlacement` with its name."""
+    """One cut-out in one photo: `cutouts.CutoutPlacement` with its name."""
 
     cutout: str
     which: int
@@ -69,7 +69,7 @@ class CutoutRecord(TypedDict):
     """One cut-out of a composite."""
 
     name: str
-    sha256: str  # of its file; empty where it was drawn
+    sha256: str  # of its file; empty without a file
     height: float  # scene units
 
 
@@ -86,7 +86,7 @@ class CompositeRecord(TypedDict):
     schema: int
     version: str
     source: CompositeSource
-    config: dict[str, Any]  # `CompositeConfig`
+    config: dict[str, object]  # `CompositeConfig`
     mask: str
     poses: str
     cutouts: list[CutoutRecord]
@@ -101,7 +101,7 @@ ViewProgress = Callable[[Sequence[View]], Iterable[View]]
 class _Plan:
     cutouts: list[Cutout]
     heights: np.ndarray  # [K] scene units
-    placements: list[tuple[CutoutPlacement, ...]]  # of every train photo
+    placements: list[tuple[CutoutPlacement, ...]]  # for each train photo
 
 
 def composite(
@@ -111,9 +111,9 @@ def composite(
     cutouts: Path | str | None = None,
     progress: ViewProgress = iter,
 ) -> CompositeRecord:
-    """Make the scene; returns truth/composite.json.
+    """Make the scene, and return truth/composite.json.
 
-    Poses and points are those of the clean photos, so they are better than from photos with distractors.
+    Poses and points come from the clean photos, so they are better than from photos with distractors.
 
     Args:
         source: a scene folder, ours or a plain COLMAP scene.
@@ -148,7 +148,7 @@ def composite(
 
 
 def check_folders(root: Path, target: Path) -> None:
-    """Raise AwError where source and output lie inside each other, or the output exists."""
+    """Raise AwError if source and output lie inside each other, or the output exists."""
     if target.resolve().is_relative_to(root.resolve()) or root.resolve().is_relative_to(target.resolve()):
         raise AwError(f"{target} and {root} lie inside each other; choose another folder for -o")
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -156,7 +156,7 @@ def check_folders(root: Path, target: Path) -> None:
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise AwError where the scene has distractors already."""
+    """Raise AwError if the scene has distractors already."""
     for view in scene.train:
         mask = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png")
         if mask.is_file() and read_gray(mask).any():
@@ -187,10 +187,10 @@ def _plan(
 
 
 def _folders(root: Path) -> list[str]:
-    """images, then every images_N by its factor."""
-    found = [p.name for p in root.iterdir() if p.is_dir() and p.name.removeprefix("images_").isdigit()]
-    found.sort(key=lambda name: int(name.removeprefix("images_")))
-    return (["images"] if (root / "images").is_dir() else []) + found
+    """Return images, then every images_N by its factor."""
+    names = [p.name for p in root.iterdir() if p.is_dir() and p.name.removeprefix("images_").isdigit()]
+    names.sort(key=lambda name: int(name.removeprefix("images_")))
+    return (["images"] if (root / "images").is_dir() else []) + names
 
 
 def _write_photos(
@@ -213,7 +213,7 @@ def _write_photos(
                 path = pictures[view.name]
                 photo = read_png_rgb(path)
                 changed = composed(photo, resized(over, width, height))
-                # Changed photos become PNG: no second JPEG compression.
+                # Changed photos become PNG, to avoid a second JPEG compression.
                 out = (folder / path.relative_to(scene.root)).with_suffix(".png")
                 jobs.append(writers.submit(write_png, out, changed))
                 if path == view.image_path:
@@ -277,12 +277,12 @@ def _facts(
 
 
 def _write_scene_json(scene: Scene, folder: Path, name: str, facts: CompositeRecord) -> None:
-    """The source's scene.json, without the keys by which 'aw build-scene' knows its own scenes."""
+    """Write the source's scene.json without the keys by which 'aw build-scene' recognises its own scenes."""
     before: SceneInfo = read_scene_json(scene.root) or {"license": "not stated"}
     license_ = before.get("license", "not stated")
     kept = {k: v for k, v in before.items() if k not in ("build_key", "inputs", "seconds", "files")}
     factor = scene.info["loaded_factor"]
-    content: dict[str, Any] = {
+    content: dict[str, object] = {
         **kept,
         "schema": "ambiguous_wild.scene",
         "schema_version": SCENE_SCHEMA,

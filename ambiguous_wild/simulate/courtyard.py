@@ -56,7 +56,7 @@ def _walls(rng: np.random.Generator) -> list[Shape]:
 
 
 def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float, float, float]]]:
-    """Planters with bushes, crates, a bench, a stone ball; and their circles on the ground."""
+    """Make planters with bushes, crates, a bench and a stone ball, and their circles on the ground."""
     shapes: list[Shape] = []
     circles: list[tuple[float, float, float]] = []
     for x, y in ((-3.1, 2.6), (3.0, 2.3), (-4.5, -0.6)):
@@ -92,13 +92,13 @@ def courtyard(
 ) -> World:
     """Build the courtyard; positions and textures vary with the generator.
 
-    Objects that are left out use their random numbers all the same: the others do not change.
+    Objects that are left out still use up their random numbers, so the others do not change.
 
     Args:
         rng: source of randomness.
         detail_px_per_m: resolution of the textures, px per m.
         samples: rays a pixel, a square number.
-        what: its objects; None: furniture and statue.
+        what: objects of the courtyard; None: furniture and statue.
     """
     what = WorldSpec() if what is None else what
     d = detail_px_per_m

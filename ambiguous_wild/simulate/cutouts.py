@@ -1,6 +1,6 @@
 """Cut-outs: images whose alpha is the mask, or shapes filled with a window of a photo.
 
-Those of one photo are drawn as a transparent layer, once for all image sizes.
+The cut-outs of one photo are drawn as one transparent layer, which serves all image sizes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SMALLEST_PX = 8  # shorter side
 LARGEST_PX = 1200  # longer side; larger files are reduced
 _BLOB_PX = 200
 _BLOBS = 3
-TRUTH_COVER = 0.25  # of a pixel: at this cover and above the truth marks a distractor
+TRUTH_COVER = 0.25  # share of a pixel that must be covered to mark it as distractor in the truth
 _SHADOW_BLUR = 0.03  # of the cut-out's height
 _LYING_SHADOW = (0.07, 0.05)  # of the cut-out's height, to the right and down
 
@@ -35,7 +35,7 @@ class Cutout:
     light: (
         np.ndarray
     )  # [h, w, 4] float32: linear RGB times alpha, and alpha in [0, 1]; transparent rim of 1 px
-    source: str = ""  # sha256 of its file, "" where it was drawn
+    source: str = ""  # sha256 of its file; "" without a file
 
     @property
     def aspect(self) -> float:
@@ -44,11 +44,11 @@ class Cutout:
 
     @property
     def filled(self) -> float:
-        """Share of the rectangle that alpha covers."""
+        """Share of the image that alpha covers."""
         return float(self.light[..., 3].mean())
 
     def reduced(self, height: int) -> Cutout:
-        """The same, at most `height` px high, averaged over areas."""
+        """Reduce the cut-out to at most `height` px by area averaging."""
         h, w = self.light.shape[:2]
         if h <= height:
             return self
@@ -57,7 +57,7 @@ class Cutout:
 
 
 def read_cutouts(folder: Path | str) -> list[Cutout]:
-    """All PNG files of the folder, ordered by name.
+    """Read all PNG files of the folder, ordered by name.
 
     Raises:
         AwError: no folder, no PNG in it, or files whose alpha holds no shape.
@@ -79,7 +79,7 @@ def read_cutouts(folder: Path | str) -> list[Cutout]:
 
 
 def premultiplied(rgba: np.ndarray) -> np.ndarray:
-    """sRGB with alpha to linear light times alpha, with a transparent rim for soft edges.
+    """Convert sRGB with alpha to linear light times alpha, with a transparent rim for soft edges.
 
     Args:
         rgba: [H, W, 4] float32 in [0, 1], not premultiplied.
@@ -90,8 +90,8 @@ def premultiplied(rgba: np.ndarray) -> np.ndarray:
 
 
 def _read_rgba(path: Path) -> np.ndarray | None:
-    """[H, W, 4] float32 in [0, 1], cropped to the visible part; None where alpha holds no shape."""
-    read_png_rgb(path)  # its errors name the file and what to do
+    """Read [H, W, 4] float32 in [0, 1], cropped to the visible part; None if alpha holds no shape."""
+    read_png_rgb(path)  # for its errors, which name the file and what to do
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if (
         pixels is None
@@ -126,8 +126,8 @@ def _read_rgba(path: Path) -> np.ndarray | None:
 
 
 def blobs(rng: np.random.Generator) -> list[Cutout]:
-    """Rounded shapes to be filled with texture."""
-    made = []
+    """Draw rounded shapes, to be filled with texture."""
+    cutouts = []
     grid = (np.arange(_BLOB_PX) + 0.5) / _BLOB_PX * 2 - 1
     angle, radius = np.arctan2(grid[:, None], grid[None]), np.hypot(grid[:, None], grid[None])
     for k in range(_BLOBS):
@@ -135,8 +135,8 @@ def blobs(rng: np.random.Generator) -> list[Cutout]:
         for wave in (2, 3, 5):
             edge += rng.uniform(0.02, 0.24 / wave) * np.cos(wave * angle + rng.uniform(0, 2 * np.pi))
         alpha = np.clip((edge - radius) * _BLOB_PX / 4 + 0.5, 0, 1).astype(np.float32)
-        made.append(Cutout(f"blob {k + 1}", np.repeat(alpha[..., None], 4, 2)))
-    return made
+        cutouts.append(Cutout(f"blob {k + 1}", np.repeat(alpha[..., None], 4, 2)))
+    return cutouts
 
 
 def filled(
@@ -145,10 +145,10 @@ def filled(
     corner: Sequence[int],  # row and column of the window in the photo
     size: tuple[int, int],  # height and width of the window, px
 ) -> Cutout:
-    """The shape filled with a window of a photo."""
+    """Fill the shape with a window of a photo."""
     (top, left), (height, width) = corner, size
     window = photo[top : top + height, left : left + width].astype(np.float32) / 255
-    # Area averaging keeps the mean of alpha; linear interpolation keeps edges smooth.
+    # Area averaging keeps the mean of alpha when reducing; linear interpolation keeps edges smooth.
     how = cv2.INTER_AREA if height < shape.light.shape[0] else cv2.INTER_LINEAR
     alpha = cv2.resize(np.ascontiguousarray(shape.light[..., 3]), (width, height), interpolation=how)
     name = f"patch {shape.name}"
@@ -160,13 +160,13 @@ class CutoutPlacement:
     """One cut-out in one photo: a billboard that faces the camera."""
 
     which: int  # index into the cut-outs
-    position: tuple[float, float, float]  # world: its foot if standing, its centre if lying
-    turn_deg: float  # in the picture, clockwise
+    position: tuple[float, float, float]  # world position of its foot if standing, of its centre if lying
+    turn_deg: float  # clockwise in the picture
     standing: bool
 
 
 def project(camera: Camera, position: Sequence[float]) -> tuple[float, float, float]:
-    """(u, v, depth) of a world point: px, px, scene units."""
+    """Project a world point: u px, v px, depth in scene units."""
     x, y, z = camera.cam_from_world[:3] @ np.append(np.asarray(position, float), 1.0)
     return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, float(z)
 
@@ -178,13 +178,13 @@ def layer(
     camera: Camera,
     shadow: float = 0.0,
 ) -> np.ndarray:  # [H, W, 4] float32: linear RGB times alpha, alpha
-    """All cut-outs of one photo, nearer ones over farther ones.
+    """Draw the cut-outs of one photo as a layer, nearer ones over farther ones.
 
     Args:
         cutouts: all cut-outs.
-        heights: of each, scene units.
-        placements: of this photo.
-        camera: of the photo; the layer has its size.
+        heights: height of each, scene units.
+        placements: cut-outs in this photo.
+        camera: the photo's camera, which gives the size of the layer.
         shadow: darkness of the shadow's centre, 0 (none) to 1 (black).
     """
     out = np.zeros((camera.height, camera.width, 4), np.float32)
@@ -209,29 +209,29 @@ def _warped(
     shape: tuple[int, ...],
     shadow: bool,
 ) -> np.ndarray:
-    """The source scaled to `tall` px height in an image of `shape`, antialiased; 0 outside."""
+    """Draw the source, scaled to `tall` px height, into an image of `shape`, antialiased; 0 outside."""
     h, w = source.shape[:2]
-    if tall < h:  # area averaging first: sampling alone would alias
+    if tall < h:  # reduce by area averaging first, because sampling alone would alias
         w, h = max(1, round(w * tall / h)), max(1, round(tall))
         source = cv2.resize(source, (w, h), interpolation=cv2.INTER_AREA)
     scale = np.array([tall * (source.shape[1] / source.shape[0]) / w, tall / h])
     angle = np.deg2rad(placement.turn_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     place = np.asarray(at, float)
-    if shadow and placement.standing:  # cast on the ground to the right: flat and slanted
+    if shadow and placement.standing:  # the shadow lies on the ground to the right, flat and slanted
         turn = np.array([[1.0, -0.55], [0.0, 0.22]]) @ turn
     elif shadow:
         place = place + tall * np.array(_LYING_SHADOW)
     matrix = turn * scale
     anchor = np.array([w / 2, h if placement.standing else h / 2])
-    # Pixel centres: +0.5 here, whole numbers in OpenCV.
+    # Pixel centres are at +0.5 in our cameras and at whole numbers in OpenCV.
     shift = place - matrix @ anchor + matrix @ [0.5, 0.5] - 0.5
     size = (shape[1], shape[0])
     return cv2.warpAffine(source, np.column_stack([matrix, shift]), size, flags=cv2.INTER_LINEAR)
 
 
 def resized(over: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The layer for a smaller image of the same camera, by area averaging of premultiplied light."""
+    """Reduce the layer for a smaller image of the same camera, by area averaging of premultiplied light."""
     if over.shape[:2] == (height, width):
         return over
     return cv2.resize(over, (width, height), interpolation=cv2.INTER_AREA)
@@ -241,7 +241,7 @@ def composed(
     photo: np.ndarray,  # [H, W, 3] uint8, sRGB
     over: np.ndarray,  # [H, W, 4] float32
 ) -> np.ndarray:  # [H, W, 3] uint8, sRGB
-    """The layer over the photo, blended in linear light; pixels that it does not cover keep their bytes."""
+    """Blend the layer over the photo in linear light; pixels that it does not cover keep their bytes."""
     touched = over[..., 3] > 0
     below = srgb_to_linear(photo[touched].astype(np.float32) / 255)
     mixed = over[touched, :3] + (1 - over[touched, 3:]) * below
@@ -251,5 +251,5 @@ def composed(
 
 
 def truth(over: np.ndarray) -> np.ndarray:
-    """255 where the layer covers at least a quarter of a pixel, else 0: [H, W] uint8."""
+    """Return 255 where the layer covers at least a quarter of a pixel, else 0: [H, W] uint8."""
     return np.where(over[..., 3] >= TRUTH_COVER, 255, 0).astype(np.uint8)

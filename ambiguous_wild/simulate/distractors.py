@@ -1,7 +1,7 @@
 """Distractors: shapes that are placed in the world anew for every photo.
 
-Perspective, occlusion and shadows on them are exact. They cast no shadow on the static world: outside their
-pixels the photo with distractors equals the clean photo.
+Perspective, occlusion and shadows on distractors are exact. They cast no shadow on the static world, so that
+outside their pixels the photo with distractors equals the clean photo.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ambiguous_wild.simulate.world import World, car, placard, statue
 
 _TRIES = 80  # layouts drawn for a photo, of which the best is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place
-_SAME_PLACE_SHARE = 0.15  # of the photos: the most with one distractor at the same place
+_SAME_PLACE_SHARE = 0.15  # largest share of the photos with one distractor at the same place
 _APART_M = 0.75
-_CLEARANCE_M = {"car": 1.2}  # from what stands; others keep 0.3 m
+_CLEARANCE_M = {"car": 1.2}  # distance from static objects; other distractors keep 0.3 m
 _PREVIEW_PX = 96
 
 
@@ -34,11 +34,11 @@ class Placement:
     x_m: float
     y_m: float
     yaw_deg: float
-    pose: float  # 0 to 1: stride and arm of a figure
+    pose: float  # stride and arm of a figure, 0 to 1
 
 
 def shapes_of(distractor: Distractor, placement: Placement, plan: GroundPlan) -> list[Shape]:
-    """The distractor's shapes in the world, owned by ``placement.which + 1``."""
+    """Make the distractor's shapes in the world, owned by ``placement.which + 1``."""
     at = (placement.x_m, placement.y_m, distractor.lift_m * placement.pose)
     parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose, plan)]
     moved = placed(parts, at, placement.yaw_deg, distractor.size)
@@ -46,7 +46,7 @@ def shapes_of(distractor: Distractor, placement: Placement, plan: GroundPlan) ->
 
 
 def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]:
-    """The distractor at its natural size, standing at the origin."""
+    """Make the distractor at its natural size, standing at the origin."""
     texture = distractor.texture
     match distractor.kind:
         case "visitor":
@@ -74,7 +74,7 @@ def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]
 
 
 def _tinted(shape: Shape, distractor: Distractor) -> Shape:
-    """Tint the parts with the distractor's texture; a head with another texture stays as it is."""
+    """Tint the parts with the distractor's texture, but not a head with another texture."""
     if shape.texture != distractor.texture:
         return shape
     r, g, b = (x * y for x, y in zip(shape.tint, distractor.tint))
@@ -82,7 +82,7 @@ def _tinted(shape: Shape, distractor: Distractor) -> Shape:
 
 
 def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -> ShapeTable:
-    """All distractors of one photo as a table for the ray caster."""
+    """Return all distractors of one photo as a table for the ray caster."""
     shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p, world.plan)]
     gloss = spec.effects.specular
     if gloss is not None:
@@ -95,15 +95,16 @@ def lay_out(
 ) -> list[tuple[Placement, ...]]:
     """Place the distractors of every train photo.
 
-    Layouts are drawn until the occlusion, measured in a small preview, lies in ``spec.occlusion``; else the
-    nearest one is taken. Presence applies to each draw; where the range starts at 0, to the photo, drawn
-    once. No distractor is at one place in more than 15 % of the photos: it would be part of the scene.
+    Layouts are drawn until the occlusion, measured in a small preview, lies in ``spec.occlusion``; if none
+    does, the nearest one is taken. Who is present is drawn for each layout, or once a photo if the range
+    starts at 0. No distractor is at one place in more than 15 % of the photos, as it would be part of the
+    scene.
     """
     chosen: list[tuple[Placement, ...]] = []
     static = world.table()
     light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
     low, high = spec.occlusion
-    # Walkers have no choice of place, and choosing who is present would change their duty cycles.
+    # The place of a walker is given, and choosing among layouts would change how often it is present.
     tries = 1 if all(d.path == "walk" for d in spec.distractors) else _TRIES
     for camera in cameras:
         if not spec.distractors:
@@ -112,13 +113,13 @@ def lay_out(
         small = camera.resized(_PREVIEW_PX, max(1, round(_PREVIEW_PX * camera.height / camera.width)))
         best: tuple[Placement, ...] = ()
         best_gap = np.inf
-        aim = rng.uniform(low, high)  # spreads the shares over the whole range
-        here = [rng.random() <= d.presence for d in spec.distractors] if low == 0 and tries > 1 else None
-        if here is not None and not any(here):
+        aim = rng.uniform(low, high)  # so that the shares spread over the whole range
+        present = [rng.random() <= d.presence for d in spec.distractors] if low == 0 and tries > 1 else None
+        if present is not None and not any(present):
             chosen.append(())
             continue
         for attempt in range(tries):
-            layout = _draw(spec, camera, world, chosen, rng, here)
+            layout = _draw(spec, camera, world, chosen, rng, present)
             seen = trace(small, static, movers(spec, layout, world), world.atlas, light)
             share = float(np.mean(seen.owner > 0))
             tolerance = (high - low) * (0.1 + 0.4 * attempt / tries)
@@ -137,11 +138,11 @@ def _draw(
     world: World,
     earlier: list[tuple[Placement, ...]],
     rng: np.random.Generator,
-    here: list[bool] | None = None,  # present distractors; None: drawn too
+    present: list[bool] | None = None,  # which distractors are present; None: draw that too
 ) -> tuple[Placement, ...]:
     layout: list[Placement] = []
     for which, distractor in enumerate(spec.distractors):
-        if not here[which] if here is not None else rng.random() > distractor.presence:
+        if not present[which] if present is not None else rng.random() > distractor.presence:
             continue
         if distractor.path == "walk":
             place = _walker_placement(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
@@ -160,7 +161,7 @@ def _draw(
 def _random_placement(
     which: int, distractor: Distractor, camera: Camera, rng: np.random.Generator
 ) -> Placement:
-    """A random point on the ground within the picture, at the distractor's distance."""
+    """Draw a random point on the ground within the picture, at the distractor's distance."""
     column = rng.uniform(0.06, 0.94) * camera.width
     direction = camera.cam_from_world[:3, :3].T @ np.array([(column - camera.cx) / camera.fx, 0.0, 1.0])
     flat = direction[:2] / np.linalg.norm(direction[:2])
@@ -169,7 +170,7 @@ def _random_placement(
 
 
 def _walker_placement(which: int, distractor: Distractor, progress: float) -> Placement:
-    """A walker at `progress` (0 to 1) of the capture: to and fro along its waypoints, facing ahead."""
+    """Place a walker at `progress` (0 to 1) of the capture: to and fro along its waypoints, facing ahead."""
     corners = np.array(distractor.waypoints)
     legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     along = (2 * distractor.laps * progress) % 2.0  # 0 to 1 forward, 1 to 2 back

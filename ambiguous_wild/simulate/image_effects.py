@@ -1,7 +1,7 @@
-"""Effects of camera and light on a simulated photo, each a pure function of its name.
+"""Effects of camera and light on a simulated photo, each a pure function with the effect's name.
 
-`draw_...` draws what differs between photos; `spec.Effects` holds the settings, `render.py` the order. An
-effect that the spec does not name is not called.
+The function `draw_...` of an effect draws what differs between photos; `spec.Effects` holds the settings, and
+`render.py` the order. An effect that the spec does not name is not called.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from ambiguous_wild.simulate.spec import (
 )
 from ambiguous_wild.simulate.tracer import Light
 
-_EFFECTS = 1000  # spawn key: world, walk and layout are 0 to 2
+_EFFECTS = 1000  # spawn key of effects; world, walk and layout have 0 to 2
 
 
 @dataclass(frozen=True)
 class PhotoRandom:
-    """One photo of a capture. Streams are independent: adding an effect changes no other."""
+    """Random numbers of one photo, in independent streams: adding an effect changes no other."""
 
     seed: int
-    number: int  # of the photo, from 0
-    progress: float  # of the capture, 0 to 1
+    number: int  # number of the photo, from 0
+    progress: float  # place of the photo in the capture, 0 to 1
 
     def rng(self, name: str) -> np.random.Generator:
-        """The generator of one effect for this photo."""
+        """Return the generator of one effect for this photo."""
         return _generator(self.seed, name, self.number + 1)
 
     def phase(self, name: str) -> float:
-        """A number in [0, 1) per effect, the same for the whole capture."""
+        """Return a number in [0, 1) for an effect, the same for the whole capture."""
         return float(_generator(self.seed, name, 0).random())
 
     def drift(self, name: str, cycles: float = 1.5) -> float:
-        """A value in [-1, 1] that drifts slowly over the capture, with a little jitter."""
+        """Return a value in [-1, 1] that drifts slowly over the capture, with a little jitter."""
         slow = np.sin(2 * np.pi * (cycles * self.progress + self.phase(name)))
         return float(0.8 * slow + 0.2 * self.rng(name).uniform(-1, 1))
 
@@ -61,7 +61,7 @@ def _generator(seed: int, name: str, number: int) -> np.random.Generator:
 
 
 def draw_exposure_drift(settings: ExposureDrift, random: PhotoRandom) -> float:
-    """Exposure error of this photo, stops; positive = brighter."""
+    """Draw the exposure error of this photo in stops; positive = brighter."""
     return settings.stops * random.drift("exposure_drift")
 
 
@@ -69,7 +69,7 @@ def exposure_drift(
     image: np.ndarray,  # [H, W, 3] float32, linear light
     stops: float,
 ) -> np.ndarray:
-    """The image times 2^stops; it is clipped when it is stored."""
+    """Multiply the image by 2^stops, without clipping."""
     return image * np.float32(2.0**stops)
 
 
@@ -77,7 +77,7 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
 
 
 def draw_white_balance(settings: WhiteBalance, random: PhotoRandom) -> tuple[float, float, float]:
-    """The photo's gains (red, green, blue); white keeps its luminance."""
+    """Draw the photo's gains (red, green, blue); white keeps its luminance."""
     warmth = settings.warmth * random.drift("white_balance", cycles=2.3)
     tint = settings.tint * random.drift("white_balance tint", cycles=1.1)
     gains = 2.0 ** np.array([warmth / 2, tint, -warmth / 2])
@@ -89,7 +89,7 @@ def white_balance(
     image: np.ndarray,  # [H, W, 3] float32, linear light
     gains: tuple[float, float, float],
 ) -> np.ndarray:
-    """The image with each channel times its gain."""
+    """Multiply each channel by its gain."""
     return image * np.array(gains, np.float32)
 
 
@@ -98,12 +98,12 @@ _READ = 5e-4  # standard deviation at ISO 100
 
 
 def draw_iso_noise(settings: IsoNoise, random: PhotoRandom) -> float:
-    """The photo's ISO."""
+    """Draw the photo's ISO."""
     return float(random.rng("iso_noise").uniform(*settings.iso))
 
 
 def pattern(random: PhotoRandom, height: int, width: int) -> np.ndarray:
-    """Standard normal numbers [H, W, 3] float32; the same for a photo and its clean version."""
+    """Draw standard normal numbers [H, W, 3] float32, the same for a photo and its clean version."""
     return random.rng("iso_noise pattern").standard_normal((height, width, 3), dtype=np.float32)
 
 
@@ -112,7 +112,7 @@ def iso_noise(
     normal: np.ndarray,  # [H, W, 3] float32, standard normal
     iso: float,
 ) -> np.ndarray:
-    """The image with noise of variance `_SHOT` gain signal + (`_READ` gain)^2, gain = iso / 100.
+    """Add noise of variance `_SHOT` gain signal + (`_READ` gain)^2, gain = iso / 100.
 
     Source: the affine noise model of Foi et al. 2008, IEEE TIP 17(10).
     """
@@ -125,7 +125,7 @@ def vignetting(
     image: np.ndarray,  # [H, W, 3] float32, linear light
     falloff: float,  # share of the light that the corners lack, in [0, 1)
 ) -> np.ndarray:
-    """The image times (1 + c r^2)^-2, r = 1 in the corners; cos^4 of the angle has this form."""
+    """Multiply the image by (1 + c r^2)^-2, r = 1 in the corners; cos^4 of the angle has this form."""
     height, width = image.shape[:2]
     x = (np.arange(width, dtype=np.float64) + 0.5) / width * 2 - 1
     y = (np.arange(height, dtype=np.float64) + 0.5) / height * 2 - 1
@@ -134,18 +134,18 @@ def vignetting(
     return image * ((1.0 + c * r2) ** -2).astype(np.float32)[..., None]
 
 
-_FINE = 9  # subpixels a side, for the disc's rim
+_FINE = 9  # subpixels a side that resolve the disc's rim
 
 
 def draw_defocus(settings: Defocus, random: PhotoRandom) -> float:
-    """Radius of the blur disc in widths of the photo; 0 = sharp."""
+    """Draw the radius of the blur disc in widths of the photo; 0 = sharp."""
     rng = random.rng("defocus")
     out_of_focus, radius = rng.random() < settings.share, rng.uniform(*settings.radius)
     return float(radius) if out_of_focus else 0.0
 
 
 def disc(radius_px: float) -> np.ndarray:
-    """The point spread, [K, K] float32, sum 1: a disc with an anti-aliased rim."""
+    """Return the point spread function, [K, K] float32, sum 1: a disc with an anti-aliased rim."""
     reach = int(np.ceil(radius_px + 0.5 - 1e-9))
     fine = (np.arange((2 * reach + 1) * _FINE) + 0.5) / _FINE - reach - 0.5
     inside = np.hypot(fine[None], fine[:, None]) <= radius_px
@@ -158,15 +158,15 @@ def defocus(
     image: np.ndarray,  # [H, W] or [H, W, 3] float32, linear light
     kernel: np.ndarray,  # [K, K] float32
 ) -> np.ndarray:
-    """The image convolved with the kernel.
+    """Convolve the image with the kernel.
 
-    A lens of 4 mm that is focused is sharp from 2 m to infinity; one that is not has one disc for all depths.
+    One disc serves all depths, as a focused lens of 4 mm is sharp from 2 m to infinity.
     """
     return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE))
 
 
 def draw_jpeg(settings: Jpeg, random: PhotoRandom) -> int:
-    """The photo's quality."""
+    """Draw the photo's quality."""
     low, high = settings.quality
     return int(random.rng("jpeg").integers(low, high + 1))
 
@@ -175,7 +175,7 @@ def jpeg(
     pixels: np.ndarray,  # [H, W, 3] uint8, sRGB
     quality: int,  # 1 to 95
 ) -> np.ndarray:  # [H, W, 3] uint8, sRGB
-    """The pixels after JPEG with chroma at half the resolution."""
+    """Compress the pixels as JPEG with chroma at half the resolution, and decode them."""
     from PIL import Image
 
     stored = io.BytesIO()
@@ -184,18 +184,18 @@ def jpeg(
     return np.array(Image.open(stored).convert("RGB"))
 
 
-# Gains of sun, sky and ground light at strength 1; in between powers of them, so hour 0 has gain 1.
+# Gains of sun, sky and ground light at strength 1; other hours use powers of them, so hour 0 has gain 1.
 _MORNING = ((0.45, 0.55, 0.75), (0.80, 0.95, 1.25), (0.80, 0.90, 1.10))  # thin cloud, blue
 _EVENING = ((1.25, 0.85, 0.50), (0.85, 0.70, 0.70), (0.95, 0.75, 0.60))  # low and golden
 
 
 def draw_time_of_day(settings: TimeOfDay, random: PhotoRandom) -> float:
-    """The photo's hour: -1 morning, 0 as in the test photos, 1 evening; in random order."""
+    """Draw the photo's hour: -1 morning, 0 as in the test photos, 1 evening; in random order."""
     return float(random.rng("time_of_day").uniform(-1, 1))
 
 
 def time_of_day(light: Light, hour: float, strength: float, sweep_deg: float) -> tuple[Light, np.ndarray]:
-    """The light at `hour`, and the gain [3] of the background sky."""
+    """Return the light at `hour`, and the gain [3] of the background sky."""
     ends = _EVENING if hour > 0 else _MORNING
     sun, sky, ground = (np.array(g) ** (abs(hour) * strength) for g in ends)
     turn = np.deg2rad(sweep_deg * hour)
@@ -217,7 +217,7 @@ _LOBES = 4
 
 
 def draw_moving_shadow(settings: MovingShadow, random: PhotoRandom) -> tuple[tuple[float, float, float], ...]:
-    """Lobes of the shadow on the ground as (x, y, radius), m; none in photos without a shadow."""
+    """Draw the lobes of the shadow on the ground as (x, y, radius), m; none in photos without a shadow."""
     rng = random.rng("moving_shadow")
     if rng.random() >= settings.presence:
         return ()
@@ -233,7 +233,7 @@ def moving_shadow(
     lobes: tuple[tuple[float, float, float], ...],
     sun: np.ndarray,  # [3] unit, towards the sun
 ) -> list[Shape]:
-    """Invisible ellipsoids towards the sun whose shadows fall on the lobes.
+    """Make invisible ellipsoids towards the sun whose shadows fall on the lobes.
 
     The sun is 0.024 rad wide: at this distance the shadow's edge is 0.2 m wide.
     """
@@ -248,7 +248,7 @@ def moving_shadow(
 def specular(
     shapes: Iterable[Shape], textures: tuple[str, ...], strength: float, sharpness: float
 ) -> list[Shape]:
-    """The shapes, those with the named textures polished.
+    """Polish the shapes with the named textures.
 
     Source: Blinn 1977 for the sun's highlight, Schlick 1994 for the reflection of the sky.
     """
@@ -276,7 +276,7 @@ def lens_distortion(
 
 
 def hand_velocity(random: PhotoRandom, speed_deg_s: float) -> np.ndarray:
-    """Angular velocity in camera axes, [3] rad/s: mostly pitch and yaw, a third of it roll.
+    """Draw the angular velocity in camera axes, [3] rad/s: mostly pitch and yaw, a third of it roll.
 
     Its length is 0.3 to 1 times `speed_deg_s`. The direction does not depend on the speed, so blur and
     rolling shutter show the same motion.
@@ -291,7 +291,7 @@ def hand_turns(
     seconds: float,  # of the exposure, or of reading all rows
     steps: int,  # instants of the exposure, or rows
 ) -> np.ndarray:  # [steps, 3] rotation vectors
-    """Rotation of the camera at `steps` instants, evenly over the time; 0 in its middle.
+    """Return the rotation of the camera at `steps` instants, evenly over the time; 0 in its middle.
 
     Translation is left out: it needs depth and leaves holes. At 5 m, 1 m/s blurs like 11 deg/s.
     """
@@ -299,21 +299,21 @@ def hand_turns(
     return seconds * instants[:, None] * velocity
 
 
-# Lens distortion, rolling shutter and motion blur in one resampling. The pinhole image is traced larger than
-# the photo, and finer by a whole factor; each fine pixel of the photo is looked up in it. All weights are
-# non-negative, so a mask resampled with them is positive exactly where masked pixels contribute.
+# Lens distortion, rolling shutter and motion blur share one resampling. The pinhole image is traced larger
+# than the photo, and finer by a whole factor; each fine pixel of the photo is looked up in it. All weights
+# are non-negative, so a mask resampled with them is positive exactly where masked pixels contribute.
 _MAX_BORDER = 2  # greatest border, in longer sides of the photo
 
 
 def fine_points(camera: Camera, fine: int) -> np.ndarray:
-    """Normalised coordinates [H fine, W fine, 2] of the photo's fine pixels."""
+    """Return normalised coordinates [H fine, W fine, 2] of the photo's fine pixels."""
     u = ((np.arange(camera.width * fine) + 0.5) / fine - camera.cx) / camera.fx
     v = ((np.arange(camera.height * fine) + 0.5) / fine - camera.cy) / camera.fy
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
 def turned(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """The points in the camera before it turned.
+    """Return the points as seen by the camera before it turned.
 
     Args:
         points: [H, W, 2] normalised, of the turned camera.
@@ -333,12 +333,12 @@ def turned(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
 
 
 def in_pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """[..., 2] px of the pinhole camera."""
+    """Convert normalised points to px of the pinhole camera, [..., 2]."""
     return points * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
 def enlarged(camera: Camera, sources: list[np.ndarray], fine: int) -> tuple[Camera, int]:
-    """A finer camera that covers all sources, and its border in coarse px."""
+    """Return a finer camera that covers all sources, and its border in coarse px."""
     low = min(float(s.min()) for s in sources)
     high = max(float((s - (camera.width, camera.height)).max()) for s in sources)
     border = int(np.ceil(max(-low, high, 0.0))) + 1
@@ -353,7 +353,7 @@ def enlarged(camera: Camera, sources: list[np.ndarray], fine: int) -> tuple[Came
 
 
 def resample(image: np.ndarray, sources: list[np.ndarray], border: int, fine: int) -> np.ndarray:
-    """The photo: mean over the sources and over the fine pixels of each pixel.
+    """Resample the photo: average over the sources and over the fine pixels of each pixel.
 
     Args:
         image: [H', W'] or [H', W', 3] float32 of the enlarged camera.

@@ -22,7 +22,7 @@ _NEAR_M = 4e-4  # distance at which a ray has reached the surface
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def distance(volume, x, y, z):
-    """Trilinear value of `volume` [N, N, N] at a point of the cube [-1, 1]^3, clamped to it."""
+    """Interpolate `volume` [N, N, N] trilinearly at a point of the cube [-1, 1]^3, clamped to it."""
     n = volume.shape[0]
     gx = min(max((x + 1.0) * 0.5 * (n - 1), 0.0), n - 1.001)
     gy = min(max((y + 1.0) * 0.5 * (n - 1), 0.0), n - 1.001)
@@ -41,7 +41,7 @@ def distance(volume, x, y, z):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def sphere_trace(volume, o, d, size, far):
-    """Distance along the local ray o + t d, d of unit length, to the volume's surface, or `far`."""
+    """Return the distance along the local ray o + t d, |d| = 1, to the volume's surface, or `far`."""
     start, end = 1e-6, far
     for axis in range(3):
         oa = o[0] if axis == 0 else (o[1] if axis == 1 else o[2])
@@ -67,7 +67,7 @@ def sphere_trace(volume, o, d, size, far):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def surface_normal(volume, p, size, d):
-    """Unit normal at the local point by central differences over one cell, turned against the ray."""
+    """Return the unit normal at the local point by central differences, turned against the ray."""
     x, y, z = p[0] / size, p[1] / size, p[2] / size
     e = 2.0 / (volume.shape[0] - 1)
     nx = distance(volume, x + e, y, z) - distance(volume, x - e, y, z)
@@ -82,7 +82,7 @@ def surface_normal(volume, p, size, d):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _intersect(kind, o, d, h, far):
-    """Distance along the local ray o + t d to the shape, or `far`; an ellipsoid is also hit from inside."""
+    """Return the distance along the local ray o + t d, or `far`; an ellipsoid is also hit from inside."""
     ox, oy, oz = o
     dx, dy, dz = d
     hx, hy, hz = h
@@ -165,7 +165,7 @@ def _local(table, s, px, py, pz, shift):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def nearest(table, which, count, o, d, far):
-    """Nearest hit among the listed shapes: (distance, shape or -1)."""
+    """Return the nearest hit among the listed shapes: (distance, shape or -1)."""
     best, hit = far, -1
     center, radius, half, kind = table[2], table[4], table[3], table[0]
     for k in range(count):
@@ -211,7 +211,7 @@ def _shadowed(table, o, d):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _normal(kind, p, h, d):
-    """Unit normal at the local point, turned against the local ray."""
+    """Return the unit normal at the local point, turned against the local ray."""
     x, y, z = p
     if kind == QUAD:
         nx, ny, nz = 0.0, 0.0, 1.0
@@ -241,7 +241,7 @@ def _normal(kind, p, h, d):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _fold(u, size):
-    """Texture coordinate to texel; mirrored at the borders, without a seam."""
+    """Map a texture coordinate to a texel, mirrored at the borders without a seam."""
     u = u - 2.0 * math.floor(0.5 * u)
     u = 2.0 - u if u > 1.0 else u
     return min(max(u * size - 0.5, 0.0), size - 1.0)
@@ -268,7 +268,7 @@ def _bilinear(atlas, t, level, u, v):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _sample(atlas, t, u, v, lod):
-    """Trilinear lookup: two mip levels around `lod`, blended."""
+    """Look a texture up trilinearly: blend the two mip levels around `lod`."""
     top = atlas[4][t] - 1
     lod = min(max(lod, 0.0), float(top))
     level = int(lod)
@@ -283,7 +283,7 @@ def _sample(atlas, t, u, v, lod):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _gloss(strength, sharpness, n, d, sun, sunlit, light):
-    """Specular light of a polished surface: highlight of the sun (Blinn), reflection of the sky (Schlick)."""
+    """Compute specular light of a polished surface: the sun's highlight (Blinn), the sky's (Schlick)."""
     facing = -(n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
     lobe = 0.0
     if sunlit:
@@ -303,9 +303,9 @@ def _gloss(strength, sharpness, n, d, sun, sunlit, light):
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others, shadow_casters):
-    """Colour of shape s at distance t: texture, sun with shadow, sky light from above and below.
+    """Compute the colour of shape s at distance t: texture, sun with shadow, sky light from above and below.
 
-    Returns it with and without the shadows of `shadow_casters`; equal numbers where none falls.
+    Returns the colour with and without the shadows of `shadow_casters`, equal where no shadow falls.
     """
     kind, half, mapping, uv, tint = table[0][s], table[3], table[6][s], table[7], table[8]
     lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
@@ -329,7 +329,7 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
         elif ay >= az:
             a, b_ = p[0], p[2]
     u, v = a * uv[s, 0] + uv[s, 2], b_ * uv[s, 1] + uv[s, 3]
-    # Footprint of a sample on the surface: geometric mean of its short and long side.
+    # Footprint of a sample on the surface, the geometric mean of its short and long side.
     footprint = t * spread / math.sqrt(max(cosine, 0.04))
     density = max(uv[s, 0] * atlas[2][texture, 0], uv[s, 1] * atlas[3][texture, 0])
     r, g, b = _sample(atlas, texture, u, v, math.log2(max(footprint * density, 1e-6)))
@@ -359,7 +359,7 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _lit(base, tone, polish, n, d, sun, lit, light):
-    """Colour of a surface under `lit` of the sun and the whole sky."""
+    """Compute the colour of a surface under the share `lit` of the sun and the whole sky."""
     up = 0.5 + 0.5 * n[2]
     sun_colour, sky, ground = light[1], light[2], light[3]
     gr, gg, gb = 0.0, 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Place the cut-outs: at the scene's points, with one size in all photos."""
+"""Place cut-outs at the scene's points, with one size in all photos."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from ambiguous_wild.simulate.cutouts import (
 )
 
 _DRAWS = 24  # positions drawn for a cut-out, of which the best is taken
-_NEARER = (0.90, 0.98)  # depth of the cut-out over that of the point behind it
-_SAME_PLACE = 0.08  # of the scene's spread: closer positions count as the same place
-_SAME_PLACE_SHARE = 0.15  # of the photos: a cut-out that stays longer would be part of the scene
-_APART = 0.3  # of the photo's shorter side: distance of two cut-outs, where possible
+_NEARER = (0.90, 0.98)  # depth of the cut-out relative to that of the point behind it
+_SAME_PLACE = 0.08  # distance relative to the scene's spread below which positions are the same place
+_SAME_PLACE_SHARE = 0.15  # of the photos; a cut-out that stays longer would be part of the scene
+_APART = 0.3  # distance of two cut-outs, if possible, relative to the photo's shorter side
 _PREVIEW_PX = 160
-_LARGEST = 0.6  # of the photo's sides: largest window of a patch
-_LONGEST = 1.2  # of the photo's longer side: largest cut-out
+_LARGEST = 0.6  # largest window of a patch, relative to the photo's sides
+_LONGEST = 1.2  # largest cut-out, relative to the photo's longer side
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class VisiblePoints:
 
 
 def visible_points(scene: Scene) -> list[VisiblePoints]:
-    """The points that each train photo sees, by tracks, or by projection where it has fewer than 10.
+    """Return the points that each train photo sees, by tracks, or by projection if it has fewer than 10.
 
     Raises:
         AwError: the scene has no points, or a photo sees fewer than three.
@@ -73,14 +73,14 @@ def visible_points(scene: Scene) -> list[VisiblePoints]:
             f"{scene.root} has no points, so the depth of a cut-out is unknown; build it with COLMAP"
         )
     owner = np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
-    made = []
+    sites = []
     for view in scene.train:
         index = scene.views.index(view)
-        made.append(_site(view, scene.points, np.unique(owner[scene.points.track_views == index])))
-    bare = [s.view.name for s in made if len(s.xyz) < 3]
+        sites.append(_site(view, scene.points, np.unique(owner[scene.points.track_views == index])))
+    bare = [s.view.name for s in sites if len(s.xyz) < 3]
     if bare:
         raise AwError(f"{scene.root}: {len(bare)} train photos see fewer than 3 points, e.g. {bare[0]}")
-    return made
+    return sites
 
 
 def _site(view: View, points: Points, tracked: np.ndarray) -> VisiblePoints:
@@ -94,7 +94,7 @@ def _site(view: View, points: Points, tracked: np.ndarray) -> VisiblePoints:
 
 
 def scene_spread(scene: Scene) -> float:
-    """Median distance of the points from their median, scene units."""
+    """Return the median distance of the points from their median, scene units."""
     xyz = scene.points.xyz
     return float(np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)))
 
@@ -117,9 +117,9 @@ def place(
         config: presence and pose.
         rng: source of randomness.
         count: number of cut-outs.
-        colours: of patches, [3] CIELAB by index; a patch goes where the photo is most like it.
-        backgrounds: with `colours`, per photo its local mean colour, [h, w, 3] CIELAB.
-        origins: world position that a patch was cut from, by index; it is not put back there.
+        colours: index of a patch -> its colour, [3] CIELAB; it is placed where the photo is most similar.
+        backgrounds: local mean colour of each photo, [h, w, 3] CIELAB, needed with `colours`.
+        origins: index of a patch -> world position that it was cut from, where it is not put back.
     """
     chosen: list[tuple[CutoutPlacement, ...]] = []
     earlier: dict[int, list[np.ndarray]] = {k: [] for k in range(count)}
@@ -147,7 +147,7 @@ def place(
                 if cost == 0:
                     break
             if best is None:
-                continue  # all positions drawn were used too often: not in this photo
+                continue  # all drawn positions were used too often, so it is left out of this photo
             xyz, uv = site.xyz[best[1]], site.uv[best[1]]
             earlier[which].append(xyz)
             taken.append(uv)
@@ -173,7 +173,7 @@ def _colour_gap(colour: np.ndarray, background: np.ndarray, uv: np.ndarray, view
 
 
 def natural_heights(cutouts: Sequence[Cutout], rng: np.random.Generator) -> np.ndarray:
-    """Heights [K] that give every cut-out about the same area, up to a fifth; any unit."""
+    """Draw heights [K] that give every cut-out about the same area, up to a fifth; in any unit."""
     return np.array([rng.uniform(0.8, 1.25) / np.sqrt(c.aspect * c.filled) for c in cutouts])
 
 
@@ -184,7 +184,7 @@ def solve_heights(
     placements: Sequence[tuple[CutoutPlacement, ...]],
     config: CompositeConfig,
 ) -> np.ndarray:
-    """Heights in scene units that give the configured mean coverage; bisection over previews.
+    """Find heights in scene units that give the configured mean coverage, by bisection over previews.
 
     Raises:
         AwError: even the largest size covers less.
@@ -229,7 +229,7 @@ def _share(
 
 
 def local_colours(photo: np.ndarray) -> np.ndarray:
-    """Local mean colour of a photo, [h, w, 3] CIELAB, 64 px wide.
+    """Return the local mean colour of a photo, [h, w, 3] CIELAB, 64 px wide.
 
     Args:
         photo: [H, W, 3] uint8, sRGB.
@@ -257,7 +257,7 @@ def cut_patches(
         rng: source of randomness.
 
     Returns:
-        The patches; by index the mean CIELAB colour [3]; by index the world position of the window [3].
+        The patches; index -> mean CIELAB colour [3]; index -> world position [3] of the window.
     """
     patches, colours, origins = [], {}, {}
     for k, shape in enumerate(shapes):
@@ -277,7 +277,7 @@ def cut_patches(
 
 
 def _window(shape: Cutout, photo: tuple[int, ...], config: CompositeConfig, count: int) -> tuple[int, int]:
-    """Height and width of the window, px: the area that one of `count` patches will cover."""
+    """Return height and width of a window, px, with the area that one of `count` patches will cover."""
     area = config.coverage * photo[0] * photo[1] / (count * config.presence)
     height = np.sqrt(area / (shape.aspect * shape.filled))
     shrink = min(1.0, _LARGEST * photo[0] / height, _LARGEST * photo[1] / (height * shape.aspect))

@@ -17,10 +17,10 @@ PRESETS = {
 
 
 def preset(name: str) -> CaptureSpec:
-    """The preset of that name.
+    """Return the preset of a name.
 
     Raises:
-        AwError: unknown name; gives the nearest one.
+        AwError: unknown name; the message gives the nearest one.
     """
     if name not in PRESETS:
         raise unknown("capture", name, PRESETS, "'aw simulate --list' lists them")
@@ -28,7 +28,7 @@ def preset(name: str) -> CaptureSpec:
 
 
 def resized(spec: CaptureSpec, views: int | None = None, width: int | None = None) -> CaptureSpec:
-    """The spec with another number of train photos, or another width with the same aspect ratio.
+    """Return the spec with another number of train photos, or another width with the same aspect ratio.
 
     Raises:
         AwError: fewer than 3 photos, or a width outside 64 to 4096 px.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NotRequired, TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 
@@ -15,7 +15,7 @@ class DrawnShutter(TypedDict):
 
 
 class DrawnEffects(TypedDict, total=False):
-    """What the effects drew for one photo; an effect that the spec does not name is absent."""
+    """Random values of the effects of one photo; effects that the spec does not name are absent."""
 
     time_of_day: dict[str, float]  # hour: -1 morning, 0 noon, 1 evening
     specular: dict[str, float]  # empty: the same in all photos
@@ -53,7 +53,7 @@ class PhotoTruth(TypedDict):
 
 
 class Spread(TypedDict):
-    """A figure over the training photos."""
+    """Mean and range of a figure over the training photos."""
 
     mean: float
     min: float
@@ -74,7 +74,7 @@ class CameraRecord(TypedDict):
 
 
 def spread(shares: list[float]) -> Spread:
-    """Of a share over the training photos."""
+    """Summarise a share over the training photos."""
     return {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)}
 
 
@@ -86,8 +86,8 @@ class CaptureTruth(TypedDict):
     seed: int
     identity: str  # hash of spec, seed and code
     version: dict[str, str]
-    spec: dict[str, Any]  # as in a YAML spec
-    designed: dict[str, Any]  # `spec.Designed`
+    spec: dict[str, object]  # as in a YAML spec
+    designed: dict[str, object]  # `spec.Designed`
     mask: str  # what the masks mark, in words
     clean: str
     test: str
@@ -98,6 +98,6 @@ class CaptureTruth(TypedDict):
 
 
 class SimulatedCapture(CaptureTruth):
-    """`CaptureTruth`, and whether the capture existed."""
+    """`CaptureTruth`, and whether an existing capture was reused."""
 
     reused: bool

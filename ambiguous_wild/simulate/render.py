@@ -3,9 +3,9 @@
     light (time of day, moving shadow, polished surfaces) -> rays -> lens, shutter, blur -> defocus
     -> vignetting -> exposure -> white balance -> noise -> 8 bits -> JPEG
 
-A training photo and its clean version get the same effects with the same random numbers: before JPEG they
-are equal to the bit outside ``mask`` and ``shadow``. Test photos get only effects that are the same in all
-photos (specular, lens distortion).
+A training photo and its clean version get the same effects with the same random numbers, so before JPEG they
+have equal bits outside ``mask`` and ``shadow``. Test photos get only effects that are the same in all photos
+(specular, lens distortion).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ambiguous_wild.simulate.spec import CaptureSpec, Effects
 from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, linear_to_srgb, trace
 from ambiguous_wild.simulate.world import World
 
-_MAX_INSTANTS = 24  # of an exposure
+_MAX_INSTANTS = 24  # largest number of instants of an exposure
 ImageFilter = Callable[[np.ndarray], np.ndarray]
 
 
@@ -67,10 +67,10 @@ class PreparedPhoto:
 
     effects: Effects
     scene: _LitScene
-    camera: Camera  # of the rays; where an effect moves pixels, finer and larger than the photo's
+    camera: Camera  # for the rays; finer and larger than the photo's if an effect moves pixels
     distractors: ShapeTable
     move: ImageFilter | None  # effects that move pixels
-    drawn: DrawnEffects  # so far
+    drawn: DrawnEffects  # random values of the effects so far
 
 
 def render_photo(
@@ -79,7 +79,7 @@ def render_photo(
     """Render one photo: `prepare_photo`, `trace_photo` and `finish_photo`.
 
     Args:
-        spec: names the effects.
+        spec: gives the effects.
         world: the static world.
         planned: the camera and the placed distractors.
         random: random numbers of the effects.
@@ -91,7 +91,7 @@ def render_photo(
 def prepare_photo(
     spec: CaptureSpec, world: World, planned: PlannedPhoto, random: PhotoRandom
 ) -> PreparedPhoto:
-    """The steps before the rays."""
+    """Do the steps before the rays are traced."""
     effects = spec.effects if planned.split == "train" else _lasting(spec.effects)
     drawn: DrawnEffects = {}
     scene = _lit(effects, world, random, drawn)
@@ -101,7 +101,7 @@ def prepare_photo(
 
 
 def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
-    """Trace the rays. They use all cores: one photo at a time."""
+    """Trace the rays of one photo, on all cores."""
     scene = prepared.scene
     return trace(
         prepared.camera, scene.static, prepared.distractors, world.atlas, scene.light, scene.shadow_casters
@@ -111,7 +111,7 @@ def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
 def finish_photo(
     planned: PlannedPhoto, random: PhotoRandom, prepared: PreparedPhoto, traced: TracedPhoto
 ) -> RenderedPhoto:
-    """The steps after the rays."""
+    """Do the steps after the rays are traced."""
     effects, drawn = prepared.effects, prepared.drawn
     distracted, clean, owner, shadow = _moved(prepared.move, traced)
     sensor = _sensor(effects, planned.camera, random, drawn)
@@ -125,12 +125,12 @@ def finish_photo(
 
 
 def depth_m(world: World, camera: Camera) -> np.ndarray:
-    """z of the static surface in the pinhole camera, [H, W] float32, m."""
+    """Return z of the static surface in the pinhole camera, [H, W] float32, m."""
     return trace(camera, world.table(), _no_shapes(world), world.atlas, world.light).depth_m
 
 
 def _lasting(effects: Effects) -> Effects:
-    """The effects that are the same in all photos: those of test photos."""
+    """Return the effects that are the same in all photos, which test photos get too."""
     return Effects(specular=effects.specular, lens_distortion=effects.lens_distortion)
 
 
@@ -166,12 +166,12 @@ def _sky(shape: Shape, gain: np.ndarray) -> Shape:
 def _optics(
     effects: Effects, camera: Camera, light: Light, random: PhotoRandom, drawn: DrawnEffects
 ) -> tuple[ImageFilter | None, Camera, Light]:
-    """The filter from the traced to the photo's pixels (linear; None: the same), and the traced camera."""
+    """Return the linear filter from traced to the photo's pixels (None: identity), and the traced camera."""
     steps: list[ImageFilter] = []
     traced = camera
     shutter = (effects.rolling_shutter, effects.motion_blur)
     if effects.lens_distortion is not None or any(s is not None for s in shutter):
-        fine = math.isqrt(len(light.sun))  # the number of rays stays: one in each finer pixel
+        fine = math.isqrt(len(light.sun))  # one ray in each finer pixel, so the number of rays stays
         sources = _sources(effects, camera, fine, random, drawn)
         traced, border = fx.enlarged(camera, sources, fine)
         light = replace(light, sun=np.ascontiguousarray(light.sun[:1]))
@@ -196,7 +196,7 @@ def _optics(
 def _sources(
     effects: Effects, camera: Camera, fine: int, random: PhotoRandom, drawn: DrawnEffects
 ) -> list[np.ndarray]:
-    """Source of the photo's fine pixels in the pinhole camera, one array per instant of the exposure."""
+    """Return where the photo's fine pixels lie in the pinhole camera, one array per instant of exposure."""
     points = fx.fine_points(camera, fine)
     if effects.lens_distortion is not None:
         lens = effects.lens_distortion
@@ -225,7 +225,7 @@ def _sources(
 def _moved(
     move: ImageFilter | None, traced: TracedPhoto
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Distracted, clean, owner and shadow after moved pixels; equal bits where nothing differs."""
+    """Move the pixels of distracted, clean, owner and shadow; bits stay equal where nothing differs."""
     clean, owner, shadow = traced.clean, traced.owner, traced.shadow
     if move is None:
         return traced.distracted, clean, owner, shadow
@@ -241,17 +241,17 @@ def _moved(
     if shadow is not None:
         shadow = _support(move, shadow)
         touched = touched | shadow
-    # Copied, not computed: equal bits outside distractors and shadow.
+    # Copied, not computed, so that the bits are equal outside distractors and shadow.
     return np.where(touched[..., None], distracted, clean), clean, owner_moved, shadow
 
 
 def _support(move: ImageFilter, mask: np.ndarray) -> np.ndarray:
-    """Every pixel that a masked pixel contributes to, beyond rounding."""
+    """Return every pixel that a masked pixel contributes to, beyond rounding."""
     return np.asarray(move(mask.astype(np.float32)) > 1e-6)
 
 
 def _sensor(effects: Effects, camera: Camera, random: PhotoRandom, drawn: DrawnEffects) -> ImageFilter:
-    """Vignetting, exposure, white balance and noise as one filter."""
+    """Combine vignetting, exposure, white balance and noise into one filter."""
     steps: list[ImageFilter] = []
     if effects.vignetting is not None:
         falloff = effects.vignetting.falloff

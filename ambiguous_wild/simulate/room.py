@@ -32,13 +32,13 @@ from ambiguous_wild.simulate.world import (
 PLAN = PLANS["room"]
 WHITE = (2.0, 2.0, 2.0)  # tint of stone that gives painted wood
 CURTAIN = (0.42, 0.30, 0.12)
-# left, right, bottom and top in m, along the wall from its middle
+# Left, right, bottom and top of each window in m, along the wall from its middle.
 _WINDOWS = {"wall_left": (-1.4, 0.5, 0.95, 2.3), "wall_back": (1.2, 2.6, 0.95, 2.3)}
 Circle = tuple[float, float, float]
 
 
 def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
-    """Build the room; see `capture.build_world`."""
+    """Build the room; arguments as in `capture.build_world`."""
     d = detail_px_per_m
     wide, deep = PLAN.surfaces["wall_back"][0], PLAN.surfaces["wall_left"][0]
     hub = (float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.35, 0.5)), 0.0)
@@ -70,14 +70,14 @@ def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
         pedestal = [*parts_of("room pedestal"), *placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0)]
         shapes += placed(pedestal, hub, float(rng.uniform(-20, 20)))
     shapes += [s for thing in what.things for s in shapes_of_thing(thing, PLAN)]
-    # The sun comes in through the windows; light that walls throw back is part of the sky's.
+    # The sun comes in through the windows; light reflected by walls is part of the sky light.
     light = sunlight(rng, samples, (-178.0, -165.0), (26.0, 34.0), sky=1.4)
     keep_out = np.array(circles, float).reshape(-1, 3)
     return World(tuple(shapes), build_atlas(textures), light, keep_out, hub, PLAN)
 
 
 def _hull() -> list[Shape]:
-    """Walls around their windows, window frames, curtains, skirting, a door, a ceiling with a lamp."""
+    """Make walls around windows, window frames, curtains, skirting, a door, and a ceiling with a lamp."""
     shapes: list[Shape] = []
     for name in PLAN.walls:
         opening = _WINDOWS.get(name)
@@ -108,7 +108,7 @@ def _hull() -> list[Shape]:
 
 
 def _window(name: str, left: float, right: float, bottom: float, top: float) -> list[Shape]:
-    """Frame, bars and sill, and curtains on both sides."""
+    """Make frame, bars and sill of a window, and curtains on both sides."""
     frame: dict[str, Any] = {"tint": WHITE, "axes": WALL_AXES[name]}
     middle, height, wide, high = (
         (left + right) / 2,
@@ -155,7 +155,7 @@ def _pictures(rng: np.random.Generator) -> list[Shape]:
 
 
 def _books(rng: np.random.Generator, wide: float, high: float) -> list[Shape]:
-    """A row of books from x = 0 to `wide`, at most `high` tall."""
+    """Make a row of books from x = 0 to `wide`, at most `high` tall."""
     books, x = [], 0.02
     while x < wide - 0.03:
         thick, tall = rng.uniform(0.02, 0.055), high * rng.uniform(0.6, 0.95)
@@ -171,7 +171,7 @@ def _books(rng: np.random.Generator, wide: float, high: float) -> list[Shape]:
 
 
 def _shelf(rng: np.random.Generator, wide: float) -> list[Shape]:
-    """A bookcase, 2.05 m tall, that faces -y."""
+    """Make a bookcase, 2.05 m tall, that faces -y."""
     boards = [Shape(BOX, (0, 0, 0.05 + 0.4 * k), (wide / 2, 0.15, 0.015), "timber") for k in range(6)]
     sides = [Shape(BOX, (x, 0, 1.03), (0.02, 0.15, 1.03), "timber") for x in (-wide / 2, wide / 2)]
     back = Shape(BOX, (0, 0.145, 1.03), (wide / 2, 0.008, 1.03), "timber", tint=(0.6, 0.6, 0.6))
@@ -190,13 +190,13 @@ def _leaves(
     half: tuple[float, float, float],
     count: int,
 ) -> list[Shape]:
-    """A plant in a pot: `count` balls around its middle."""
+    """Make the leaves of a plant: `count` balls around its middle."""
     middles = [np.array(at) + rng.uniform(-reach, reach, 3) for _ in range(count)]
     return [Shape(ELLIPSOID, vector(middle), half, "foliage") for middle in middles]
 
 
 def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
-    """What stands in the room, and its circles on the floor."""
+    """Make the furniture, and its circles on the floor."""
     shapes: list[Shape] = [
         Shape(
             QUAD, (0.0, 0.2, 0.006), (1.5, 1.0, 0.0), "rug", mapping=PLANAR, scale=(1 / 3.0, 1 / 2.0),

@@ -1,10 +1,8 @@
-"""Primitives, and objects made of them: figure, pole, barrier, banner.
+"""Shapes: primitives, objects made of them (figure, pole, barrier, banner), and statues.
 
-Statues as signed distance functions, sampled on grids for sphere tracing.
-
-A volume fills the cube [-1, 1]^3 around a shape's centre, z up, foot at z = -0.9; the shape's half size
-scales it. Distances of a smooth union of primitives are a lower bound, nearly exact at the surface (Quilez,
-"distance functions").
+Statues are signed distance functions, sampled on grids for sphere tracing. A grid fills the cube [-1, 1]^3
+around a shape's centre, z up, foot at z = -0.9; the shape's half size scales it. Distances of a smooth union
+of primitives are a lower bound, nearly exact at the surface (Quilez, "distance functions").
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ Point = tuple[float, float, float]
 
 @cache
 def grid(name: str) -> np.ndarray:
-    """Signed distance of the named statue, [SIZE, SIZE, SIZE] float32 indexed z, y, x; read only."""
+    """Sample the named statue's signed distance, [SIZE, SIZE, SIZE] float32 indexed z, y, x; read-only."""
     axis = np.linspace(-1.0, 1.0, SIZE)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     values = np.asarray(STATUES[name](np.stack([x, y, z], -1)), np.float32)
@@ -35,13 +33,13 @@ def grid(name: str) -> np.ndarray:
 
 
 def grids(names: Iterable[str]) -> np.ndarray:
-    """The named volumes, [V, SIZE, SIZE, SIZE] float32; [0, 1, 1, 1] without names."""
+    """Stack the grids of named statues, [V, SIZE, SIZE, SIZE] float32; [0, 1, 1, 1] without names."""
     listed = [grid(name) for name in names]
     return np.stack(listed) if listed else np.zeros((0, 1, 1, 1), np.float32)
 
 
 def _ball(p: np.ndarray, at: Point, half: Point | float) -> np.ndarray:
-    """An ellipsoid, or a ball of one radius."""
+    """Distance to an ellipsoid, or to a ball of one radius."""
     h = np.broadcast_to(np.asarray(half, float), 3)
     q = p - at
     inner = np.linalg.norm(q / h, axis=-1)
@@ -50,20 +48,20 @@ def _ball(p: np.ndarray, at: Point, half: Point | float) -> np.ndarray:
 
 
 def _rod(p: np.ndarray, start: Point, end: Point, radius: float) -> np.ndarray:
-    """A capsule."""
+    """Distance to a capsule."""
     a, b = np.asarray(start), np.asarray(end)
     along = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
     return np.linalg.norm(p - a - along[..., None] * (b - a), axis=-1) - radius
 
 
 def _block(p: np.ndarray, at: Point, half: Point, round_off: float = 0.03) -> np.ndarray:
-    """A box with rounded edges."""
+    """Distance to a box with rounded edges."""
     q = np.abs(p - at) - (np.asarray(half) - round_off)
     return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - round_off
 
 
 def _joined(parts: Iterable[np.ndarray], soft: float = 0.08) -> np.ndarray:
-    """The smooth union (polynomial, of width `soft`)."""
+    """Distance to the smooth union of parts (polynomial, of width `soft`)."""
     listed = list(parts)
     total = listed[0]
     for part in listed[1:]:
@@ -73,7 +71,7 @@ def _joined(parts: Iterable[np.ndarray], soft: float = 0.08) -> np.ndarray:
 
 
 def _bust(p: np.ndarray) -> np.ndarray:
-    """Head and shoulders on a foot."""
+    """Distance to head and shoulders on a foot."""
     return _joined(
         [
             _block(p, (0, 0, -0.78), (0.3, 0.26, 0.12)),
@@ -91,7 +89,7 @@ def _bust(p: np.ndarray) -> np.ndarray:
 
 
 def _knot(p: np.ndarray) -> np.ndarray:
-    """A trefoil knot on a slab."""
+    """Distance to a trefoil knot on a slab."""
     t = np.linspace(0, 2 * np.pi, 61)
     curve = 0.2 * np.stack(
         [np.sin(t) + 2 * np.sin(2 * t), -np.sin(3 * t), np.cos(t) - 2 * np.cos(2 * t)], axis=-1
@@ -101,7 +99,7 @@ def _knot(p: np.ndarray) -> np.ndarray:
 
 
 def _hound(p: np.ndarray) -> np.ndarray:
-    """A sitting dog that looks ahead (-y)."""
+    """Distance to a sitting dog that looks ahead (-y)."""
     legs = [_rod(p, (x, -0.28, -0.1), (x, -0.3, -0.75), 0.075) for x in (-0.15, 0.15)]
     thighs = [_ball(p, (x, 0.2, -0.55), (0.13, 0.3, 0.24)) for x in (-0.22, 0.22)]
     ears = [_rod(p, (x, -0.16, 0.62), (1.3 * x, -0.1, 0.8), 0.05) for x in (-0.13, 0.13)]
@@ -121,7 +119,7 @@ def _hound(p: np.ndarray) -> np.ndarray:
 
 
 def _spire(p: np.ndarray) -> np.ndarray:
-    """A square column that twists and narrows upwards."""
+    """Distance to a square column that twists and narrows upwards."""
     z = p[..., 2]
     angle, width = 1.8 * z, np.clip(0.38 - 0.17 * z, 0.1, 0.6)
     c, s = np.cos(angle), np.sin(angle)
@@ -139,7 +137,7 @@ STATUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 UNSEEN = -1  # owner of an invisible shadow caster
-SHEET_M = 2.0  # side of the square that an object's texture covers before it is mirrored
+SHEET_M = 2.0  # side of the square that an object's texture covers before it repeats mirrored
 
 Vector = tuple[float, float, float]
 Axes = tuple[Vector, ...]
@@ -165,7 +163,7 @@ class Shape:
 
 
 def bounding_radius(kind: int, half: Sequence[float]) -> float:
-    """Radius of the bounding sphere around the shape's centre, m."""
+    """Return the radius of the bounding sphere around the shape's centre, m."""
     if kind == QUAD:
         return float(np.hypot(half[0], half[1]))
     if kind == ELLIPSOID:
@@ -178,7 +176,7 @@ def bounding_radius(kind: int, half: Sequence[float]) -> float:
 
 
 def shape_table(shapes: Iterable[Shape], atlas: Atlas) -> ShapeTable:
-    """The shapes as columns for the ray caster."""
+    """Convert shapes to columns for the ray caster."""
     listed = list(shapes)
     count = len(listed)
     names = sorted({s.volume for s in listed if s.volume})
@@ -208,7 +206,7 @@ def between(
     kind: int = CAPSULE,
     **more: Any,
 ) -> Shape:
-    """A capsule (or cylinder) from one point to another."""
+    """Make a capsule (or cylinder) from one point to another."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     z = (b - a) / np.linalg.norm(b - a)
     x = np.cross((0.0, 1.0, 0.0) if abs(z[1]) < 0.9 else (1.0, 0.0, 0.0), z)
@@ -220,13 +218,13 @@ def between(
 
 
 def vector(values: Iterable[float]) -> Vector:
-    """Three numbers as a tuple of floats."""
+    """Convert three numbers to a tuple of floats."""
     x, y, z = (float(v) for v in values)
     return x, y, z
 
 
 def placed(shapes: Iterable[Shape], at: Sequence[float], yaw_deg: float, size: float = 1.0) -> list[Shape]:
-    """The shapes turned about z, scaled and moved to `at`, with their textures."""
+    """Turn shapes about z, scale them and move them to `at`, with their textures."""
     c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     moved = []
@@ -245,7 +243,7 @@ def placed(shapes: Iterable[Shape], at: Sequence[float], yaw_deg: float, size: f
 
 
 def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: float = 1.0) -> list[Shape]:
-    """A standing person, 1.75 m, facing -y, feet at the origin.
+    """Make a standing person, 1.75 m, facing -y, feet at the origin.
 
     Args:
         body: texture of clothes and limbs.
@@ -278,13 +276,13 @@ def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: f
 
 
 def pole(texture: str) -> list[Shape]:
-    """A pole of 2 m, 5 cm thick, on a small foot."""
+    """Make a pole of 2 m, 5 cm thick, on a small foot."""
     foot = Shape(BOX, (0, 0, 0.02), (0.14, 0.14, 0.02), texture)
     return [between((0, 0, 0.03), (0, 0, 2.0), 0.025, texture), foot]
 
 
 def barrier(texture: str) -> list[Shape]:
-    """Two posts of 1 m, 1.5 m apart, and a rope of 3 cm that sags between them."""
+    """Make two posts of 1 m, 1.5 m apart, and a rope of 3 cm that sags between them."""
     posts = [between((x, 0, 0.02), (x, 0, 1.0), 0.022, texture) for x in (-0.75, 0.75)]
     feet = [Shape(BOX, (x, 0, 0.015), (0.12, 0.12, 0.015), texture) for x in (-0.75, 0.75)]
     x = np.linspace(-0.75, 0.75, 9)
@@ -294,6 +292,6 @@ def barrier(texture: str) -> list[Shape]:
 
 
 def banner(texture: str) -> list[Shape]:
-    """A strip of cloth, 1.3 x 0.26 m, held up by two sticks of 2 cm."""
+    """Make a strip of cloth, 1.3 x 0.26 m, held up by two sticks of 2 cm."""
     sticks = [between((x, 0, 0.02), (x, 0, 1.75), 0.012, texture) for x in (-0.62, 0.62)]
     return [Shape(BOX, (0, 0, 1.6), (0.65, 0.008, 0.13), texture), *sticks]

@@ -1,6 +1,6 @@
 """The spec of a capture, as frozen dataclasses that a YAML file fills, and the places by name.
 
-World axes: x right, y away from the walk, z up; metres; the ground is z = 0. Imports nothing heavy.
+World axes: x right, y away from the walk, z up; metres; the ground is z = 0.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ STATUES = ("bust", "knot", "hound", "spire")  # signed-distance shapes, in the w
 
 @dataclass(frozen=True)
 class Designed:
-    """Label of a capture: the result that a measurement of it should give."""
+    """Label of a capture: the result that measuring it should give."""
 
     ambiguity: Literal["colour", "semantic", "both", "neither", "unstated"] = "unstated"
     effects: tuple[
@@ -45,15 +45,15 @@ class Designed:
 
 @dataclass(frozen=True)
 class Distractor:
-    """Something that has another place in every photo, or walks through the capture."""
+    """An object that has another place in every photo, or walks through the capture."""
 
     name: str
     kind: Kind
     texture: str  # stone, foliage, brick, ...; for a placard any texture of the world
     ambiguity: Ambiguity  # why it is hard: the background's colour, the statue's shape, or not at all
     head: str = ""  # texture of a visitor's head and hands; empty: the same
-    # share of the train photos that show it; with path "elsewhere" and `occlusion` above 0, share of the
-    # layouts drawn, from which `occlusion` chooses
+    # Share of the train photos that show it; with path "elsewhere" and `occlusion` above 0, share of the
+    # layouts drawn, from which `occlusion` chooses.
     presence: float = 0.85
     distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; for a walker only the minimum counts
     size: float = (
@@ -75,7 +75,7 @@ class Thing:
     kind: ThingKind
     texture: str
     at_m: tuple[float, float, float]  # middle of its foot: x to the right, y away from the walk, z up
-    # width, depth, height; statues take the height, a car the width as its length
+    # Width, depth, height; of a statue only the height is used, of a car only the width, as its length.
     size_m: tuple[float, float, float] = (1.0, 1.0, 1.0)
     yaw_deg: float = 0.0
     tint: Colour = (1.0, 1.0, 1.0)
@@ -83,7 +83,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class WorldSpec:
-    """A place: its ground and walls, and these objects."""
+    """A place, with its ground and walls, and the objects in it."""
 
     place: Place = "courtyard"
     furniture: bool = (
@@ -156,7 +156,7 @@ class Defocus:
 
 @dataclass(frozen=True)
 class Jpeg:
-    """Photos compressed once more, as by a messenger; colour at half the resolution."""
+    """Photos are compressed once more, as by a messenger, with colour at half the resolution."""
 
     quality: tuple[int, int] = (30, 55)  # 1 to 95, drawn anew for every photo
 
@@ -243,8 +243,8 @@ class GroundPlan:
     """A rectangle with walls."""
 
     ground_m: tuple[float, float]  # of the ground's texture, centred on the origin
-    x_m: tuple[float, float]  # of the inside
-    y_m: tuple[float, float]
+    x_m: tuple[float, float]  # range of the inside
+    y_m: tuple[float, float]  # range of the inside
     wall_m: float  # height
     walls: tuple[str, ...] = SURFACE_NAMES[1:]
     ceiling: bool = False
@@ -258,16 +258,16 @@ class GroundPlan:
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Centre of the inside."""
+        """Centre of the inside, m."""
         return (self.x_m[0] + self.x_m[1]) / 2, (self.y_m[0] + self.y_m[1]) / 2
 
     @property
     def highest_m(self) -> float:
-        """Of a camera."""
+        """Greatest height of a camera, m."""
         return self.wall_m - 0.3 if self.ceiling else 3.3
 
     def gap(self, x: float, y: float) -> float:
-        """Distance to the nearest wall, m; the open side of the courtyard counts as one. Negative outside."""
+        """Return the distance to the nearest wall, m, negative outside; an open side counts as wall."""
         return min(x - self.x_m[0], self.x_m[1] - x, y - self.y_m[0], self.y_m[1] - y)
 
 

@@ -1,4 +1,4 @@
-"""Specs as YAML: strict reading with a check of every number and name, lossless writing."""
+"""Read and write specs as YAML: reading checks every number and name, writing loses nothing."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ class _Dumper(yaml.SafeDumper):
 
 
 def is_spec_file(name: str) -> bool:
-    """Whether the word names a file rather than a preset."""
+    """Tell whether a word names a file rather than a preset."""
     return name.lower().endswith((".yaml", ".yml")) or "/" in name
 
 
 def read_spec(path: Path | str) -> CaptureSpec:
-    """The capture that a YAML file describes.
+    """Read the spec of a capture from a YAML file.
 
     Raises:
-        AwError: no such file, no YAML, or a wrong value; names the place.
+        AwError: no such file, no YAML, or a wrong value; the message names its place.
     """
     where = Path(path)
     text = plain_yaml.read_text(where)
@@ -59,7 +59,7 @@ def read_spec(path: Path | str) -> CaptureSpec:
 
 
 def parse_spec(text: str) -> CaptureSpec:
-    """The capture that YAML text describes.
+    """Read the spec of a capture from YAML text.
 
     Raises:
         AwError: no YAML, an unknown key, a wrong type or a value out of range.
@@ -71,7 +71,7 @@ def parse_spec(text: str) -> CaptureSpec:
 
 
 def spec_of(data: dict[Any, Any]) -> CaptureSpec:
-    """The capture that plain data describes; raises like `parse_spec`."""
+    """Convert plain data to a spec; raises like `parse_spec`."""
     _lists(data)
     rest = {str(key): value for key, value in data.items() if key != "effects"}
     spec = from_plain(CaptureSpec, rest, "spec")
@@ -79,7 +79,7 @@ def spec_of(data: dict[Any, Any]) -> CaptureSpec:
 
 
 def _lists(data: dict[Any, Any]) -> None:
-    """Refuse single values where lists are needed: `from_plain` would wrap them."""
+    """Refuse single values where lists are needed, because `from_plain` would wrap them."""
     world = data.get("world", {})
     if not isinstance(world, Mapping):
         raise AwError(f"world: keys below it, got {world!r}")
@@ -110,18 +110,18 @@ def _read_effects(named: Any) -> Effects:
 
 
 def dump_spec(spec: CaptureSpec) -> str:
-    """The spec as YAML with every value; `parse_spec` returns an equal spec."""
+    """Write the spec as YAML with every value; `parse_spec` returns an equal spec."""
     return yaml.dump(plain_spec(spec), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
 def plain_spec(spec: CaptureSpec) -> dict[str, Any]:
-    """The spec as dicts, lists and scalars; effects that are None are left out."""
+    """Convert the spec to dicts, lists and scalars; effects that are None are left out."""
     data: dict[str, Any] = to_plain(spec)
     data["effects"] = {name: value for name, value in data["effects"].items() if value is not None}
     return data
 
 
-# Textures that `world.py` bakes (a test compares the two lists).
+# Textures that `world.py` bakes; a test compares the two lists.
 SHEET_NAMES = (
     "stone",
     "foliage",
@@ -140,9 +140,9 @@ PICTURES = tuple(
     f"poster_{name}" for name in ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 )
 
-MOST = 255  # distractors: the ray caster stores a pixel's distractor in a byte
+MOST = 255  # largest number of distractors, as the ray caster stores a pixel's distractor in a byte
 
-# Least and greatest value; of a pair the smaller number comes first.
+# Least and greatest value of each number; in pairs the smaller number comes first.
 Limits = dict[str, tuple[float, float]]
 _SPEC: Limits = {
     "train_views": (3, 2000),
@@ -187,7 +187,7 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
     """Return the spec, or refuse it.
 
     Raises:
-        AwError: the first wrong value: where it is, what it is, what is allowed.
+        AwError: the first wrong value, with its place and what is allowed.
     """
     plan = PLANS[spec.world.place]
     if not spec.name or not all(c.isalnum() or c in "-_" for c in spec.name):
@@ -201,7 +201,7 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
         if not distractor.name.strip():
             raise AwError(f"distractors[{k}].name: empty; capture.json lists the placed distractors by name")
         if distractor.name in (d.name for d in spec.distractors[:k]):
-            raise AwError(f"distractors[{k}].name: {distractor.name!a} is there twice; give each its own")
+            raise AwError(f"distractors[{k}].name: {distractor.name!a} occurs twice; give each its own")
         _distractor(f"distractors[{k}].", distractor, plan)
     for k, thing in enumerate(spec.world.things):
         _thing(f"world.things[{k}].", thing, plan)
@@ -224,7 +224,7 @@ def _lens(spec: CaptureSpec, lens: LensDistortion) -> None:
     r = np.linspace(0.0, 4.0 * corner, 4001)
     bent = r * (1 + lens.k1 * r**2 + lens.k2 * r**4)
     until = int(np.argmax(np.diff(bent) <= 0)) if (np.diff(bent) <= 0).any() else len(r) - 1
-    if bent[until] < 1.02 * corner:  # a moving hand looks a little further
+    if bent[until] < 1.02 * corner:  # a moving hand looks a little beyond the corner
         raise AwError(
             f"effects.lens_distortion: k1 {lens.k1:g}, k2 {lens.k2:g} fold the picture inside its corners at "
             f"focal_35mm {spec.focal_35mm:g}, zoom {spec.zoom[0]:g}; raise the focal length or lower k1, k2"
@@ -259,7 +259,7 @@ def _thing(where: str, thing: Thing, plan: GroundPlan) -> None:
 
 
 def _within(where: str, record: Any, limits: Limits) -> None:
-    """Check a record's numbers, in tuples each, and the order of pairs."""
+    """Check a record's numbers, each number of a tuple too, and the order of pairs."""
     for key, (low, high) in limits.items():
         value = getattr(record, key)
         for number in value if isinstance(value, tuple) else (value,):
@@ -277,6 +277,6 @@ def _between(where: str, value: float, low: float, high: float) -> None:
         raise AwError(f"{where}: between {low:g} and {high:g}, got {text}")
 
 
-def _texture(where: str, name: str, known: Sequence[str]) -> None:
-    if name not in known:
-        raise unknown(f"texture in {where}", name, known)
+def _texture(where: str, name: str, textures: Sequence[str]) -> None:
+    if name not in textures:
+        raise unknown(f"texture in {where}", name, textures)

@@ -1,4 +1,4 @@
-"""Textures from photographs that scikit-image ships, without repetition.
+"""Textures made of photographs in scikit-image, without repetition.
 
 In a tiled photograph COLMAP would match a brick with its copy; blended layers and noise make every square
 metre different.
@@ -34,7 +34,7 @@ Colour = tuple[float, float, float]  # linear light
 
 @cache
 def photograph(name: str) -> np.ndarray:
-    """A shipped photograph, [H, W, 3] float32 in [0, 1], sRGB; read only.
+    """Read a photograph of scikit-image, [H, W, 3] float32 in [0, 1], sRGB; read-only.
 
     Raises:
         AwError: this scikit-image has no such file.
@@ -72,7 +72,7 @@ def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, c
             break
         total += noise(rng, height, width, cell_px / 2**k) * 0.6**k
         weight += 0.6**k
-    if weight == 0.0:  # finer than the texture: only the mean is left
+    if weight == 0.0:  # the noise is finer than the texture, so only its mean is left
         return np.full((height, width), 0.5, np.float32)
     return np.asarray(total / weight, dtype=np.float32)
 

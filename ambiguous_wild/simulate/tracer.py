@@ -1,7 +1,8 @@
 """The ray caster: one pass renders the photo with distractors and the clean photo.
 
-Both share every static sample: they differ only where a ray hits a distractor or a moving shadow falls.
-Each tile lists the shapes whose bounding sphere its cone of rays can touch, so a sample tests few shapes.
+The two photos share every static sample, so they differ only where a ray hits a distractor or a moving
+shadow falls. Each tile lists the shapes whose bounding sphere its cone of rays can touch, so that a sample
+tests few shapes.
 """
 
 from __future__ import annotations
@@ -35,18 +36,18 @@ class Atlas:
 
 
 def srgb_to_linear(image: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def linear_to_srgb(image: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB, clipped to [0, 1] (IEC 61966-2-1)."""
+    """Convert linear light to sRGB, clipped to [0, 1] (IEC 61966-2-1)."""
     clipped = np.clip(image, 0.0, 1.0)
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
 
 
 def build_atlas(textures: Mapping[str, np.ndarray]) -> Atlas:
-    """Mip pyramids by area averaging, in linear light.
+    """Build mip pyramids by area averaging, in linear light.
 
     Args:
         textures: name -> [H, W, 3] float32, linear light.
@@ -92,7 +93,7 @@ class ShapeTable:
     grids: np.ndarray  # [V, N, N, N] float32, signed distances
 
     def columns(self) -> tuple[np.ndarray, ...]:
-        """The arrays in the order of the kernel's arguments."""
+        """Return the arrays in the order of the kernel's arguments."""
         return (
             self.kind,
             self.rotation,
@@ -179,7 +180,7 @@ def _empty_table(table: ShapeTable) -> ShapeTable:
 @rebuild_damaged_cache
 @numba.njit(cache=True, error_model="numpy", inline="never")
 def _cull(table, o, axis, spread, keep):
-    """List the shapes whose bounding sphere meets the cone around `axis`; returns their number."""
+    """List the shapes whose bounding sphere meets the cone around `axis`, and return their number."""
     center, radius = table[2], table[4]
     count = 0
     for s in range(len(radius)):
@@ -281,7 +282,7 @@ def _tile(view, box, static, movers, shadow_casters, atlas, light, frame):
                         hit = movers[10][m] if hit == 0 else hit
                 mr, mg, mb = mr + seen[0], mg + seen[1], mb + seen[2]
             clean[i, j, 0], clean[i, j, 1], clean[i, j, 2] = cr * share, cg * share, cb * share
-            # Copied, not computed: equal bits where there is no distractor.
+            # Copied, not computed, so that the bits are equal where there is no distractor.
             distracted[i, j, 0], distracted[i, j, 1] = sr * share, sg * share
             distracted[i, j, 2] = sb * share
             for a in range(3):

@@ -1,6 +1,6 @@
-"""A place: static shapes, textures and light; what all places share.
+"""A simulated place: static shapes, textures and light, and the parts that all places share.
 
-Objects of places and specs: those of `objects.yaml`, boxes, balls, columns, boards, statues, cars.
+Objects that places and specs use: those of `objects.yaml`, boxes, balls, columns, boards, statues, cars.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable
 
 
 def statue(name: str, texture: str, height_m: float) -> Shape:
-    """A signed-distance statue at the origin."""
-    half = height_m / 1.8  # its foot is at -0.9 of the half size
+    """Make a signed-distance statue at the origin."""
+    half = height_m / 1.8  # the foot is at -0.9 of the half size
     return Shape(VOLUME, (0, 0, 0.9 * half), (half, half, half), texture, mapping=BY_FACE, volume=name)
 
 
 def board(
     texture: str, width_m: float, height_m: float, thick_m: float, plan: GroundPlan, lift_m: float = 0.0
 ) -> Shape:
-    """An upright board that faces -y. A poster covers it once; of another texture it shows a part.
+    """Make an upright board that faces -y. A poster covers it once; of other textures it shows a part.
 
-    Of a wall it shows the part at its own height, so it looks like the wall behind it.
+    With the texture of a wall it shows the part at its height, so it looks like the wall behind it.
     """
     half = (width_m / 2, thick_m / 2, height_m / 2)
     middle = (0.0, 0.0, lift_m + height_m / 2)
@@ -56,13 +56,13 @@ def board(
 
 
 def placard(texture: str, plan: GroundPlan) -> list[Shape]:
-    """A board of 1.1 x 0.85 m on two sticks, 0.75 m above the ground."""
+    """Make a board of 1.1 x 0.85 m on two sticks, 0.75 m above the ground."""
     sticks = [between((x, 0.03, 0.02), (x, 0.03, 1.5), 0.018, "timber") for x in (-0.45, 0.45)]
     return [board(texture, 1.1, 0.85, 0.03, plan, 0.75), *sticks]
 
 
 def car(texture: str, length_m: float = 4.1) -> list[Shape]:
-    """A small car at the origin that faces +x: body, glass, wheels, lamps."""
+    """Make a small car at the origin that faces +x: body, glass, wheels, lamps."""
     return placed(parts_of("car", texture), (0, 0, 0), 0.0, length_m / 4.1)
 
 
@@ -72,7 +72,7 @@ def _objects() -> dict[str, list[dict[str, Any]]]:
 
 
 def parts_of(name: str, texture: str = "") -> list[Shape]:
-    """An object of `objects.yaml` at the origin; `texture` is its own."""
+    """Make an object of `objects.yaml` at the origin; parts without a texture get `texture`."""
     shapes = []
     for part in _objects()[name]:
         shown = texture if part["texture"] == "own" else part["texture"]
@@ -87,7 +87,7 @@ def parts_of(name: str, texture: str = "") -> list[Shape]:
 
 
 def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
-    """The thing's shapes in the world."""
+    """Make the shapes of a thing of the spec, in the world."""
     width, depth, height = thing.size_m
     half = (width / 2, depth / 2, height / 2)
     middle = (0.0, 0.0, height / 2)
@@ -104,7 +104,7 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
     else:
         parts = [Shape(ELLIPSOID if thing.kind == "ball" else BOX, middle, half, thing.texture)]
     tint = thing.tint
-    # Each object shows another part of its texture: two of the same stone differ.
+    # Each object shows another part of its texture, so that two of the same stone differ.
     shift = (0.37 * thing.at_m[0], 0.29 * thing.at_m[1])
     parts = [
         replace(
@@ -120,7 +120,7 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
 
 
 def circle_of(thing: Thing) -> tuple[float, float, float]:
-    """x, y and radius on the ground, m, where no distractor may stand."""
+    """Return x, y and radius in m of the circle on the ground in which no distractor may stand."""
     width, depth, height = thing.size_m
     if thing.kind in STATUES or thing.kind == "figure":
         return (thing.at_m[0], thing.at_m[1], 0.3 * height)
@@ -129,8 +129,8 @@ def circle_of(thing: Thing) -> tuple[float, float, float]:
 
 POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 
-# Textures of objects and distractors; `brick` and `gravel` are those of the courtyard's walls and ground,
-# `plaster` of the room's walls, `asphalt` of the yard's ground.
+# Textures of objects and distractors; `brick` and `gravel` also cover the courtyard's walls and ground,
+# `plaster` the room's walls, `asphalt` the yard's ground.
 SHEETS = {
     "stone": tx.stone,
     "foliage": tx.foliage,
@@ -145,7 +145,7 @@ SHEETS = {
     "asphalt": built.asphalt,
     "enamel": built.enamel,
 }
-# With random streams of their own: a sheet that is added changes no bit of other captures.
+# These have random streams of their own, so that adding a sheet changes no bit of other captures.
 _LATER_SHEETS = ("cloth", "plaster", "asphalt", "enamel")
 
 # Local axes of the walls: along the wall, up, inwards.
@@ -165,16 +165,16 @@ class World:
     atlas: Atlas
     light: Light
     keep_out: np.ndarray  # [N, 3] float64: x, y, radius in m
-    hub: tuple[float, float, float]  # m: foot of what the cameras walk around, or where they stand
+    hub: tuple[float, float, float]  # m: point on the ground that the cameras walk around
     plan: GroundPlan
 
     def table(self) -> ShapeTable:
-        """The static shapes for the ray caster."""
+        """Return the static shapes as a table for the ray caster."""
         return shape_table(self.shapes, self.atlas)
 
 
 def baked_sheets(rng: np.random.Generator, detail_px_per_m: float) -> Callable[[], dict[str, np.ndarray]]:
-    """Draws the streams of the later sheets now; the call bakes all sheets."""
+    """Draw the random streams of the later sheets now, and return a function that bakes all sheets."""
     later = dict(zip(_LATER_SHEETS, rng.spawn(len(_LATER_SHEETS))))
 
     def bake() -> dict[str, np.ndarray]:
@@ -194,13 +194,13 @@ def surface(
     axes: Axes,
     casts: bool,
 ) -> Shape:
-    """A quad that the texture covers once."""
+    """Make a quad that the texture covers once."""
     scale = (0.5 / half[0], 0.5 / half[1])
     return Shape(QUAD, center, (*half, 0.0), texture, axes, PLANAR, scale, (0.5, 0.5), casts=casts)
 
 
 def ground_and_sky(plan: GroundPlan) -> list[Shape]:
-    """The ground and a dome around it."""
+    """Make the ground and a dome around it."""
     return [
         surface((0, 0, 0), (plan.ground_m[0] / 2, plan.ground_m[1] / 2), "ground", Shape.axes, False),
         Shape(ELLIPSOID, (0, 0, -0.5), (26.0, 26.0, 26.0), "sky", mapping=DOME, casts=False),
@@ -208,7 +208,7 @@ def ground_and_sky(plan: GroundPlan) -> list[Shape]:
 
 
 def box(center: Sequence[float], half: Sequence[float], yaw_deg: float, texture: str, **more: Any) -> Shape:
-    """A box turned about z."""
+    """Make a box turned about z."""
     shape = Shape(BOX, (0, 0, 0), vector(half), texture, **more)
     return placed([shape], center, yaw_deg)[0]
 
@@ -216,11 +216,11 @@ def box(center: Sequence[float], half: Sequence[float], yaw_deg: float, texture:
 def wall(
     plan: GroundPlan, name: str, openings: Sequence[tuple[float, float, float, float]] = ()
 ) -> list[Shape]:
-    """A wall as quads around its openings.
+    """Make a wall of quads around its openings.
 
     Args:
-        plan: of the place.
-        name: of the wall; also its texture.
+        plan: ground plan of the place.
+        name: name of the wall, and of its texture.
         openings: each (left, right, bottom, top) in m, along the wall from its middle, and from the ground.
     """
     across, up = plan.surfaces[name]
@@ -251,7 +251,7 @@ def wall(
 def on_wall(
     plan: GroundPlan, name: str, along_m: float, height_m: float, out_m: float = 0.02
 ) -> tuple[float, float, float]:
-    """A point before a wall: metres along it from its middle, above the ground, and away from it."""
+    """Return a point in front of a wall: along it from its middle, above the ground, and away from it, m."""
     along, _, inwards = (np.array(a, float) for a in WALL_AXES[name])
     span = plan.y_m if name in ("wall_back", "wall_front") else plan.x_m
     foot = np.array([*plan.middle, 0.0]) - inwards * ((span[1] - span[0]) / 2 - out_m)
@@ -259,7 +259,7 @@ def on_wall(
 
 
 def poster(name: str, at: tuple[float, float, float], axes: Axes, half_m: float = 0.55) -> Shape:
-    """A shipped photograph with a border, as a sheet of paper."""
+    """Make a sheet of paper with one of scikit-image's photographs and a border."""
     h, w = tx.photograph(name).shape[:2]
     return surface(at, (half_m, half_m * h / w), f"poster_{name}", axes, False)
 
@@ -267,7 +267,7 @@ def poster(name: str, at: tuple[float, float, float], axes: Axes, half_m: float 
 def shade_feet(
     ground: np.ndarray, circles: Iterable[Sequence[float]], px_per_m: float, plan: GroundPlan
 ) -> None:
-    """Darken the ground, in place, at the foot of walls and objects; without rays."""
+    """Darken the ground at the foot of walls and objects, in place and without tracing rays."""
     h, w = ground.shape[:2]
     x = (np.arange(w, dtype=np.float32) + 0.5) / px_per_m - plan.ground_m[0] / 2
     y = (np.arange(h, dtype=np.float32) + 0.5) / px_per_m - plan.ground_m[1] / 2
@@ -287,7 +287,7 @@ def sunlight(
     elevation_deg: tuple[float, float] = (44.0, 54.0),
     sky: float = 1.0,
 ) -> Light:
-    """An afternoon sun, by default from behind left, 0.024 rad wide, and a blue sky of that strength."""
+    """Make an afternoon sun 0.024 rad wide, by default from behind left, and a blue sky of strength `sky`."""
     azimuth, elevation = np.deg2rad(rng.uniform(*azimuth_deg)), np.deg2rad(rng.uniform(*elevation_deg))
     side, spread, sun = math.isqrt(samples), 0.024, []
     for n in range(side * side):

@@ -52,7 +52,7 @@ Circle = tuple[float, float, float]
 
 
 def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
-    """Build the yard; see `capture.build_world`."""
+    """Build the yard; arguments as in `capture.build_world`."""
     d = detail_px_per_m
     hub = (float(rng.uniform(-0.4, 0.4)), float(rng.uniform(-0.4, 0.4)), 0.0)
     shapes, circles = _standing(rng)
@@ -86,7 +86,7 @@ def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
 
 
 def _fronts(rng: np.random.Generator) -> list[Shape]:
-    """Four house fronts with cornices, roofs' edges and a few bills on the walls."""
+    """Make four house fronts with cornices, roof edges and a few bills on the walls."""
     shapes: list[Shape] = []
     for k, name in enumerate(PLAN.walls):
         across, up = PLAN.surfaces[name]
@@ -103,7 +103,7 @@ def _fronts(rng: np.random.Generator) -> list[Shape]:
 
 
 def _tree(rng: np.random.Generator) -> list[Shape]:
-    """A tree of about 5 m."""
+    """Make a tree of about 5 m."""
     height = rng.uniform(1.9, 2.4)
     shapes = [between((0, 0, 0), (0.08, 0.04, height), 0.13, "timber", offset=(0.4, 0.1))]
     for _ in range(4):
@@ -119,7 +119,7 @@ def _tree(rng: np.random.Generator) -> list[Shape]:
 
 
 def _standing(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
-    """Cars, trees, lamp posts, bins, a bench; and their circles on the ground."""
+    """Make cars, trees, lamp posts, bins and a bench, and their circles on the ground."""
     shapes: list[Shape] = []
     circles: list[Circle] = []
     for x, y, yaw, paint in _PARKED:

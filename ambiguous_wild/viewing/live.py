@@ -1,7 +1,7 @@
 """Watch a training in a browser: renders, masks, the loss; pause and step. Needs viser (extra [view]).
 
-Everything is drawn in `tick`, between two steps and in the trainer's own thread; the browser's callbacks only
-leave wishes. What is drawn changes nothing: the run ends with the same bits (a test compares them).
+Everything is drawn in `tick`, between two steps and in the trainer's thread; the browser's callbacks only set
+requests. Drawing changes nothing: the run ends with the same bits, which a test compares.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.trainer import Trainer
 
 _WIDTH = 480  # px of a picture that is sent
-_WAIT_S = 0.1  # between looks at wishes while paused
-_POINTS = 20_000  # of the sparse model, at most
-_ROWS = 2000  # of the loss curve, at most
+_WAIT_S = 0.1  # between checks for requests while paused
+_POINTS = 20_000  # largest number of points of the sparse model
+_ROWS = 2000  # largest number of points of the loss curve
 _RED = np.array([255.0, 0.0, 0.0])
 
 
 def require_viser() -> Any:
-    """The viser module.
+    """Import viser.
 
     Raises:
-        AwError: it is not installed; gives the command.
+        AwError: it is not installed; the message gives the command.
     """
     try:
         import viser
@@ -70,7 +70,7 @@ class LiveView:
         self._losses: list[tuple[int, float]] = []
         self._controls()
 
-    # -- what people set; called in viser's threads -------------------------------------------------
+    # -- requests of the user; called in viser's threads --------------------------------------------
 
     def _controls(self) -> None:
         gui = self._server.gui
@@ -103,7 +103,7 @@ class LiveView:
         self._ask()
 
     def pause(self, on: bool) -> None:
-        """Pause after the step that is under way, or go on."""
+        """Pause after the current step, or continue."""
         with self._woken:
             self._paused = on
             self._woken.notify_all()
@@ -111,7 +111,7 @@ class LiveView:
         self._step.disabled = not on
 
     def step(self) -> None:
-        """One more step while paused."""
+        """Make one more step while paused."""
         with self._woken:
             self._steps += 1
             self._woken.notify_all()
@@ -128,7 +128,7 @@ class LiveView:
     # -- called in the trainer's thread ------------------------------------------------------------
 
     def tick(self, trainer: Trainer) -> None:
-        """Show the model as it stands where that is due; wait while paused."""
+        """Show the present model if a picture is due; wait while paused."""
         if trainer is not self._trainer:
             self._begin(trainer)
         timeline = trainer.timeline
@@ -151,7 +151,7 @@ class LiveView:
                 self._draw(trainer)
 
     def end(self, text: str) -> None:
-        """Say what became of the run."""
+        """Show how the run ended."""
         self._status.content = html.escape(text)
 
     def stop(self) -> None:
@@ -160,7 +160,7 @@ class LiveView:
         self._server.stop()
 
     def _begin(self, trainer: Trainer) -> None:
-        """Cameras and sparse points of the run's scene."""
+        """Show cameras and sparse points of the run's scene."""
         self._trainer, self._losses = trainer, []
         scene = trainer.data.scene
         self._views = {f"{v.split}: {v.name}": v for v in (*scene.test, *scene.train)}
@@ -212,7 +212,7 @@ class LiveView:
             camera = _camera_of(client.camera)
             if camera is not None:
                 client.scene.set_background_image(self._picture(trainer, camera), format="jpeg")
-        trainer.clock.parts_s = spent  # looking is no part of training
+        trainer.clock.parts_s = spent  # time for viewing does not count as training
         rows = self._losses[:: max(1, len(self._losses) // _ROWS)]
         if len(rows) > 1:
             self._plot.data = tuple(np.array(column, np.float64) for column in zip(*rows))
@@ -226,7 +226,7 @@ class LiveView:
         return to_uint8(trainer.picture(camera).cpu().numpy())
 
     def _photo(self, trainer: Trainer, name: str, path: Path) -> np.ndarray:
-        """The photo; what the method masks now is red."""
+        """Return the photo with the pixels that the method masks now in red."""
         photo = read_png_rgb(path)
         if name not in self._train:
             return photo
@@ -241,7 +241,7 @@ class LiveView:
 
 
 def _camera_of(seen: Any) -> Camera | None:
-    """A browser's camera in our terms; None where it has not told yet."""
+    """Convert a browser's camera to ours; None if the browser has not sent it yet."""
     wxyz, fov, aspect = np.asarray(seen.wxyz, np.float64), float(seen.fov), float(seen.aspect)
     size = np.linalg.norm(wxyz)
     position = np.asarray(seen.position, np.float64)
@@ -270,10 +270,10 @@ def _camera_of(seen: Any) -> Camera | None:
 
 
 def _free_port(host: str, port: int) -> int:
-    """The port, or a free one where it is 0; viser would silently take another.
+    """Check the port, or choose a free one for 0, because viser would silently take another.
 
     Raises:
-        AwError: it is taken, or the address is not of this machine.
+        AwError: the port is taken, or the address is not of this machine.
     """
     import socket
 

@@ -1,4 +1,4 @@
-"""A trained model as it is shown: how it is drawn, its scene's frame, its export in other formats."""
+"""A trained model for viewing: how it is drawn, its scene's axes, its export in other formats."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from ambiguous_wild.metrics.image import psnr
 
 @dataclass(frozen=True)
 class Space:
-    """A scene's frame, world units."""
+    """Up, middle and size of a scene, in world units."""
 
     up: np.ndarray  # [3] unit vector
-    middle: np.ndarray  # [3] where the cameras look
-    distance: float  # mean of the cameras from the middle
+    middle: np.ndarray  # [3] point that the cameras look at
+    distance: float  # mean distance of the cameras from the middle
     extent: float  # radius of the camera positions, see `Scene.extent`
 
 
 def space_of(scene: Scene) -> Space:
-    """Up is the mean of the photos' own up; the middle lies at the median depth of what each photo shows."""
+    """Find up as the mean of the photos' up, and the middle at the median depth of the photos' points."""
     views = together(scene.train or scene.views)
     poses = np.array([v.camera.cam_from_world for v in views])
     up = -poses[:, 1, :3].mean(axis=0)
@@ -41,15 +41,15 @@ def space_of(scene: Scene) -> Space:
     up = up / size if size > 1e-6 else -poses[0, 1, :3]
     centers = np.array([v.camera.center for v in views])
     depths = np.array([_median_depth(pose, scene.points.xyz) for pose in poses])
-    known = np.isfinite(depths)
-    depths = np.where(known, depths, np.median(depths[known]) if known.any() else scene.extent)
+    finite = np.isfinite(depths)
+    depths = np.where(finite, depths, np.median(depths[finite]) if finite.any() else scene.extent)
     middle = (centers + poses[:, 2, :3] * depths[:, None]).mean(axis=0)
     distance = float(np.linalg.norm(centers - middle, axis=1).mean())
     return Space(up=up, middle=middle, distance=max(distance, 1e-6), extent=scene.extent)
 
 
 def _median_depth(pose: np.ndarray, points: np.ndarray) -> float:
-    """Of the points in a cone of 45 degrees around the view's axis; NaN where there is none."""
+    """Return the median depth of points within 45 degrees of the view's axis; NaN without points."""
     if not len(points):
         return np.nan
     seen = points @ pose[:3, :3].T + pose[:3, 3]
@@ -58,7 +58,7 @@ def _median_depth(pose: np.ndarray, points: np.ndarray) -> float:
 
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
-NO_PHOTO = Path()  # of a view of a scene that is made for a model alone
+NO_PHOTO = Path()  # image path of views without a photo, in a scene made for a splat file
 
 
 @dataclass(frozen=True)
@@ -77,16 +77,16 @@ class Model:
 
     label: str  # unique among the models that are shown together
     ply: Path
-    look: RenderSettings = field(default_factory=RenderSettings)
+    render_settings: RenderSettings = field(default_factory=RenderSettings)
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
     masks: Path | None = None  # folder of keep maps of train views, white = keep
-    reference: bool = False  # it saw exact masks or clean photos, so it is no rival
+    reference: bool = False  # trained with exact masks or clean photos, so it does not compete
     splats: Splats | None = field(
         default=None, repr=False, compare=False
-    )  # of any splat file, as `ply` names it
+    )  # content of `ply` if it is a splat file and not a run's model
 
     def read(self) -> dict[str, np.ndarray]:
-        """The Gaussians, in the coordinates of `place`.
+        """Read the Gaussians, in the coordinates of `place`.
 
         Raises:
             AwError: no splat PLY.
@@ -95,7 +95,7 @@ class Model:
 
     @property
     def place(self) -> Place:
-        """Of the coordinates that `read` gives."""
+        """Place of the scene in whose coordinates `read` returns Gaussians."""
         return read_place(self.ply) if self.splats is None else self.splats.place
 
     @property
@@ -104,7 +104,7 @@ class Model:
         return splat_count(self.ply) if self.splats is None else len(self.splats.gaussians["means"])
 
     def within(self, place: Place) -> Model:
-        """The model of a splat file in a scene's inner coordinates; a run's is in them already."""
+        """Move the model of a splat file to a scene's inner coordinates; a run's model has them already."""
         if self.splats is None:
             return self
         arrays = moved(self.splats.gaussians, self.splats.place, place)
@@ -112,7 +112,7 @@ class Model:
 
 
 def file_model(path: Path) -> tuple[Model, str]:
-    """The model of a splat file of any tool, drawn as plain 3DGS; and a note, or "".
+    """Read the model of a splat file of any tool, to be drawn as plain 3DGS; also return a note, or "".
 
     Raises:
         AwError: see `read_splats`.
@@ -124,17 +124,17 @@ def file_model(path: Path) -> tuple[Model, str]:
 
 
 def moved(gaussians: Arrays, of: Place, to: Place) -> Arrays:
-    """Gaussians in the coordinates of one place in those of another; the same ones where these are equal."""
+    """Convert Gaussians from the coordinates of one place to those of another."""
     if of == to:
         return gaussians
     factor, shift = to.scale / of.scale, to.rotation @ np.subtract(of.centre, to.centre) * to.scale
     turn = to.rotation @ of.rotation.T
-    found = {**gaussians, "means": (factor * gaussians["means"] @ turn.T + shift).astype(np.float32)}
-    found["log_scales"] = (gaussians["log_scales"] + np.log(factor)).astype(np.float32)
+    placed = {**gaussians, "means": (factor * gaussians["means"] @ turn.T + shift).astype(np.float32)}
+    placed["log_scales"] = (gaussians["log_scales"] + np.log(factor)).astype(np.float32)
     if of.turn != to.turn:
-        found["quats"] = _turned_quats(gaussians["quats"], turn)
-        found["sh_rest"] = _turned_harmonics(gaussians["sh_rest"], turn)
-    return found
+        placed["quats"] = _turned_quats(gaussians["quats"], turn)
+        placed["sh_rest"] = _turned_harmonics(gaussians["sh_rest"], turn)
+    return placed
 
 
 def _turned_quats(quats: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -146,31 +146,31 @@ def _turned_quats(quats: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _turned_harmonics(rest: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Coefficients [N, K, 3] of the same colours in turned directions: each degree is mixed within itself."""
+    """Turn harmonics [N, K, 3]: each degree is mixed within itself so that colours turn with the model."""
     from ambiguous_wild.splat.cpu.project import basis
 
     degree = round((rest.shape[1] + 1) ** 0.5) - 1
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    there, here = np.empty((2, rest.shape[1], len(directions)))
-    for values, seen in ((there, directions), (here, directions @ turn)):
-        getattr(basis, "py_func", basis)(*seen.T, degree, values)  # of all directions at once
-    found = rest.astype(np.float64)
+    basis_turned, basis_now = np.empty((2, rest.shape[1], len(directions)))
+    for values, seen in ((basis_turned, directions), (basis_now, directions @ turn)):
+        getattr(basis, "py_func", basis)(*seen.T, degree, values)  # for all directions at once
+    turned = rest.astype(np.float64)
     for k in range(1, degree + 1):
         of = slice(k * k - 1, (k + 1) ** 2 - 1)
-        mixing = np.linalg.lstsq(there[of].T, here[of].T, rcond=None)[0]
-        found[:, of] = np.einsum("jk,nkc->njc", mixing, found[:, of])
-    return found.astype(np.float32)
+        mixing = np.linalg.lstsq(basis_turned[of].T, basis_now[of].T, rcond=None)[0]
+        turned[:, of] = np.einsum("jk,nkc->njc", mixing, turned[:, of])
+    return turned.astype(np.float32)
 
 
 class Renderer:
     """Renders one model on the CPU, with the kernels it was trained with."""
 
-    def __init__(self, gaussians: Arrays, look: RenderSettings) -> None:
+    def __init__(self, gaussians: Arrays, render_settings: RenderSettings) -> None:
         """
         Args:
-            gaussians: raw parameters; of none nothing can be drawn.
-            look: how they are drawn.
+            gaussians: raw parameters of at least one Gaussian.
+            render_settings: how they are drawn.
 
         Raises:
             AwError: there is no Gaussian.
@@ -185,23 +185,23 @@ class Renderer:
             name: torch.from_numpy(np.array(gaussians[name], np.float32)) for name in PARAMETERS
         }
         self._gaussians = Gaussians(**tensors)
-        self._look = look
+        self._render_settings = render_settings
 
     def __call__(self, camera: Camera) -> np.ndarray:  # [H, W, 3] uint8
-        """The picture that a camera sees, as a run writes it to PNG."""
+        """Render the picture that a camera sees, as a run writes it to PNG."""
         import torch
 
         from ambiguous_wild.splat.render import render
 
-        look = self._look
+        settings = self._render_settings
         with torch.no_grad():
             drawn = render(
                 self._gaussians,
                 camera,
-                sh_degree=min(look.sh_degree, self._gaussians.sh_degree),
-                background=look.background,
-                antialias=look.antialias,
-                blur=look.blur,
+                sh_degree=min(settings.sh_degree, self._gaussians.sh_degree),
+                background=settings.background,
+                antialias=settings.antialias,
+                blur=settings.blur,
             )
         return to_uint8(drawn.image.numpy())
 
@@ -209,16 +209,16 @@ class Renderer:
 AXES = {
     sign + axis: (-1.0 if sign else 1.0) * row for sign in ("", "-") for axis, row in zip("xyz", np.eye(3))
 }
-_FLOOR = 0.02  # of the Gaussians around the middle lie lower
+_FLOOR = 0.02  # share of the Gaussians around the middle that lie below the floor
 
 
 def upright(model: Model, space: Space, axis: str) -> Place:
-    """The place in which an axis of `AXES` points up, the floor is at zero, and the scene's middle above it.
+    """Return a place in which an axis of `AXES` points up and the floor below the scene's middle is at zero.
 
     Args:
-        model: in the coordinates that `space` is in.
-        space: of its scene.
-        axis: of the file.
+        model: model in the coordinates of `space`.
+        space: up, middle and size of its scene.
+        axis: axis of the file that is to point up.
     """
     from scipy.spatial.transform import Rotation
 
@@ -245,18 +245,18 @@ FORMATS: Mapping[str, tuple[str, Callable[[Path], dict[str, np.ndarray]]]] = {
 
 @dataclass(frozen=True)
 class Exported:
-    """One file. dB are means over the views; None = there was nothing to measure on."""
+    """An exported file. dB are means over the views; None = there was no view to measure on."""
 
     format: str
     path: Path
     bytes: int
-    share: float  # of the plain PLY's size
-    gaussians: int  # those that are not finite are left out
-    psnr_to_model: float | None  # its renders against the model's, dB; inf = the same pictures
-    psnr: float | None  # its renders against the photos, dB
-    lost_db: float | None  # the model's PSNR against the photos minus that
-    place: Place = UNMOVED  # of the file's coordinates; glTF that is not turned holds the user's itself
-    source: str = "the PLY"  # what `share` compares with
+    share: float  # of the size of `source`
+    gaussians: int  # number of finite Gaussians, which are written
+    psnr_to_model: float | None  # of its renders against the model's, dB; inf = equal pictures
+    psnr: float | None  # of its renders against the photos, dB
+    lost_db: float | None  # PSNR of the model minus `psnr`
+    place: Place = UNMOVED  # of the file's coordinates; glTF that is not turned has the user's coordinates
+    source: str = "the PLY"  # file with whose size `share` compares
 
 
 def export(
@@ -271,17 +271,17 @@ def export(
 ) -> list[Exported]:
     """Write the formats into a folder, each atomically, read them back and measure them.
 
-    Files are in the units of the scene's files, where their format holds these: SPZ's sizes and, of large
-    units, SOG's positions do not. What remains to be done stands in each file (`Exported.place`).
+    Files have the units of the scene's files if the format can hold them: SPZ's sizes and, for large units,
+    SOG's positions cannot. Each file records how to reach the scene's coordinates (`Exported.place`).
 
     Args:
-        model: its PLY stays as it is.
-        folder: made where there is none.
-        formats: of `FORMATS`.
-        views: to render for the loss, usually the test views; none = only sizes.
-        name: of the files, without ending.
-        space: of the scene, where `up` is given.
-        up: axis of `AXES` that points up in the files (y in glTF, always), with the floor at zero; None =
+        model: the model; its PLY is not changed.
+        folder: created if it does not exist.
+        formats: some of `FORMATS`.
+        views: views to measure the loss on, usually the test views; none = only sizes.
+        name: name of the files, without extension.
+        space: of the scene, needed with `up`.
+        up: axis of `AXES` that points up in the files (always y in glTF), with the floor at zero; None =
             the scene's coordinates.
 
     Raises:
@@ -294,8 +294,8 @@ def export(
     place = model.place
     plain = model.ply.stat().st_size
     photos = [read_png_rgb(view.image_path) for view in views]
-    before = _renders(gaussians, model.look, views)
-    found = []
+    before = _renders(gaussians, model.render_settings, views)
+    exported = []
     for wanted in dict.fromkeys(formats):
         if up is not None and space is not None:
             place = upright(model, space, "y" if wanted == "gltf" else up)
@@ -307,14 +307,14 @@ def export(
         if wanted == "spz" or (wanted == "sog" and units < 1):
             units = 1.0
         left = replace(place, scale=place.scale / units)
-        count = _write(wanted, path, rescaled(gaussians, 1 / units), model.look, left)
+        count = _write(wanted, path, rescaled(gaussians, 1 / units), model.render_settings, left)
         if not count:
             raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
         there = moved(rescaled(read(path), units), place, model.place)
-        after = _renders(there, model.look, views)
+        after = _renders(there, model.render_settings, views)
         old, new = _mean(before, photos), _mean(after, photos)
         size = path.stat().st_size
-        found.append(
+        exported.append(
             Exported(
                 format=wanted,
                 path=path,
@@ -328,12 +328,12 @@ def export(
                 source="the PLY" if model.ply.suffix == ".ply" else model.ply.name,
             )
         )
-    return found
+    return exported
 
 
-def _write(wanted: str, path: Path, gaussians: Arrays, look: RenderSettings, place: Place) -> int:
+def _write(wanted: str, path: Path, gaussians: Arrays, render_settings: RenderSettings, place: Place) -> int:
     if wanted == "spz":
-        return spz.write_spz(path, gaussians, antialias=look.antialias, place=place)
+        return spz.write_spz(path, gaussians, antialias=render_settings.antialias, place=place)
     if wanted == "ply":
         kept = finite(gaussians)
         if len(kept["means"]):
@@ -348,11 +348,11 @@ def _write(wanted: str, path: Path, gaussians: Arrays, look: RenderSettings, pla
 
 
 def _renders(
-    gaussians: Mapping[str, np.ndarray], look: RenderSettings, views: Sequence[View]
+    gaussians: Mapping[str, np.ndarray], render_settings: RenderSettings, views: Sequence[View]
 ) -> list[np.ndarray]:
     if not views:
         return []
-    renderer = Renderer(gaussians, look)
+    renderer = Renderer(gaussians, render_settings)
     return [renderer(view.camera) for view in views]
 
 

@@ -1,4 +1,4 @@
-"""One HTML file with models, photos, masks and the program that draws them; it loads nothing else."""
+"""Write one HTML file with models, photos, masks and the program that draws them; it loads nothing else."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,29 +22,29 @@ from ambiguous_wild.viewing.model import NO_PHOTO, Model, Renderer, space_of
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
-MOST_GAUSSIANS = 150_000  # a model in the page, by default: about 6 MB, and what a phone still turns smoothly
-MOST_PHOTO_BYTES = 1_000_000  # of text for all photos
-MOST_POINTS = 20_000  # features that move or stay, over all photos
-MOST_MASK_BYTES = 300_000  # of text for the masks of all models
+MOST_GAUSSIANS = 150_000  # default size of a model: about 6 MB, which a phone still turns smoothly
+MOST_PHOTO_BYTES = 1_000_000  # text of all photos
+MOST_POINTS = 20_000  # moving and static features of all photos
+MOST_MASK_BYTES = 300_000  # text of the masks of all models
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
 
 
 @dataclass(frozen=True)
 class Page:
-    """What was written."""
+    """The written page."""
 
     path: Path
     bytes: int
-    models_bytes: int  # of these, text of the models
+    models_bytes: int  # text of the models, part of `bytes`
     notes: tuple[str, ...]
 
 
 def check_page_folder(folder: Path) -> None:
-    """Check, before anything is read, that the page can be written there.
+    """Check, before anything is read, that the page can be written to a folder.
 
     Raises:
-        AwError: the path is a file, cannot be written, or holds a page of something else.
+        AwError: the path is a file, cannot be written, or holds a page of another program.
     """
     refuse_file(folder)
     path = folder / PAGE
@@ -66,26 +65,26 @@ def write_page(
     notes: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Page:
-    """Write FOLDER/index.html, whole or not at all.
+    """Write FOLDER/index.html atomically.
 
     Args:
-        folder: made where there is none; other files in it stay.
-        scene: of all the models.
+        folder: created if it does not exist; other files in it stay.
+        scene: scene of all the models.
         models: at least one.
-        title: of the page; any text.
-        most_gaussians: a larger model is reduced to so many, with a note.
+        title: title of the page; any text.
+        most_gaussians: a larger model is reduced to this number, with a note.
         notes: lines below the models.
-        say: told what is done.
+        say: called with a line for each model.
 
     Raises:
         AwError: the folder holds another page, or a model cannot be read.
     """
     check_page_folder(folder)
-    text, models_bytes, told = page_text(
+    text, models_bytes, page_notes = page_text(
         scene, models, title=title, most_gaussians=most_gaussians, notes=notes, say=say
     )
     write_text(folder / PAGE, text)
-    return Page(folder / PAGE, len(text.encode("utf-8")), models_bytes, told)
+    return Page(folder / PAGE, len(text.encode("utf-8")), models_bytes, page_notes)
 
 
 def page_text(
@@ -97,11 +96,11 @@ def page_text(
     notes: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> tuple[str, int, tuple[str, ...]]:
-    """The page, how much of it is models, and its notes; see `write_page`."""
+    """Return the page's text, the bytes of models in it, and its notes; arguments as in `write_page`."""
     if not models:
         raise AwError("no model to show")
     views = (*scene.test, *scene.train)
-    told, elements, facts = list(notes), [], []
+    page_notes, elements, facts = list(notes), [], []
     for number, model in enumerate(models):
         say(f"{model.label}: {model.count:,} Gaussians")
         gaussians = model.read()
@@ -109,26 +108,26 @@ def page_text(
         fewer = reduced(gaussians, cameras, most_gaussians)
         given, shown = len(gaussians["means"]), len(fewer["means"])
         if shown < min(given, most_gaussians):
-            told.append(
+            page_notes.append(
                 f"{model.label}: {given - shown:,} Gaussians with values that are not finite left out"
             )
         elif shown < given:
-            told.append(
+            page_notes.append(
                 f"{model.label}: reduced from {given:,} to {shown:,} Gaussians for this page; "
                 "its PSNR is that of the whole model"
             )
-        packed, _ = spz_bytes(fewer, antialias=model.look.antialias)
-        told += [cost] if (cost := _rounding_cost(model, fewer, packed, cameras[0])) else []
+        packed, _ = spz_bytes(fewer, antialias=model.render_settings.antialias)
+        page_notes += [cost] if (cost := _rounding_cost(model, fewer, packed, cameras[0])) else []
         element = f"model-{number}"
         elements.append(
             f'<script id="{element}" type="text/plain">{base64.b64encode(packed).decode("ascii")}</script>'
         )
         facts.append(_model_facts(model, element, views, scene.train, MOST_MASK_BYTES // len(models)))
-    for line in told:
+    for line in page_notes:
         say(line)
     space = space_of(scene)
     if views[0].image_path == NO_PHOTO:
-        drawn = Renderer(models[0].read(), models[0].look)
+        drawn = Renderer(models[0].read(), models[0].render_settings)
         uris = [data_uri("jpeg", jpeg_bytes(narrowed(drawn(v.camera), WIDTHS[1]), _QUALITY)) for v in views]
     else:
         uris = photo_uris(views, MOST_PHOTO_BYTES)
@@ -137,23 +136,23 @@ def page_text(
         "middle": space.middle.tolist(),
         "extent": space.extent,
         "frustum": 0.08 * space.extent,
-        "centre": scene.place.centre,  # of saved paths, in the coordinates of the scene's files
+        "centre": scene.place.centre,  # converts saved paths to the coordinates of the scene's files
         "scale": scene.place.scale,
         "views": [_view_facts(v, uri, points) for v, uri, points in zip(views, uris, _points(scene, views))],
         "models": facts,
-        "notes": told,
+        "notes": page_notes,
     }
-    return _fill(title, data, "\n".join(elements)), sum(map(len, elements)), tuple(told)
+    return _fill(title, data, "\n".join(elements)), sum(map(len, elements)), tuple(page_notes)
 
 
 def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: bytes, camera: Camera) -> str:
-    """What the page's format costs a model with sizes that it does not hold; empty for others."""
+    """Return a note on the loss of a model with sizes that the page's format cannot hold; else ""."""
     sizes = np.exp(gaussians["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
     stored = spz_arrays(packed, model.ply)
     held = np.exp(stored["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
     if not len(sizes) or (sizes.max() < 1.1 * held.max() and np.median(sizes) > 0.9 * np.median(held)):
         return ""
-    pictures = [Renderer(arrays, model.look)(camera) for arrays in (gaussians, stored)]
+    pictures = [Renderer(arrays, model.render_settings)(camera) for arrays in (gaussians, stored)]
     return (
         f"{model.label}: some of its Gaussians are larger or smaller than the page's format (SPZ) holds: the "
         f"first photo's view is {psnr(*pictures):.1f} dB to the model; 'aw export --format gltf' holds them"
@@ -162,15 +161,15 @@ def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: by
 
 def _model_facts(
     model: Model, element: str, views: Sequence[View], train: Sequence[View], most_mask_bytes: int
-) -> dict[str, Any]:
+) -> dict[str, object]:
     psnr = {v.name: model.psnr[v.name] for v in views if np.isfinite(model.psnr.get(v.name, np.nan))}
     return {
         "label": model.label,
         "reference": model.reference,
         "element": element,
-        "antialias": model.look.antialias,
-        "blur": model.look.blur,
-        "background": list(model.look.background),
+        "antialias": model.render_settings.antialias,
+        "blur": model.render_settings.blur,
+        "background": list(model.render_settings.background),
         "psnr": psnr,
         "mean": sum(psnr.values()) / len(psnr) if psnr else None,
         "masks": {} if model.masks is None else mask_uris(model.masks, train, most_mask_bytes),
@@ -178,24 +177,24 @@ def _model_facts(
 
 
 def _points(scene: Scene, views: Sequence[View]) -> list[list[int]]:
-    """Of each view, x and y of its features in thousandths of the photo and 1 if it moves, one after another.
+    """Return for each view a flat list of x, y in thousandths of the photo and 1 if the feature moves.
 
-    Each photo has the same number at most; those that move come first.
+    Each photo has the same largest number of features; moving ones come first.
     """
-    known, most = read_motion_points(scene.root), MOST_POINTS // max(len(views), 1)
-    found: list[list[int]] = []
+    motion_points, most = read_motion_points(scene.root), MOST_POINTS // max(len(views), 1)
+    rows: list[list[int]] = []
     for view in views:
-        points = known.get(view.name)
+        points = motion_points.get(view.name)
         if points is None:
-            found.append([])
+            rows.append([])
             continue
         chosen = np.argsort(~points.moves, kind="stable")[:most]
         xy = (points.xy[chosen] * 999).astype(int)
-        found.append(np.column_stack([xy, points.moves[chosen]]).ravel().tolist())
-    return found
+        rows.append(np.column_stack([xy, points.moves[chosen]]).ravel().tolist())
+    return rows
 
 
-def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, Any]:
+def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, object]:
     camera = view.camera
     return {
         "name": view.name,
@@ -212,53 +211,53 @@ def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, Any]:
     }
 
 
-def _fill(title: str, data: Mapping[str, Any], models: str) -> str:
+def _fill(title: str, data: Mapping[str, object], models: str) -> str:
     licences = html.escape((_HERE / "licences.txt").read_text(encoding="utf-8"), quote=False)
     return fill_page(
         _HERE,
         data,
         SCRIPTS,
         title=title,
-        # Spark's WebAssembly is compiled from bytes, its workers come from blobs; nothing may be fetched.
+        # Spark compiles WebAssembly from bytes and starts workers from blobs; nothing else may be loaded.
         images="data: blob:",
         more_sources="worker-src blob:; ",
         more_scripts=" blob: 'wasm-unsafe-eval'",
         parts={
             "MODELS": models,
             "RENDERER": base64.b64encode((_HERE / "renderer.js.gz").read_bytes()).decode("ascii"),
-            "LICENCES": licences.replace("--", "—"),  # they stand in a comment
+            "LICENCES": licences.replace("--", "—"),  # "--" would end the comment that holds them
         },
     )
 
 
 WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
 _QUALITY = 78
-_MASK_WIDTH = 480  # px, at most
+_MASK_WIDTH = 480  # px; largest width of masks
 
 
 def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
-    """A data: address for each photo, JPEG, as wide as lets all of them stay below `most_bytes` of text.
+    """Return a data: address of each photo as JPEG, at the largest width at which all fit `most_bytes`.
 
-    1000 photos or more can exceed it at the smallest width. One photo is held at a time.
+    1000 photos or more can exceed it at the smallest width. One photo is in memory at a time.
     """
     return _as_wide_as_fits(_photo, [view.image_path for view in views], WIDTHS, most_bytes)
 
 
 def mask_uris(folder: Path, views: Sequence[View], most_bytes: int) -> dict[str, str]:
-    """A data: address for each keep map that `folder` holds, PNG with two grey levels, by view name.
+    """Return a data: address of each keep map in `folder` as black-and-white PNG, by view name.
 
-    As wide as lets all of them stay below `most_bytes` of text.
+    They have the largest width at which all fit `most_bytes` of text.
     """
     paths = {view.name: folder / Path(view.name).with_suffix(".png") for view in views}
-    found = {name: path for name, path in paths.items() if path.is_file()}
+    files = {name: path for name, path in paths.items() if path.is_file()}
     widths = [width for width in WIDTHS if width <= _MASK_WIDTH]
-    return dict(zip(found, _as_wide_as_fits(_mask, list(found.values()), widths, most_bytes)))
+    return dict(zip(files, _as_wide_as_fits(_mask, list(files.values()), widths, most_bytes)))
 
 
 def _as_wide_as_fits(
     uri: Callable[[Path, int], str], paths: Sequence[Path], widths: Sequence[int], most_bytes: int
 ) -> list[str]:
-    """The addresses at the first width at which they fit; else at the last one."""
+    """Return the addresses at the first width at which they fit, else at the last one."""
     uris: list[str] = []
     for width in widths:
         uris, size = [], 0
@@ -284,22 +283,22 @@ def _mask(path: Path, width: int) -> str:
     return data_uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
 
 
-_NEAR = 0.01  # as in training
-_MARGIN = 0.15  # of the picture on each side still counts
+_NEAR = 0.01  # nearest depth, as in training
+_MARGIN = 0.15  # share of the picture beyond each side that is still counted
 
 
 def reduced(
     gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera], most: int
 ) -> dict[str, np.ndarray]:
-    """At most so many Gaussians: the ones with the largest opacity times projected area, summed over cameras.
+    """Keep at most `most` Gaussians, with the largest opacity times projected area, summed over cameras.
 
     A Gaussian's area in one camera counts up to a hundredth of the picture, so that a few large ones in the
     background do not displace all detail. Order is kept.
 
     Args:
         gaussians: raw parameters.
-        cameras: of the photos.
-        most: Gaussians to keep.
+        cameras: cameras of the photos.
+        most: largest number of Gaussians.
     """
     kept = finite(gaussians)
     if len(kept["means"]) <= most:
@@ -310,10 +309,10 @@ def reduced(
 
 
 def importance(gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
-    """Opacity times projected area in px, summed over cameras; [N] float64."""
+    """Return opacity times projected area in px, summed over cameras; [N] float64."""
     means = gaussians["means"].astype(np.float64)
     scales = np.sort(np.exp(gaussians["log_scales"].astype(np.float64)), axis=1)
-    area = np.pi * scales[:, 1] * scales[:, 2]  # of the two longest axes, world units squared
+    area = np.pi * scales[:, 1] * scales[:, 2]  # ellipse of the two longest axes, world units squared
     total = np.zeros(len(means))
     for camera in cameras:
         seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]

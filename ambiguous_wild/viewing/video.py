@@ -1,4 +1,4 @@
-"""Films of models side by side along one camera path: through cameras, an orbit, or from a file."""
+"""Film models side by side along one camera path: through cameras, an orbit, or from a file."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from ambiguous_wild.viewing.model import NO_PHOTO, Model, Renderer, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
 _MOST_BYTES = 64 * 1024 * 1024
-_TILT_DEG = 15.0  # of an orbit's cameras above the middle
-_WIDTH, _HEIGHT, _VIEWS = 960, 540, 8  # px and number of cameras where there is no scene
-_AWAY = 3.0  # times the median distance of the Gaussians from their middle
+_TILT_DEG = 15.0  # angle of an orbit's cameras above the middle
+_WIDTH, _HEIGHT, _VIEWS = 960, 540, 8  # px and number of cameras without a scene
+_AWAY = 3.0  # distance of these cameras, relative to the Gaussians' median distance from their middle
 _MOST_POINTS = 20_000
 
 
 def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
-    """A smooth path through the test cameras (train cameras where there are none), each once, nearest next.
+    """Make a smooth path through the test cameras, or without any the train cameras: each once, nearest next.
 
     Args:
-        scene: at least one view.
-        frames: number of cameras, evenly spaced in length of the path.
-        size: width and height, px; the lens is the views' own, fitted into it.
+        scene: scene with at least one view.
+        frames: number of cameras, evenly spaced along the path.
+        size: width and height, px; the lens is that of the views, fitted to it.
     """
     views = together(scene.test or scene.train)
     keys = [view.camera for view in views]
@@ -39,7 +39,7 @@ def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Came
 
 
 def orbit(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
-    """A circle around the middle of the scene, as far away as the photos were taken."""
+    """Make a circle around the middle of the scene, as far away as the photos were taken."""
     space = space_of(scene)
     first = (scene.test or scene.views)[0].camera
     away = first.center - space.middle
@@ -56,7 +56,7 @@ def orbit(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
 def _circle(
     middle: np.ndarray, up: np.ndarray, x: np.ndarray, distance: float, count: int
 ) -> Iterator[np.ndarray]:
-    """Positions above a middle, from the one in the direction of `x` on."""
+    """Yield positions on a circle above the middle, starting in the direction of `x`."""
     y, tilt = np.cross(up, x), math.radians(_TILT_DEG)
     for k in range(count):
         turn = 2 * math.pi * k / count
@@ -65,9 +65,9 @@ def _circle(
 
 
 def scene_around(model: Model) -> Scene:
-    """A scene without photos for the model of a splat file: cameras that look at its robust middle.
+    """Make a scene without photos for the model of a splat file, whose cameras look at the model's median.
 
-    Up is the axis of the file that is nearest to -y, which COLMAP's first photo often has up.
+    Up is the axis of the file that is nearest to -y, which often is up in COLMAP's models.
     """
     place = model.place
     xyz = model.read()["means"].astype(np.float64)
@@ -89,14 +89,14 @@ def scene_around(model: Model) -> Scene:
 
 
 def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
-    """A path that a viewer saved, in the coordinates of the scene's files.
+    """Read a path that a viewer saved, in the coordinates of the scene's files.
 
-    Read are the page of `aw view` and nerfstudio ({"camera_path": [{"camera_to_world": 16 numbers, "fov":
-    degrees}]}, OpenGL axes) and 3DGS viewers (cameras.json: [{"position", "rotation", "fx", "fy", "width",
-    "height"}], OpenCV axes). A path of other length is resampled to `frames`.
+    Formats are those of `aw view` and nerfstudio ({"camera_path": [{"camera_to_world": 16 numbers, "fov":
+    degrees}]}, OpenGL axes) and of 3DGS viewers (cameras.json: [{"position", "rotation", "fx", "fy", "width",
+    "height"}], OpenCV axes). A path of another length is resampled to `frames`.
 
     Raises:
-        AwError: another format, fewer than two cameras, or numbers that make no camera.
+        AwError: another format, fewer than two cameras, or an invalid camera.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -117,7 +117,7 @@ def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> l
         try:
             cameras.append(scene.place.inside(_camera(row, lens, size)))
         except (AwError, KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
-            raise AwError(f"{path}: camera {number} is none: {error}") from None
+            raise AwError(f"{path}: camera {number} is invalid: {error}") from None
     return cameras if len(cameras) == frames else _smooth(cameras, frames, size)
 
 
@@ -148,7 +148,7 @@ def _camera(row: Any, lens: Camera, size: tuple[int, int]) -> Camera:
 
 
 def fitted(lens: Camera, size: tuple[int, int], cam_from_world: np.ndarray) -> Camera:
-    """The lens for another size: the whole picture of the lens is in it."""
+    """Fit a lens to another size, so that its whole picture is visible."""
     width, height = size
     scale = min(width / lens.width, height / lens.height)
     left, top = (width - scale * lens.width) / 2, (height - scale * lens.height) / 2
@@ -164,7 +164,7 @@ def fitted(lens: Camera, size: tuple[int, int], cam_from_world: np.ndarray) -> C
 
 
 def _nearest_next(places: np.ndarray) -> list[int]:
-    """Each place once, the nearest of those left next, from the one furthest from the middle."""
+    """Order places from the one furthest from the middle on, the nearest remaining place next."""
     left = set(range(len(places)))
     at = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())
     order = []
@@ -177,7 +177,7 @@ def _nearest_next(places: np.ndarray) -> list[int]:
 
 
 def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[Camera]:
-    """Cameras along a curve through the keys; the lens changes evenly from key to key."""
+    """Return cameras along a curve through the keys; the lens changes evenly from key to key."""
     from scipy.interpolate import CubicSpline, PchipInterpolator
     from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -187,13 +187,13 @@ def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[
     steps = np.linalg.norm(np.diff(to_world[:, :3, 3], axis=0), axis=1)
     turns = Rotation.from_matrix(to_world[:, :3, :3])
     angles = (turns[:-1].inv() * turns[1:]).magnitude()
-    # No step has length 0: keys may differ in direction alone, or not at all.
+    # No step may have length 0, but keys may differ in direction only, or not at all.
     lengths = steps + angles * max(float(steps.mean()), 1e-6) + 1e-9 + 1e-3 * steps.mean()
     at = np.concatenate([[0.0], np.cumsum(lengths)])
     wanted = np.linspace(0.0, at[-1], frames)
     centers = CubicSpline(at, to_world[:, :3, 3])(wanted)
     rotations = RotationSpline(at, turns)(wanted).as_matrix()
-    # A lens changes monotonically between keys: no overshoot below zero.
+    # A lens changes monotonically between keys, so it cannot overshoot below zero.
     lenses = np.array([fitted(key, size, key.cam_from_world) for key in keys], dtype=object)
     values = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses])
     values = PchipInterpolator(at, values)(wanted)
@@ -206,7 +206,7 @@ def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[
 
 
 def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """cam_from_world of a camera at `center` that looks at `target`, OpenCV axes."""
+    """Return cam_from_world of a camera at `center` that looks at `target`, OpenCV axes."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
@@ -217,7 +217,7 @@ def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarr
 
 
 _GAP = 4  # px between pictures
-_MOST_SIDE = 8192  # px of a frame
+_MOST_SIDE = 8192  # px; largest side of a frame
 _GIF_COLOURS = 128
 
 Frame = np.ndarray  # [H, W, 3] uint8
@@ -231,12 +231,12 @@ def draw_frames(
     columns: int | None = None,
     tick: Tick = lambda done, total: None,
 ) -> Iterator[Frame]:
-    """Each camera's picture of every model, side by side with labels.
+    """Yield a frame for each camera: the renders of all models side by side, with labels.
 
     Args:
         models: at least one.
-        cameras: of one size.
-        columns: pictures in a row; None = all in one row up to three, else two rows or more.
+        cameras: cameras of one size.
+        columns: pictures in a row; None = all in one row up to three, else in two rows or more.
         tick: called with (frames done, frames).
 
     Raises:
@@ -251,11 +251,11 @@ def draw_frames(
         raise AwError(
             f"a frame would be {size[1]}x{size[0]} px, at most {_MOST_SIDE}; give a smaller --width"
         )
-    renderers = [Renderer(model.read(), model.look) for model in models]
+    renderers = [Renderer(model.read(), model.render_settings) for model in models]
     for number, camera in enumerate(cameras):
         frame = np.zeros(
             (size[0] + size[0] % 2, size[1] + size[1] % 2, 3), np.uint8
-        )  # encoders want even sizes
+        )  # encoders need even sizes
         for k, (model, renderer) in enumerate(zip(models, renderers)):
             row, column = divmod(k, across)
             top, left = row * (height + _GAP), column * (width + _GAP)
@@ -265,7 +265,7 @@ def draw_frames(
 
 
 def labelled(picture: Frame, label: str) -> Frame:
-    """The picture with a label in its upper left corner; what the font lacks becomes '?'."""
+    """Draw a label in the upper left corner of a picture; characters that the font lacks become '?'."""
     import cv2
 
     out = picture.copy()
@@ -284,10 +284,10 @@ def labelled(picture: Frame, label: str) -> Frame:
 
 
 def write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> int:
-    """Write frames atomically as VP9 in an mp4 file, through OpenCV's own FFmpeg (LGPL). Returns how many.
+    """Write frames atomically as VP9 in mp4, through OpenCV's FFmpeg (LGPL), and return their number.
 
     Raises:
-        AwError: OpenCV has no such encoder here.
+        AwError: this OpenCV has no such encoder.
     """
     import cv2
 
@@ -310,7 +310,7 @@ def write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> int:
 def _open(temporary: Path, path: Path, frame: Frame, fps: float) -> Any:
     import cv2
 
-    # OpenCV chooses bit rate and speed of the encoder, and reads no options for them.
+    # OpenCV chooses bit rate and speed of the encoder; it has no options for them.
     writer = cv2.VideoWriter(
         str(temporary),
         cv2.CAP_FFMPEG,
@@ -327,7 +327,7 @@ def _open(temporary: Path, path: Path, frame: Frame, fps: float) -> Any:
 
 
 def write_gif(path: Path, frames: Sequence[Frame], fps: float) -> None:
-    """Write frames atomically as an animation that repeats, with one palette for all frames.
+    """Write frames atomically as a repeating animation with one palette for all frames.
 
     Raises:
         AwError: no frame, or Pillow is missing.

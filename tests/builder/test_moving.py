@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.builder.moving import Votes, _together, seen_through
+from ambiguous_wild.builder.moving import Votes, _number_motions, seen_through
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -229,7 +229,7 @@ def test_the_file_comes_back_and_a_damaged_one_is_refused(tmp_path):
 def test_a_feature_that_stays_does_not_cut_a_motion_in_two():
     votes = Votes(np.array([0, 0, 3, 0, 0, 0]), np.array([1, 1, 1, 1, 0, 1]), [np.array([0, 1, 2, 3])])
     moves = votes.moving > votes.static
-    assert _together(votes, moves).tolist() == [1, 1, 0, 1, 0, 2]
+    assert _number_motions(votes, moves).tolist() == [1, 1, 0, 1, 0, 2]
 
 
 def test_nothing_near_says_nothing():

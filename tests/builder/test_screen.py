@@ -104,7 +104,7 @@ def test_copies_in_train_and_test_are_kept_and_named(tmp_path):
     facts = run(tmp_path)[0]
     assert len(facts["photos"]) == 6 and facts["skipped"] == []
     leak = next(w for w in facts["warnings"] if "test/t.jpg" in w)
-    assert leak.startswith("identical files: train/p00.jpg, test/t.jpg: one trains and one tests")
+    assert leak.startswith("identical files: train/p00.jpg, test/t.jpg: in train/ and in test/")
     assert "identical files: train/p01.jpg, train/z.jpg" in facts["warnings"]
 
 

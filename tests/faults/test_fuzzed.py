@@ -66,7 +66,7 @@ def replaced(path, old, new):
 def test_colmap_text_that_contradicts_itself(tmp_path, file, old, new):
     root = write_tiny_scene(tmp_path / "scene")
     replaced(root / "sparse" / "0" / file, old, new)
-    with pytest.raises(AwError, match=r"damaged|not what COLMAP writes"):
+    with pytest.raises(AwError, match=r"damaged|not in COLMAP's format"):
         load_scene(root)
 
 

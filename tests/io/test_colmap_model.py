@@ -140,7 +140,7 @@ def _no_lens(model):
         (lambda m: _first(m.images).tvec.__setitem__(2, 1e20), "translation"),
         (lambda m: m.points.xyz.__setitem__((3, 1), np.inf), "1 points have no valid position, the first is"),
         (lambda m: m.points.xyz.__setitem__((slice(2, 4), 1), 1e200), "2 points have no valid position"),
-        (_same_name, "there twice"),
+        (_same_name, "twice"),
         (_no_lens, "parameters"),
     ],
 )

@@ -64,7 +64,7 @@ def simulated(folder: Path, text: str) -> Result:
         ("width: -5", "width: between 64 and 4096, got -5"),
         ("width: [1, 2]", "width: expected int"),
         ("width: .nan", "width"),
-        ("width: 100\nwidth: 200", "line 2: the key 'width' is there twice"),
+        ("width: 100\nwidth: 200", "line 2: the key 'width' occurs twice"),
         ("samples: 5", "a square number"),
         ("name: ../up", "letters, digits"),
         ("zoom: [2, 1]", "the smaller number first"),
@@ -104,7 +104,7 @@ def simulated(folder: Path, text: str) -> Result:
         ("focal_35mm: 14\neffects: {lens_distortion: {k1: -0.12}}", "fold the picture"),
         ("effects: {lens_distortion: {k2: -0.1}}", "fold the picture"),
         ("effects: {motion_blur: {exposure_s: 0}}", "exposure_s: between 1e-05 and 0.5"),
-        (f"distractors: [{RED}, {RED}]", "distractors[1].name: 'a' is there twice"),
+        (f"distractors: [{RED}, {RED}]", "distractors[1].name: 'a' occurs twice"),
         (
             f"distractors: [{RED.replace('name: a', 'name: ~')}]".replace("~", "' '"),
             "distractors[0].name: empty",

@@ -1,4 +1,4 @@
-"""One file a layout: each turns a folder into a `ForeignScene`; and which layout a folder has."""
+"""Readers of public layouts, a file each, that turn a folder into a `ForeignScene`; recognise layouts."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ READERS: dict[str, Callable[..., ForeignScene]] = {
     "record3d": phone.read_record3d,
     "colmap": colmap.read_plain,
 }
-FINDERS: dict[str, Callable[[Path], Path | None]] = {  # of files with poses, where there is no COLMAP model
+FINDERS: dict[str, Callable[[Path], Path | None]] = {  # find poses in folders without a COLMAP model
     "realityscan": realityscan.find_table,
     "metashape": metashape.find_cameras,
     "polycam": lambda root: next(root.glob("keyframes/*cameras"), None),
@@ -48,7 +48,7 @@ DRONE_SCENES = ("Cultural_Center", "TangTian", "Pavilion", "Simingshan", "Inters
 
 
 def recognise(root: Path) -> tuple[str, str]:
-    """(layout, the evidence for it).
+    """Return the folder's layout and the evidence for it.
 
     Raises:
         AwError: no layout, two that contradict each other, or a scene of ours.
@@ -66,26 +66,26 @@ def recognise(root: Path) -> tuple[str, str]:
             f"the layout with --as ({', '.join(READERS)}), or build a scene with 'aw build-scene'"
         )
     if len(candidates) > 1:
-        found = "; ".join(f"{kind} ({why})" for kind, why in candidates)
-        raise AwError(f"{root} may be two layouts, whose splits differ: {found}; choose one with --as")
+        layouts = "; ".join(f"{kind} ({why})" for kind, why in candidates)
+        raise AwError(f"{root} may be two layouts, whose splits differ: {layouts}; choose one with --as")
     return candidates[0]
 
 
 def _candidates(root: Path) -> list[tuple[str, str]]:
-    """Layouts whose own files are there; several where they state different splits."""
+    """Return the layouts whose files the folder has; several only if they give different splits."""
     if (root / "nb-info.json").is_file():
         return [("nerfbaselines", "nb-info.json")]
-    found = []
+    layouts = []
     if (root / "transforms_train.json").is_file():
-        found.append(("blender", "transforms_train.json"))
+        layouts.append(("blender", "transforms_train.json"))
     if (root / "split.json").is_file():
-        found.append(("on-the-go", "split.json"))
+        layouts.append(("on-the-go", "split.json"))
     if sorted(root.glob("*.tsv")) or (root / "nerfw_split.csv").is_file():
-        found.append(("photo-tourism", "a .tsv table"))
+        layouts.append(("photo-tourism", "a .tsv table"))
     elif (root / "dense" / "sparse").is_dir():
-        found.append(("photo-tourism", "dense/sparse"))
-    if found:
-        return found
+        layouts.append(("photo-tourism", "dense/sparse"))
+    if layouts:
+        return layouts
     folder = colmap.model_folder(root)
     if (root / "transforms.json").is_file() and (folder is None or not colmap.has_lists(root)):
         data = transforms.read_json(root / "transforms.json")
@@ -114,14 +114,14 @@ def read_foreign(root: Path, kind: str | None = None, model: str = "") -> tuple[
 
     Args:
         root: its folder.
-        kind: the layout; None = recognised.
+        kind: the layout; None = recognise it.
         model: name of one of several COLMAP models; empty = the one with most photos.
 
     Returns:
         The scene, and why it is taken for this layout.
 
     Raises:
-        AwError: unknown layout, or a folder that is not of it.
+        AwError: unknown layout, or a folder in another layout.
     """
     if kind is None:
         kind, why = recognise(root)
@@ -141,12 +141,12 @@ def read_foreign(root: Path, kind: str | None = None, model: str = "") -> tuple[
             raise AwError(f"--model {model} chooses among COLMAP models, which layout {kind} does not use")
         return _with_masks(READERS[kind](root)), why
     scene = _with_masks(READERS[kind](root, model))
-    told = colmap.which_model(root, model)
-    return (dataclasses.replace(scene, notes=(*scene.notes, told)) if told else scene), why
+    note = colmap.which_model(root, model)
+    return (dataclasses.replace(scene, notes=(*scene.notes, note)) if note else scene), why
 
 
 def _with_masks(scene: ForeignScene) -> ForeignScene:
-    """The scene with the keep masks that lie in masks/ beside its photos, where its own files name none."""
+    """Add the keep masks in masks/ beside the photos, unless the dataset's files name masks."""
     folder = (scene.photos.parent if scene.photos != scene.root else scene.root) / "masks"
     if scene.masks or scene.kind in ("drone", "dualsplat", "blender") or (folder / OWN_MASKS).is_file():
         return scene

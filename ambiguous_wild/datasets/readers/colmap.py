@@ -1,4 +1,4 @@
-"""COLMAP models with photos: plain, with lists, and the releases that look like it."""
+"""Read COLMAP models with photos: plain, with lists, and published datasets in this form."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ambiguous_wild.io.scene_folder import models_in, read_list, registered, sev
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
 KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
-MODEL_FOLDERS = ("sparse", "dense/sparse", "colmap/sparse")  # or numbered models below one of them
-DRONE_WIDTH = 1920  # px; DroneSplat's loader reduces wider photos to it
+MODEL_FOLDERS = ("sparse", "dense/sparse", "colmap/sparse")  # each may hold numbered models instead
+DRONE_WIDTH = 1920  # px to which DroneSplat's loader reduces wider photos
 _NO_KEEP_MASKS = "are not keep masks of the dataset: left out"
 
 
 def model_folder(root: Path, chosen: str = "") -> Path | None:
-    """Where the COLMAP model lies: the one called `chosen`, else the largest; None without one.
+    """Find the folder of the COLMAP model called `chosen`, else of the largest; None without a model.
 
     Raises:
-        AwError: none is called `chosen`.
+        AwError: no model is called `chosen`.
     """
     models = models_in(root, MODEL_FOLDERS)
     if not models:
@@ -38,14 +38,14 @@ def model_folder(root: Path, chosen: str = "") -> Path | None:
 
 
 def which_model(root: Path, chosen: str = "") -> str:
-    """What is said where there are several models; empty for one."""
+    """Return a note if there are several models; empty for a single one."""
     folder = model_folder(root, chosen)
     models = models_in(root, MODEL_FOLDERS)
     return several_models(models, folder) if folder is not None and models else ""
 
 
 def read_named_model(root: Path, chosen: str = "") -> Model:
-    """The model, its photos' names checked; `chosen` is the name of one of several.
+    """Read the model and check the names of its photos; `chosen` is the name of one of several models.
 
     Raises:
         AwError: no model, a damaged one, or a name that leads out of the folder.
@@ -58,7 +58,7 @@ def read_named_model(root: Path, chosen: str = "") -> Model:
         )
     model = read_model(folder)
     for number, image in model.images.items():
-        if "\\" in image.name:  # written on Windows: below its folder of photos, or somewhere on its disk
+        if "\\" in image.name:  # the model was made on Windows; the name may be a full path
             name = image.name.replace("\\", "/")
             name = f"/{name}".rpartition("/images/")[2].removeprefix("/")
             name = name.rpartition("/")[2] if name[1:2] == ":" else name
@@ -68,53 +68,53 @@ def read_named_model(root: Path, chosen: str = "") -> Model:
 
 
 def model_names(model: Model) -> list[str]:
-    """Names of the registered photos, sorted."""
+    """Return the names of the registered photos, sorted."""
     return sorted(image.name for image in model.images.values())
 
 
 def photo_folder(root: Path) -> Path:
-    """images/, below dense/ where it is there."""
+    """Return the folder images/, or dense/images/ if there is one."""
     for folder in (root / "images", root / "dense" / "images"):
         if folder.is_dir():
             return folder
     if registered(root):
         return root
-    return root / "images"  # absent where a release ships downsampled photos alone
+    return root / "images"  # absent if a dataset has downsampled photos only
 
 
 def shipped_factors(root: Path) -> list[int]:
-    """Factors of the downsampled folders images_N that come with the photos, ascending."""
+    """Return the factors N of the downsampled folders images_N, ascending."""
     tails = (p.name.removeprefix("images_") for p in root.glob("images_*") if p.is_dir())
     return sorted(int(t) for t in tails if t.isdigit() and 1 < int(t) <= 64)
 
 
 def read_lists(root: Path) -> dict[Split, list[str]]:
-    """train_list.txt and test_list.txt.
+    """Read train_list.txt and test_list.txt.
 
     Raises:
         AwError: one is missing, empty or unreadable.
     """
-    found: dict[Split, list[str]] = {}
+    listed: dict[Split, list[str]] = {}
     for side in SIDES:
         path = root / LISTS[side]
         try:
-            found[side] = read_list(path)
+            listed[side] = read_list(path)
         except OSError as error:
             raise AwError(
                 f"{path}: {error.strerror}; both {LISTS['train']} and {LISTS['test']} are needed"
             ) from error
-        if not found[side]:
+        if not listed[side]:
             raise AwError(f"{path} is empty: it must name the {side} photos, one a line")
-    return found
+    return listed
 
 
 def has_lists(root: Path) -> bool:
-    """Whether at least one of the two lists is there."""
+    """Tell whether the folder has at least one of the two lists."""
     return any((root / name).is_file() for name in LISTS.values())
 
 
 def sides(names: Iterable[str], root: Path) -> tuple[dict[str, Split], dict[Split, list[str]], list[str]]:
-    """Sides by the folder's lists, else every 8th; listed names that are no photos; notes."""
+    """Return sides by the folder's lists, else by every 8th photo; listed names without photo; notes."""
     if has_lists(root):
         return *split_by_lists(names, read_lists(root), root), []
     split, note = every_nth(names)
@@ -122,7 +122,7 @@ def sides(names: Iterable[str], root: Path) -> tuple[dict[str, Split], dict[Spli
 
 
 def read_plain(root: Path, chosen: str = "") -> ForeignScene:
-    """COLMAP with images: split by lists, else every 8th photo tests."""
+    """Read a COLMAP model with images, split by lists, else by every 8th photo."""
     model = read_named_model(root, chosen)
     factors = shipped_factors(root)
     factor = factors[0] if len(factors) == 1 and not photo_folder(root).is_dir() else 1
@@ -131,17 +131,17 @@ def read_plain(root: Path, chosen: str = "") -> ForeignScene:
 
 
 def keyword_sides(names: Iterable[str]) -> dict[str, Split | None]:
-    """Sides by keyword in the file name: clutter trains, extra tests, clean is left out.
+    """Split by keyword in the file name: clutter = train, extra = test, clean = left out.
 
     Raises:
         AwError: a name with no keyword, or with two.
     """
-    found: dict[str, Split | None] = {}
+    side_of: dict[str, Split | None] = {}
     odd = []
     for name in names:
         hits = [word for word in KEYWORDS if word in PurePosixPath(name).name.casefold()]
         if len(hits) == 1:
-            found[name] = KEYWORDS[hits[0]]
+            side_of[name] = KEYWORDS[hits[0]]
         else:
             odd.append(f"{name} ({' and '.join(hits) or 'none'})")
     if odd:
@@ -150,17 +150,17 @@ def keyword_sides(names: Iterable[str]) -> dict[str, Split | None]:
             f"{shortlist(odd, 3)}; rename or remove them, or write train_list.txt and test_list.txt and pass "
             "--as colmap"
         )
-    return found
+    return side_of
 
 
 def has_keywords(names: Iterable[str]) -> bool:
-    """Whether some names have "clutter" and others "extra"."""
+    """Tell whether some names have "clutter" and others "extra"."""
     bases = [PurePosixPath(n).name.casefold() for n in names]
     return any("clutter" in b for b in bases) and any("extra" in b for b in bases)
 
 
 def read_robustnerf(root: Path, chosen: str = "") -> ForeignScene:
-    """RobustNeRF, the SpotLessSplats release and RobustSplat's renamed ones: the split is in the names."""
+    """Read RobustNeRF, also as SpotLessSplats and RobustSplat publish it: the split is in the file names."""
     model = read_named_model(root, chosen)
     sides = keyword_sides(model_names(model))
     split: dict[str, Split] = {name: side for name, side in sides.items() if side is not None}
@@ -178,18 +178,18 @@ def read_robustnerf(root: Path, chosen: str = "") -> ForeignScene:
 
 
 def _published_factor(root: Path, model: Model, factor: int = 8) -> int:
-    """The factor of the papers, or 1 for a release that was downsampled before COLMAP ran."""
+    """Return the factor of the papers, or 1 for photos that were downsampled before COLMAP ran."""
     longest = max(max(c.width, c.height) for c in model.cameras.values())
     return factor if longest / factor >= 200 or factor in shipped_factors(root) else 1
 
 
 def first_dot(name: str) -> str:
-    """The base name up to its first dot: how DroneSplat compares names."""
+    """Return the base name up to its first dot, by which DroneSplat compares names."""
     return PurePosixPath(name).name.partition(".")[0]
 
 
 def read_drone(root: Path, chosen: str = "") -> ForeignScene:
-    """Drone Imagery of DroneSplat: two lists, names compared up to their first dot, at most 1920 px wide."""
+    """Read DroneSplat's Drone Imagery: lists with names up to their first dot, photos at most 1920 px."""
     model = read_named_model(root, chosen)
     split, missing = split_by_lists(model_names(model), read_lists(root), root, first_dot)
     notes: tuple[str, ...] = ()
@@ -212,7 +212,7 @@ def read_drone(root: Path, chosen: str = "") -> ForeignScene:
 
 
 def read_dualsplat(root: Path, chosen: str = "") -> ForeignScene:
-    """DualSplat's preparation: lists beside masks and depths of its own, which other methods do not get."""
+    """Read scenes as DualSplat prepares them: lists, beside its own masks and depths, which are left out."""
     model = read_named_model(root, chosen)
     split, missing = split_by_lists(model_names(model), read_lists(root), root)
     own = [n for n in ("sam_masks", "pseudo_masks", "depths") if (root / n).is_dir()]

@@ -1,7 +1,7 @@
-"""Cameras of Agisoft Metashape: the XML of File > Export > Export Cameras.
+"""Read cameras of Agisoft Metashape: the XML of File > Export > Export Cameras.
 
-Camera to chunk has OpenCV's axes; a component or the chunk states chunk to world as s R x + t. The lens is
-that of the manual's appendix on camera models; its P1 and P2 are OpenCV's p2 and p1.
+Camera to chunk has OpenCV's axes; a component or the chunk states chunk to world as s R x + t. The lens
+follows the manual's appendix on camera models, whose P1 and P2 are OpenCV's p2 and p1.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "
 
 
 def find_cameras(root: Path) -> Path | None:
-    """The folder's XML of cameras; None where there is none."""
-    return posed.the_one(root, "*.xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
+    """Find the folder's XML of cameras; None without one."""
+    return posed.only_file(root, "*.xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
 
 
 def read_metashape(root: Path) -> ForeignScene:
-    """Poses and lenses of the aligned cameras of one chunk; a PLY beside is its point cloud."""
+    """Read poses and lenses of the aligned cameras of one chunk, and the point cloud of a PLY beside."""
     path = find_cameras(root)
     if path is None:
         raise AwError(f"{root} has no XML of Metashape's File > Export > Export Cameras")
     text = read_text(path)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may expand without end
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may expand without limit
         raise AwError(f"{path} has a DOCTYPE or entities, which Metashape does not write; do not use it")
-    with posed.written_by("Metashape", path):
+    with posed.tool_errors("Metashape", path):
         chunks = [c for c in ElementTree.fromstring(text).iter("chunk") if c.find("cameras") is not None]
         if len(chunks) != 1:
             raise AwError(f"{path} holds {counted(len(chunks), 'chunk')} with cameras; export one")
@@ -70,7 +70,7 @@ def read_metashape(root: Path) -> ForeignScene:
             pose = move @ _numbers(camera.find("transform"), 4, 4) @ np.diag([1, -1, -1, 1])
             pose[:3, :3] /= np.cbrt(abs(np.linalg.det(move[:3, :3])))
             rows.append((name, pose, lenses[camera.attrib["sensor_id"]]))
-        # The points of a map are in its projection, the cameras are geocentric.
+        # Of a chunk on a map, the points are in the map's projection, but the cameras are geocentric.
         placed = whole is not None or any(move is not None for move in moves.values())
         local = not placed or "LOCAL_CS" in (chunk.findtext("reference") or "LOCAL_CS")
     left = len(every) - len(used)
@@ -86,7 +86,7 @@ def _numbers(element: Element | None, *shape: int) -> np.ndarray:
 
 
 def _move(transform: Element | None) -> np.ndarray | None:
-    """[4, 4] of a component or chunk; None without."""
+    """Return the transform [4, 4] of a component or chunk; None without one."""
     if transform is None or transform.find("rotation") is None:
         return None
     move = np.eye(4)
@@ -96,7 +96,7 @@ def _move(transform: Element | None) -> np.ndarray | None:
 
 
 def _camera(sensor: Element, where: str) -> ModelCamera:
-    """The sensor's adjusted calibration."""
+    """Read the sensor's adjusted calibration."""
     kind = sensor.get("type", "")
     if kind != "frame" and kind not in FISHEYES:
         what = SPLIT_PANORAMAS if kind == "spherical" else "export undistorted photos"

@@ -1,11 +1,10 @@
-"""NerfBaselines' own folders: nb-info.json names the loader and the evaluation protocol."""
+"""Read NerfBaselines' folders, whose nb-info.json names the loader and the evaluation protocol."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, inside
@@ -30,14 +29,14 @@ PROTOCOLS: dict[str, Evaluation] = {"default": {}, "nerf": {}, "nerfw": NERF_W}
 
 
 def read_nerfbaselines(root: Path, chosen: str = "") -> ForeignScene:
-    """A folder with nb-info.json.
+    """Read a folder with nb-info.json.
 
     Raises:
         AwError: another loader, protocol or folder than are supported.
     """
     path = root / "nb-info.json"
     info = read_json(path)
-    # a name, or where the function lies: nerfbaselines.datasets.phototourism:load_phototourism_dataset
+    # The loader is a name or a function: nerfbaselines.datasets.phototourism:load_phototourism_dataset
     loader = str(info.get("loader", "colmap")).partition(":")[0].rpartition(".")[2]
     if loader not in LOADERS:
         raise unknown(f"loader in {path}", loader[:60], LOADERS)
@@ -46,11 +45,11 @@ def read_nerfbaselines(root: Path, chosen: str = "") -> ForeignScene:
         raise unknown(f"evaluation_protocol in {path}", protocol[:60], PROTOCOLS)
     scene = LOADERS[loader](root, chosen) if loader in COLMAP else LOADERS[loader](root)
     kwargs = info.get("loader_kwargs")
-    options: dict[str, Any] = kwargs if isinstance(kwargs, dict) else {}
+    options: dict[str, object] = kwargs if isinstance(kwargs, dict) else {}
     images = options.get("images_path", "images")
     factor = _factor(str(images), _whole(info.get("downscale_factor")), root, path)
     loaded = _whole(info.get("downscale_loaded_factor") or options.get("downscale_loaded_factor"))
-    if loaded > 1:  # of the photos on disk, whatever the size of their cameras
+    if loaded > 1:  # this factor refers to the photos on disk, not to their cameras
         factor = loaded * max(factor, round(at_photo_size(scene)[1]))
     identity = str(info.get("id") or "").lower()
     return dataclasses.replace(
@@ -67,11 +66,11 @@ def _whole(stated: object) -> int:
 
 
 def _factor(images: str, stated: int, root: Path, path: Path) -> int:
-    """images_8 -> 8; images -> 1."""
+    """Return the factor in the name of a folder: 8 for images_8, 1 for images."""
     folder = inside(images, root)
     tail = folder.removeprefix("images").removeprefix("_")
     if folder == "images":
-        return stated  # of the cameras; `aw import` finds what the photos on disk have of it
+        return stated  # refers to the cameras; `aw import` compares the photos on disk with them
     if not tail.isdigit() or not 1 <= int(tail) <= 64:
         raise AwError(f"{path}: images_path {images[:60]!r} is not supported: images or images_N is")
     return int(tail)

@@ -1,4 +1,4 @@
-"""NeRF On-the-go: split.json counts frames of transforms.json sorted by name; also undistorted copies."""
+"""Read NeRF On-the-go, whose split.json counts the sorted frames of transforms.json, and its copies."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from ambiguous_wild.datasets.readers.transforms import frame_name, frames_of, re
 DATASET = "NeRF On-the-go"
 FACTOR, LOW_FACTOR = 8, 4
 LOW_RESOLUTION = ("patio", "arcdetriomphe")  # 1920x1080 sources, published at factor 4
-# Of the twelve, those with undistorted copies: other names are common words.
+# Scenes with undistorted copies, which are recognised by name; the names of the others are common words.
 SCENES = ("mountain", "fountain", "corner", "patio", "spot", "patio_high", "arcdetriomphe")
 
 
 def is_scene_name(name: str) -> bool:
-    """Whether it is a scene of On-the-go, in any spelling."""
+    """Tell whether a name is that of a scene of On-the-go, in any spelling."""
     return plain(name) in {plain(s) for s in SCENES}
 
 
 def published_factor(root: Path) -> int:
-    """4 for patio and arcdetriomphe, 8 for all others; what a release ships goes before it."""
+    """Return the factor of images_N in the folder, else 4 for patio and arcdetriomphe, 8 for the others."""
     shipped = shipped_factors(root)
     if len(shipped) == 1:
         return shipped[0]
@@ -40,37 +40,37 @@ def published_factor(root: Path) -> int:
 
 
 def read_split(path: Path, count: int) -> dict[str, list[int]]:
-    """split.json: lists of positions in the sorted frames.
+    """Read split.json: lists of positions in the sorted frames.
 
     Raises:
         AwError: damaged, without clutter or extra, or positions that the frames do not have.
     """
     data = read_json(path)
-    found: dict[str, list[int]] = {}
+    positions: dict[str, list[int]] = {}
     for key in ("clutter", "extra", "clean"):
         rows: Any = data.get(key, [])
         if not isinstance(rows, list) or not all(
             isinstance(i, int) and not isinstance(i, bool) for i in rows
         ):
             raise AwError(f"{path}: {key!r} is no list of whole numbers")
-        found[key] = rows
+        positions[key] = rows
     for key in ("clutter", "extra"):
-        if not found[key]:
+        if not positions[key]:
             raise AwError(f"{path} has no {key!r}: clutter trains and extra tests")
-    largest = max(max(found["clutter"]), max(found["extra"]))
-    if largest >= count or min(min(found["clutter"]), min(found["extra"])) < 0:
+    largest = max(max(positions["clutter"]), max(positions["extra"]))
+    if largest >= count or min(min(positions["clutter"]), min(positions["extra"])) < 0:
         raise AwError(
             f"{path} counts up to {largest}, but transforms.json has {count} frames: they belong to "
             "two scenes"
         )
-    both = sorted(set(found["clutter"]) & set(found["extra"]))
+    both = sorted(set(positions["clutter"]) & set(positions["extra"]))
     if both:
         raise AwError(f"{path}: position {both[0]} is in clutter and in extra")
-    return found
+    return positions
 
 
 def read_on_the_go(root: Path, chosen: str = "") -> ForeignScene:
-    """The original release, with or without a COLMAP model of one's own, or an undistorted copy."""
+    """Read the original dataset, with or without a COLMAP model in its folder, or an undistorted copy."""
     if not (root / "split.json").is_file():
         return _undistorted(root, chosen)
     path = root / "transforms.json"
@@ -114,7 +114,7 @@ def _undistorted(root: Path, chosen: str = "") -> ForeignScene:
 
 
 def _undistorted_factor(root: Path, model: Any) -> int:
-    """As shipped; 1 for copies that were reduced before (504 px), else as published."""
+    """Return the factor of images_N; 1 for copies that were reduced before (504 px), else as published."""
     longest = max(max(c.width, c.height) for c in model.cameras.values())
     factor = published_factor(root)
     return factor if shipped_factors(root) or longest / factor >= 200 else 1

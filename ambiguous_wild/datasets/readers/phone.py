@@ -1,7 +1,7 @@
-"""Poses of ARKit as phone apps export them: Polycam's keyframes, Record3D's metadata.
+"""Read ARKit poses that phone apps export: Polycam's keyframes and Record3D's metadata.
 
 Both state camera to world with OpenGL's axes. Sources: PolyCam/polyform, and Record3D's author in
-marek-simonik/record3d, issues 27, 33 and 83. NeRFCapture writes a transforms.json.
+marek-simonik/record3d, issues 27, 33 and 83. NeRFCapture writes a transforms.json instead.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.datasets.foreign import ForeignScene
-from ambiguous_wild.datasets.readers.posed import find_posed, posed_scene, written_by
+from ambiguous_wild.datasets.readers.posed import find_posed, posed_scene, tool_errors
 from ambiguous_wild.datasets.readers.transforms import frame_camera, read_json
 
 LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
 def read_polycam(root: Path) -> ForeignScene:
-    """keyframes/ of Polycam's raw data: its corrected cameras and images where they are there."""
+    """Read keyframes/ of Polycam's raw data: corrected cameras and images if present, else ARKit's."""
     base, notes = root / "keyframes", []
     cameras, photos = base / "corrected_cameras", base / "corrected_images"
     if not (any(cameras.glob("*.json")) and photos.is_dir()):
@@ -33,7 +33,7 @@ def read_polycam(root: Path) -> ForeignScene:
     rows = []
     for path, name in zip(files, find_posed(photos, [f.stem for f in files], cameras)):
         data = read_json(path)
-        with written_by("Polycam", path):
+        with tool_errors("Polycam", path):
             pose = [[data[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
             lens = {k: data[v] for k, v in zip(LENS, ("fx", "fy", "cx", "cy", "width", "height"))}
         rows.append((name, pose, frame_camera(1, lens, {}, photos / name, path)))
@@ -41,7 +41,7 @@ def read_polycam(root: Path) -> ForeignScene:
 
 
 def find_metadata(root: Path) -> Path | None:
-    """Record3D's file in an exported folder or an unpacked .r3d; None where there is none."""
+    """Find Record3D's metadata in an exported folder or an unpacked .r3d; None without it."""
     for path in (root / "metadata.json", root / "metadata"):
         with suppress(AwError):
             if {"poses", "K"} <= set(read_json(path)):
@@ -50,12 +50,12 @@ def find_metadata(root: Path) -> Path | None:
 
 
 def read_record3d(root: Path) -> ForeignScene:
-    """metadata.json or metadata, and the numbered photos of rgb/ or rgbd/."""
+    """Read metadata.json or metadata, and the numbered photos of rgb/ or rgbd/."""
     path = find_metadata(root)
     if path is None:
         raise AwError(f"{root} has no metadata.json of Record3D, with poses and K")
     data = read_json(path)
-    with written_by("Record3D", path):
+    with tool_errors("Record3D", path):
         poses = np.array(data["poses"], np.float64).reshape(-1, 7)  # quaternion (x, y, z, w), position
         turns = Rotation.from_quat(poses[:, :4]).as_matrix()
         k = np.array(data["K"], np.float64).reshape(9)[[0, 4, 6, 7]]  # column by column

@@ -1,4 +1,4 @@
-"""Photo Tourism with NeRF-W's split: dense/, a table of names, half of each test photo is fitted."""
+"""Read Photo Tourism with NeRF-W's split: dense/, a table of names; half of each test photo is fitted."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ NERF_W: Evaluation = {
     "effects": ["appearance"],
     "source": "NeRF-W: colour is fitted on the left half of a test photo, the right half is measured",
 }
-LEAST_SHARE = 0.5  # of the table's photos in the model; below, the table is of another scene
+LEAST_SHARE = 0.5  # of the table's photos in the model; below, the table belongs to another scene
 
 
 def find_table(root: Path) -> Path | None:
-    """The scene's .tsv, or NerfBaselines' nerfw_split.csv; None without one.
+    """Find the scene's .tsv, or NerfBaselines' nerfw_split.csv; None without either.
 
     Raises:
-        AwError: there are several.
+        AwError: there are several tables.
     """
-    found = sorted(root.glob("*.tsv")) or sorted(root.glob("nerfw_split.csv"))
-    if len(found) > 1:
+    tables = sorted(root.glob("*.tsv")) or sorted(root.glob("nerfw_split.csv"))
+    if len(tables) > 1:
         raise AwError(
-            f"{root} has {len(found)} tables: {shortlist(p.name for p in found)}; keep the scene's own"
+            f"{root} has {len(tables)} tables: {shortlist(p.name for p in tables)}; keep the scene's own"
         )
-    return found[0] if found else None
+    return tables[0] if tables else None
 
 
 def read_table(path: Path) -> dict[Split, list[str]]:
-    """Names by side of the rows with an id. The ids themselves are wrong in the published tables.
+    """Read the names by side of rows with an id; the ids themselves are wrong in the published tables.
 
     Raises:
         AwError: unreadable, without the columns, or with an unknown side.
@@ -52,19 +52,19 @@ def read_table(path: Path) -> dict[Split, list[str]]:
     lacking = [c for c in COLUMNS[:3] if not rows or c not in rows[0]]
     if lacking:
         raise AwError(f"{path} lacks the columns {', '.join(lacking)}; it must have {', '.join(COLUMNS)}")
-    found: dict[Split, list[str]] = {"train": [], "test": []}
+    names_of: dict[Split, list[str]] = {"train": [], "test": []}
     for number, row in enumerate(rows, start=2):
         side, name = (row["split"] or "").strip(), (row["filename"] or "").strip()
         if not (row["id"] or "").strip():
             continue
-        if side not in found or not name:
+        if side not in names_of or not name:
             raise AwError(f"{path}, line {number}: side {side!r} of {name!r} is neither train nor test")
-        found[side].append(name)
-    return found
+        names_of[side].append(name)
+    return names_of
 
 
 def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
-    """dense/images, dense/sparse and <name>.tsv, or the published lists."""
+    """Read dense/images, dense/sparse and <name>.tsv, or the published lists."""
     model = read_named_model(root, chosen)
     names = model_names(model)
     table = find_table(root)
@@ -80,10 +80,10 @@ def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
     where = table or root
     total = sum(len(v) for v in listed.values())
     bases = {PurePosixPath(n).name for n in names}
-    known = sum(PurePosixPath(n).name in bases for v in listed.values() for n in v)
-    if total and known < LEAST_SHARE * total and table is not None:
+    in_model = sum(PurePosixPath(n).name in bases for v in listed.values() for n in v)
+    if total and in_model < LEAST_SHARE * total and table is not None:
         raise AwError(
-            f"{table} names {total} photos, {known} of them are in the model of {len(names)}: it is "
+            f"{table} names {total} photos, {in_model} of them are in the model of {len(names)}: it is "
             "the table "
             "of another scene"
         )

@@ -1,4 +1,4 @@
-"""What readers of poses without a COLMAP model share: photos by name, lenses, sides, points."""
+"""Shared by readers of poses without a COLMAP model: photos by name, lenses, sides, points."""
 
 from __future__ import annotations
 
@@ -24,44 +24,44 @@ from ambiguous_wild.io.colmap_model import check_camera
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.ply import read_point_ply
 
-FIT_PX = 0.05  # between a lens and the rational one that stands for it
+FIT_PX = 0.05  # largest error of the rational lens that replaces another lens
 Row = tuple[str, Any, ModelCamera]  # photo; [3 or 4, 4] camera to world with OpenGL's axes; camera
 
 
 @contextmanager
-def written_by(tool: str, path: Path) -> Iterator[None]:
-    """A file that lacks what the tool writes is the user's error, in one line."""
+def tool_errors(tool: str, path: Path) -> Iterator[None]:
+    """Turn errors on a file that lacks what the tool writes into an AwError."""
     try:
         yield
     except (LookupError, ValueError, TypeError, AttributeError, SyntaxError) as error:
-        told = f"{type(error).__name__}: {str(error)[:80]}"
-        raise AwError(f"{path} is not as {tool} writes it ({told}); export it again") from error
+        reason = f"{type(error).__name__}: {str(error)[:80]}"
+        raise AwError(f"{path} is not as {tool} writes it ({reason}); export it again") from error
 
 
-def the_one(root: Path, pattern: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
-    """The folder's file of this kind.
+def only_file(root: Path, pattern: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
+    """Return the folder's only file of this kind; None without one.
 
     Raises:
-        AwError: there are several.
+        AwError: there are several files.
     """
-    found = [path for path in sorted(root.glob(pattern)) if fits(path)]
-    if len(found) > 1:
-        told = shortlist([path.name for path in found])
-        raise AwError(f"{root} has several files of poses or points: {told}; keep one")
-    return found[0] if found else None
+    files = [path for path in sorted(root.glob(pattern)) if fits(path)]
+    if len(files) > 1:
+        names = shortlist([path.name for path in files])
+        raise AwError(f"{root} has several files of poses or points: {names}; keep one")
+    return files[0] if files else None
 
 
 def find_posed(folder: Path, names: Sequence[str], where: Path) -> list[str]:
-    """Photos below `folder` that another tool names without extension, or with folders of another computer.
+    """Find photos below `folder` by names without extension, or with folders of another computer.
 
     Raises:
-        AwError: a photo is absent, or there twice, or a name fits several.
+        AwError: a photo is absent or named twice, or a name fits several photos.
     """
     below: dict[str, list[str]] = {}
     for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES and p.name[:2] != "._"):
         for key in {path.name, path.stem}:
             below.setdefault(key, []).append(path.relative_to(folder).as_posix())
-    found, lost = [], []
+    photos, lost = [], []
     for name in names:
         pure = PurePosixPath(name.replace("\\", "/") or "?")
         local = not (pure.is_absolute() or ":" in pure.parts[0] or ".." in pure.parts)
@@ -71,14 +71,14 @@ def find_posed(folder: Path, names: Sequence[str], where: Path) -> list[str]:
         fits = fits if exact is None else [exact.relative_to(folder).as_posix()]
         if len(fits) > 1:
             raise AwError(f"{where}: {name!r} fits {shortlist(fits, 3)}; give the photos unique names")
-        found += fits
+        photos += fits
         lost += [] if fits else [name]
     if lost:
-        told = f"{len(lost)} of {len(names)} photos of {where} are not in {folder}: {shortlist(lost, 3)}"
-        raise AwError(f"{told}; copy all of them there")
-    if twice := [name for name, times in Counter(found).items() if times > 1]:
+        problem = f"{len(lost)} of {len(names)} photos of {where} are not in {folder}: {shortlist(lost, 3)}"
+        raise AwError(f"{problem}; copy all of them there")
+    if twice := [name for name, times in Counter(photos).items() if times > 1]:
         raise AwError(f"{where} states a photo twice: {shortlist(twice, 3)}; keep one pose of it")
-    return found
+    return photos
 
 
 def brown_camera(
@@ -89,7 +89,7 @@ def brown_camera(
     where: str,
     shear: float = 0.0,
 ) -> ModelCamera:
-    """The camera with Brown's lens, as COLMAP states it; with r^8 a rational one that is equal to `FIT_PX`.
+    """Return a camera of COLMAP with Brown's lens; a lens with r^8 becomes a rational one within `FIT_PX`.
 
     Raises:
         AwError: an impossible camera, or a lens that folds inside the photo.
@@ -110,15 +110,15 @@ def brown_camera(
         k = np.linalg.lstsq(np.hstack([powers, -gain[:, None] * powers]), gain - 1, rcond=None)[0]
         error = np.abs((1 + powers @ k[:3]) / (1 + powers @ k[3:]) - gain) * r * max(fx, fy)
         if end == 1 or not error.max() < FIT_PX:
-            told = f"{where}: the lens {list(radial)} folds inside the photo"
-            raise AwError(f"{told}; export undistorted photos")
+            problem = f"{where}: the lens {list(radial)} folds inside the photo"
+            raise AwError(f"{problem}; export undistorted photos")
         k /= corner ** np.array([2, 4, 6] * 2)
         more = [*map(float, k[:2]), *tangential, *map(float, k[2:])]
     return ModelCamera(1, model, *size, (*pinhole, *more), shear)
 
 
 def model_of_poses(rows: Iterable[Row]) -> Model:
-    """A model without points; equal cameras are one.
+    """Make a model without points; equal cameras become one.
 
     Raises:
         AwError: an impossible camera, or a pose that is no rigid motion.
@@ -128,7 +128,7 @@ def model_of_poses(rows: Iterable[Row]) -> Model:
     for number, (name, matrix, camera) in enumerate(sorted(rows, key=lambda row: row[0]), start=1):
         key = (camera.model, camera.width, camera.height, camera.params, camera.shear)
         check_camera(Path(name), camera)
-        known = cameras.setdefault(key, ModelCamera(len(cameras) + 1, *key))
+        camera_of_photo = cameras.setdefault(key, ModelCamera(len(cameras) + 1, *key))
         try:
             pose = pose_from_opengl(np.array(matrix, dtype=np.float64))
         except (ValueError, TypeError) as error:
@@ -137,21 +137,21 @@ def model_of_poses(rows: Iterable[Row]) -> Model:
             raise AwError(f"{name}: {error}") from None
         q = quaternion_from_rotation(pose[:3, :3])
         none = np.zeros((0, 2)), np.zeros(0, np.int64)
-        images[number] = ModelImage(number, q, pose[:3, 3], known.camera_id, name, *none)
+        images[number] = ModelImage(number, q, pose[:3, 3], camera_of_photo.camera_id, name, *none)
     return Model({c.camera_id: c for c in cameras.values()}, images, points_without_tracks())
 
 
 def posed_scene(
     kind: str, root: Path, photos: Path, rows: Sequence[Row], notes: Sequence[str] = (), points: bool = True
 ) -> ForeignScene:
-    """The scene of photos below a folder; `points`: a PLY of `root` has the poses' coordinates."""
+    """Make a scene of photos below a folder; `points`: a PLY in `root` has the coordinates of the poses."""
     model = model_of_poses(rows)
-    split, missing, said = sides(sorted(name for name, _, _ in rows), root)
-    cloud = the_one(root, "*.ply") if points else None
+    split, missing, more = sides(sorted(name for name, _, _ in rows), root)
+    cloud = only_file(root, "*.ply") if points else None
     if cloud is None:
         return ForeignScene(
-            kind, root, model, photos, split, missing=missing, notes=(*notes, *said), points="triangulate"
+            kind, root, model, photos, split, missing=missing, notes=(*notes, *more), points="triangulate"
         )
     model = Model(model.cameras, model.images, points_without_tracks(*read_point_ply(cloud)))
-    said.append(f"points from {cloud.name}, without the photos that see them")
-    return ForeignScene(kind, root, model, photos, split, missing=missing, notes=(*notes, *said))
+    more.append(f"points from {cloud.name}, without the photos that see them")
+    return ForeignScene(kind, root, model, photos, split, missing=missing, notes=(*notes, *more))

@@ -1,4 +1,4 @@
-"""RealityScan and RealityCapture: the CSV "Internal/External camera parameters", which Postshot reads too.
+"""Read the CSV "Internal/External camera parameters" of RealityScan and RealityCapture.
 
 Camera to world is Rz(-heading) Rx(pitch) Ry(roll) with OpenGL's axes; f is in mm of a longer side of 36 mm,
 px and py are in longer sides from the middle; t1 and t2 are OpenCV's p2 and p1. Sources: the templates of
@@ -19,19 +19,19 @@ from ambiguous_wild.datasets.readers import posed
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import header_size, pillow
 
-NAMES = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}  # of RealityScan 2.2
+NAMES = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}  # other names in RealityScan 2.2
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")
 LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")  # the template may leave them out
 ORIENTATION = 274  # tag of EXIF
 
 
 def find_table(root: Path) -> Path | None:
-    """The folder's CSV with a pose and a focal length a photo; None where there is none."""
-    return posed.the_one(root, "*.csv", lambda path: bool(_table(path)))
+    """Find the folder's CSV with a pose and a focal length for each photo; None without one."""
+    return posed.only_file(root, "*.csv", lambda path: bool(_table(path)))
 
 
 def _table(path: Path) -> list[list[str]]:
-    """Columns and rows; empty where it is another table."""
+    """Read header and rows; empty if it is another table."""
     try:
         lines = [[v.strip() for v in line] for line in csv.reader(read_text(path).splitlines()) if line]
     except (AwError, csv.Error):
@@ -43,12 +43,12 @@ def _table(path: Path) -> list[list[str]]:
 
 
 def read_realityscan(root: Path) -> ForeignScene:
-    """Poses and lenses of the CSV; a PLY beside is the point cloud in the same coordinate system."""
+    """Read poses and lenses of the CSV, and the point cloud of a PLY beside it in the same coordinates."""
     path = find_table(root)
     if path is None:
         raise AwError(f"{root} has no CSV of RealityScan's export 'Internal/External camera parameters'")
     columns, *lines = _table(path)
-    with posed.written_by("RealityScan", path):
+    with posed.tool_errors("RealityScan", path):
         stated = [dict(zip(columns, line, strict=True)) for line in lines]
         numbers = [{key: float(row[key]) for key in (*POSE, "f", *LENS) if key in row} for row in stated]
     photos = root / "images" if (root / "images").is_dir() else root
@@ -64,19 +64,19 @@ def read_realityscan(root: Path) -> ForeignScene:
 
 
 def _camera(row: dict[str, float], photo: Path, path: Path) -> ModelCamera:
-    """The camera at the size of its photo, which the file does not state."""
+    """Return the camera at the size of its photo, which the CSV does not state."""
     size = header_size(photo)
     if size is None:
         raise AwError(f"{photo} is no image; copy it again")
     with pillow().open(photo) as image:
         turned = image.getexif().get(ORIENTATION, 1) != 1
     if turned:
-        told = f"{photo} is turned by its EXIF, and {path.name} does not say whether its pose is"
-        raise AwError(f"{told}: export undistorted photos, or COLMAP")
+        fault = f"{photo} is turned by its EXIF, and {path.name} does not say whether its pose is"
+        raise AwError(f"{fault}: export undistorted photos, or COLMAP")
     px, py, k1, k2, k3, k4, t1, t2 = (row.get(key, 0.0) for key in LENS)
     if k1 and not any((k2, k3, k4, t1, t2)):
-        told = f"{path}: {photo.name} has k1 alone, as of the lens 'division', which the file does not name"
-        raise AwError(f"{told}: export with a Brown lens, or undistorted photos")
+        fault = f"{path}: {photo.name} has only k1, as of the lens 'division', which the file does not name"
+        raise AwError(f"{fault}: export with a Brown lens, or undistorted photos")
     longer = max(size)
     f, cx, cy = row["f"] * longer / 36, px * longer + size[0] / 2, py * longer + size[1] / 2
     return posed.brown_camera(size, (f, f, cx, cy), (k1, k2, k3, k4), (t2, t1), str(path))

@@ -1,4 +1,4 @@
-"""transforms.json of nerfstudio and instant-ngp, and Blender's transforms_train.json."""
+"""Read transforms.json of nerfstudio and instant-ngp, and Blender's transforms_train.json."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
@@ -22,11 +22,11 @@ _LENS = ("k1", "k2", "p1", "p2")
 WHITE = (255, 255, 255)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file that holds a mapping.
+def read_json(path: Path) -> dict[str, object]:
+    """Read a JSON file that holds a mapping.
 
     Raises:
-        AwError: unreadable, too large, or something else.
+        AwError: unreadable, too large, or no mapping.
     """
     try:
         data = json.loads(read_text(path))
@@ -37,11 +37,11 @@ def read_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def frames_of(data: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
-    """The frames, each with a file and a matrix.
+def frames_of(data: Mapping[str, object], path: Path) -> list[dict[str, object]]:
+    """Return the frames after checking that each has a file and a matrix.
 
     Raises:
-        AwError: there are none, or one lacks either.
+        AwError: there are no frames, or one lacks its file or matrix.
     """
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
@@ -54,12 +54,12 @@ def frames_of(data: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
     return frames
 
 
-def frame_name(frame: Mapping[str, Any], root: Path) -> str:
-    """The frame's path relative to the scene, without a leading "./"."""
+def frame_name(frame: Mapping[str, object], root: Path) -> str:
+    """Return the frame's path relative to the scene, without a leading "./"."""
     return inside(str(frame["file_path"]).replace("\\", "/"), root)
 
 
-def _number(values: Mapping[str, Any], key: str, path: Path) -> float | None:
+def _number(values: Mapping[str, object], key: str, path: Path) -> float | None:
     value = values.get(key)
     if value is None:
         return None
@@ -69,9 +69,9 @@ def _number(values: Mapping[str, Any], key: str, path: Path) -> float | None:
 
 
 def frame_camera(
-    number: int, frame: Mapping[str, Any], data: Mapping[str, Any], photo: Path, path: Path
+    number: int, frame: Mapping[str, object], data: Mapping[str, object], photo: Path, path: Path
 ) -> ModelCamera:
-    """The camera of a frame: its own values before the file's common ones, else the field of view.
+    """Return the camera of a frame: its values first, then the file's common ones, then field of view.
 
     Raises:
         AwError: no focal length, no size, or a camera model that is not supported.
@@ -103,8 +103,8 @@ def frame_camera(
     model = str(both.get("camera_model", "OPENCV")).upper()
     fisheye = model == "OPENCV_FISHEYE" or bool(both.get("is_fisheye"))
     if model not in _MODELS:
-        told = f"{path}: camera_model {model[:40]!r} is not supported"
-        raise AwError(f"{told}; undistort the photos to PINHOLE")
+        problem = f"{path}: camera_model {model[:40]!r} is not supported"
+        raise AwError(f"{problem}; undistort the photos to PINHOLE")
     size_px = (round(width), round(height))
     if fisheye:
         return ModelCamera(number, "OPENCV_FISHEYE", *size_px, (fx, fy, cx, cy, *lens[:2], *third))
@@ -112,32 +112,32 @@ def frame_camera(
 
 
 def read_frames(
-    root: Path, path: Path, data: Mapping[str, Any]
-) -> tuple[Model, Path, dict[str, Mapping[str, Any]]]:
-    """The model of a transforms file, the folder of its photos, and the frames by the model's names.
+    root: Path, path: Path, data: Mapping[str, object]
+) -> tuple[Model, Path, dict[str, Mapping[str, object]]]:
+    """Read the model of a transforms file, the folder of its photos, and the frames by the model's names.
 
     Raises:
         AwError: damaged, or two frames of one photo.
     """
-    found: dict[str, Mapping[str, Any]] = {}
+    frame_of: dict[str, Mapping[str, object]] = {}
     for frame in frames_of(data, path):
         name = frame_name(frame, root)
         photo = find_photo(root, name)
         name = photo.relative_to(root).as_posix() if photo is not None else name
-        if name in found:
-            raise AwError(f"{path}: {name!r} is there twice; keep one frame of it")
-        found[name] = frame
-    tops = {PurePosixPath(n).parts[0] if len(PurePosixPath(n).parts) > 1 else "" for n in found}
-    # A photo's name is relative to the one folder that holds all of them.
+        if name in frame_of:
+            raise AwError(f"{path} lists {name!r} twice; keep one frame of it")
+        frame_of[name] = frame
+    tops = {PurePosixPath(n).parts[0] if len(PurePosixPath(n).parts) > 1 else "" for n in frame_of}
+    # The names of photos become relative to the folder that holds all of them.
     top = tops.pop() if len(tops) == 1 else ""
     folder = root / top if top else root
-    named = {name[len(top) + 1 :] if top else name: frame for name, frame in found.items()}
+    named = {name[len(top) + 1 :] if top else name: frame for name, frame in frame_of.items()}
     rows = [(n, f["transform_matrix"], frame_camera(1, f, data, folder / n, path)) for n, f in named.items()]
     return model_of_poses(rows), folder, named
 
 
 def read_transforms(root: Path) -> ForeignScene:
-    """transforms.json of nerfstudio or instant-ngp."""
+    """Read transforms.json of nerfstudio or instant-ngp."""
     path = root / "transforms.json"
     data = read_json(path)
     model, folder, named = read_frames(root, path, data)
@@ -162,8 +162,8 @@ def read_transforms(root: Path) -> ForeignScene:
     )
 
 
-def _listed(data: Mapping[str, Any], path: Path, root: Path, folder: Path) -> dict[Split, list[str]]:
-    """nerfstudio's own lists; validation photos test where no others do."""
+def _listed(data: Mapping[str, object], path: Path, root: Path, folder: Path) -> dict[Split, list[str]]:
+    """Read nerfstudio's lists; without test photos, the validation photos are the test set."""
     lists: dict[str, list[str]] = {}
     prefix = "" if folder == root else folder.relative_to(root).as_posix() + "/"
     for side in ("train", "val", "test"):
@@ -174,21 +174,23 @@ def _listed(data: Mapping[str, Any], path: Path, root: Path, folder: Path) -> di
     return {"train": lists["train"], "test": lists["test"] or lists["val"]}
 
 
-def _masks(named: Mapping[str, Mapping[str, Any]], split: Mapping[str, Split], root: Path) -> dict[str, Path]:
-    """nerfstudio's masks of training photos: black is ignored, so they are keep masks."""
-    found = {}
+def _masks(
+    named: Mapping[str, Mapping[str, object]], split: Mapping[str, Split], root: Path
+) -> dict[str, Path]:
+    """Find nerfstudio's masks of training photos: black is ignored, so they are keep masks."""
+    mask_files = {}
     for name, frame in named.items():
         mask = frame.get("mask_path")
         if isinstance(mask, str) and split.get(name) == "train":
-            found[name] = root / inside(mask, root)
-    absent = [str(p) for p in found.values() if not p.is_file()]
+            mask_files[name] = root / inside(mask, root)
+    absent = [str(p) for p in mask_files.values() if not p.is_file()]
     if absent:
         raise AwError(f"{len(absent)} masks of {root / 'transforms.json'} are absent: {shortlist(absent, 3)}")
-    return found
+    return mask_files
 
 
 def read_blender(root: Path) -> ForeignScene:
-    """Blender scenes of NeRF: transforms_train.json and transforms_test.json, RGBA photos before white."""
+    """Read NeRF's Blender scenes: transforms_train.json, transforms_test.json, RGBA photos over white."""
     rows, split = [], dict[str, Split]()
     for side in SIDES:
         path = root / f"transforms_{side}.json"
@@ -200,9 +202,9 @@ def read_blender(root: Path) -> ForeignScene:
                 raise AwError(f"{path} names {name}, which is absent; copy all of the scene")
             name = photo.relative_to(root).as_posix()
             if name in split:
-                raise AwError(f"{path}: {name!r} is there twice, or on both sides")
+                raise AwError(f"{path} lists {name!r} twice, or it is in both files")
             rows.append((name, frame["transform_matrix"], frame_camera(1, frame, data, photo, path)))
             split[name] = side
-    note = "photos with alpha are put before white; initial points are random, as there is no model"
+    note = "photos with alpha are composited over white; initial points are random, as there is no model"
     model = model_of_poses(rows)
     return ForeignScene("blender", root, model, root, split, background=WHITE, points="random", notes=(note,))

@@ -38,13 +38,14 @@ def written_by(tool: str, path: Path) -> Iterator[None]:
         raise AwError(f"{path} is not as {tool} writes it ({told}); export it again") from error
 
 
-def the_one(root: Path, pattern: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
-    """The folder's file of this kind.
+def the_one(root: Path, suffix: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
+    """The folder's file with this extension, in any case.
 
     Raises:
         AwError: there are several.
     """
-    found = [path for path in sorted(root.glob(pattern)) if fits(path)]
+    files = (path for path in sorted(root.iterdir()) if path.suffix.lower() == suffix and path.is_file())
+    found = [path for path in files if fits(path)]
     if len(found) > 1:
         told = shortlist([path.name for path in found])
         raise AwError(f"{root} has several files of poses or points: {told}; keep one")
@@ -147,7 +148,7 @@ def posed_scene(
     """The scene of photos below a folder; `points`: a PLY of `root` has the poses' coordinates."""
     model = model_of_poses(rows)
     split, missing, said = sides(sorted(name for name, _, _ in rows), root)
-    cloud = the_one(root, "*.ply") if points else None
+    cloud = the_one(root, ".ply") if points else None
     if cloud is None:
         return ForeignScene(
             kind, root, model, photos, split, missing=missing, notes=(*notes, *said), points="triangulate"

@@ -18,8 +18,11 @@ _MOST_LOGIT = 15.0  # sigmoid differs from 0 and 1 by 3e-7 there; formats that k
 
 
 def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
-    """The Gaussians that can be drawn: rows with a value that is not finite are left out, quaternions have
-    norm 1."""
+    """The Gaussians that can be drawn: rows with a value that is not finite are left out, but an opacity of
+    exactly 0 or 1 (infinite logits) stays; quaternions have norm 1."""
+    # exact 0 and 1 as converters of 8-bit alpha write them
+    logits = np.nan_to_num(gaussians["opacity_logits"], nan=np.nan, posinf=_MOST_LOGIT, neginf=-_MOST_LOGIT)
+    gaussians = {**gaussians, "opacity_logits": logits}
     sound = np.ones(len(gaussians["means"]), bool)
     for name in _NAMES:
         sound &= np.isfinite(gaussians[name]).all(axis=tuple(range(1, gaussians[name].ndim)))

@@ -92,19 +92,15 @@ def lay_out_masks(
     return {"kept_share": shares, "alpha": sorted(alpha)}
 
 
-def alpha_warning(photos: int) -> str:
-    """Return the warning for photos whose alpha hides pixels."""
-    return (
-        f"alpha of {counted(photos, 'photo')} hides pixels: nothing is learnt from them, and psnr_valid of "
-        "test photos leaves them out"
-    )
-
-
 def mask_warnings(facts: MaskResult | None) -> list[str]:
     """Warn of alpha that hides pixels, and of masks that keep so little that they may be inverted."""
     shares = list(facts["kept_share"].values()) if facts else []
-    hidden = len(facts.get("alpha", ())) if facts else 0
-    warnings = [alpha_warning(hidden)] if hidden else []
+    warnings = []
+    if hidden := len(facts.get("alpha", ())) if facts else 0:
+        warnings = [
+            f"alpha of {counted(hidden, 'photo')} hides pixels: nothing is learnt from them, and psnr_valid "
+            "of test photos leaves them out"
+        ]
     if not shares or np.median(shares) >= LITTLE_KEPT:
         return warnings
     return [

@@ -29,6 +29,14 @@ class FileEntry(TypedDict):
     bytes: int
 
 
+class Evaluation(TypedDict, total=False):
+    """How the dataset's papers measure; the key "evaluation" of scene.json, which `aw bench` follows."""
+
+    protocol: Literal["full", "half"]
+    effects: list[str]  # fitted on the left half of a test photo
+    source: str
+
+
 class SceneInfo(TypedDict, total=False):
     """The keys of scene.json that programs read, and what `load_scene` adds; the file may hold more."""
 
@@ -38,7 +46,7 @@ class SceneInfo(TypedDict, total=False):
     images: str  # folder of that factor
     license: str
     dataset: str  # name of the data set in result tables
-    evaluation: Facts  # how the dataset's papers measure: protocol, effects
+    evaluation: Evaluation
     build_key: str
     inputs: Facts  # what it was built from
     files: dict[str, FileEntry]  # path relative to the scene -> its entry

@@ -5,26 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Literal, TypedDict
+from typing import Literal
 
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.core.scene import Split
+from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, Model
 from ambiguous_wild.io.scene_folder import TEST_EVERY
 
 SIDES: tuple[Split, Split] = ("train", "test")
 LARGEST = 100_000_000  # bytes of a text file
 SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
-
-
-class Evaluation(TypedDict, total=False):
-    """How the dataset's papers measure; the key "evaluation" of scene.json, which `aw bench` follows."""
-
-    protocol: Literal["full", "half"]
-    effects: list[str]  # fitted on the left half of a test photo
-    source: str
 
 
 @dataclass(frozen=True)
@@ -174,7 +166,7 @@ def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
     """
     c2w = np.asarray(matrix, dtype=np.float64)
     if c2w.shape not in ((4, 4), (3, 4)) or not np.isfinite(c2w).all():
-        raise AwError(f"a transform_matrix is {list(c2w.shape)} or not finite; it must be [4, 4] numbers")
+        raise AwError(f"a transform_matrix of shape {list(c2w.shape)} is not [4, 4] finite numbers")
     rotation = c2w[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise AwError("a transform_matrix has no rotation in its left 3x3 part (scaled or mirrored)")

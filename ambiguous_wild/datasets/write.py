@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NotRequired, TypedDict, cast
 
 from ambiguous_wild.builder.downsample import check_factor
-from ambiguous_wild.builder.masks import alpha_warning
+from ambiguous_wild.builder.masks import mask_warnings
 from ambiguous_wild.builder.package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.report import point_checks
@@ -37,6 +37,7 @@ from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import Model, ModelCamera
 from ambiguous_wild.io.files import check_output, refuse_foreign_files, sweep, write_json, write_text
+from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
@@ -253,8 +254,9 @@ def _write_scene(
     with ThreadPoolExecutor(jobs) as pool:
         placed = list(pool.map(one, plans))
     bar.finish()
-    if hidden := sum(HIDDEN in p.notes for p in placed):
-        notes.append(alpha_warning(hidden))
+    shares = {str(m): float((read_gray(m) > 0).mean()) for m in (folder / "masks").rglob("*.png")}
+    hidden = [p.image.name for p in placed if HIDDEN in p.notes]
+    notes += mask_warnings({"kept_share": shares, "alpha": hidden})
     if lost := [note for p in placed for note in p.notes if note.startswith("undistorted without")]:
         notes.append(f"{counted(len(lost), 'photo')} {max(lost)}: the lens sees more than a pinhole camera")
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}
@@ -375,5 +377,5 @@ def _record(
     if settings.dataset or foreign.dataset:
         record["dataset"] = settings.dataset or foreign.dataset
     if foreign.evaluation:
-        record["evaluation"] = dict(foreign.evaluation)
+        record["evaluation"] = foreign.evaluation
     return record

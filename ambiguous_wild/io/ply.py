@@ -104,7 +104,7 @@ def read_place(path: Path | str) -> Place:
         AwError: the numbers in its comments are invalid.
     """
     with open(path, "rb") as f:
-        head = f.read(_MAX_HEADER).partition(b"end_header")[0]
+        head = f.read(_MAX_HEADER).partition(b"\nend_header")[0]
     words = dict(re.findall(rb"^comment (offset|training_scale|rotation) (.+)$", head, re.MULTILINE))
     if not {b"offset", b"training_scale"} <= words.keys():
         return UNMOVED
@@ -178,10 +178,11 @@ def has_splats(path: Path) -> bool:
     """
     try:
         with open(path, "rb") as f:
-            head = f.read(_MAX_HEADER).partition(b"end_header")[0]
+            head = f.read(_MAX_HEADER).partition(b"\nend_header")[0]
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
-    return not head.startswith(b"ply") or b" opacity" in head or b"element chunk" in head
+    splats = re.search(rb"^(property \w+ opacity|element chunk)\b", head, re.MULTILINE)
+    return not head.startswith(b"ply") or splats is not None
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -200,9 +201,10 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     spelt = [of for of in _SPELLINGS if all(c in names for c in of)]
     if not spelt:
         return xyz, np.full(xyz.shape, 128, np.uint8)
-    rgb = np.stack([table[c] for c in spelt[0]], axis=1)
-    shares = rgb.dtype.kind == "f" and not (rgb > 1.0).any()  # others write 0 to 255 as floats
-    return xyz, np.clip(rgb * (255.0 if shares else 1.0), 0, 255).astype(np.uint8)
+    rgb = np.nan_to_num(np.stack([table[c] for c in spelt[0]], axis=1))
+    most = rgb.max(initial=0)  # 16 bits, 8 bits (some write them as floats), or shares
+    white = 65535 if most > 256 else 1 if rgb.dtype.kind == "f" and most <= 1 else 255
+    return xyz, np.rint(np.clip(rgb * (255.0 / white), 0, 255)).astype(np.uint8)
 
 
 def write_point_ply(
@@ -282,8 +284,8 @@ def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int, str]:
     """Parse the header: number of vertices, their dtype, offset of the data, and format."""
     if not head.startswith(b"ply"):
         raise AwError(f"{path} is no PLY file: it does not start with 'ply'")
-    end = head.find(b"end_header")
-    newline = head.find(b"\n", end)
+    end = head.find(b"\nend_header")  # a comment may hold the word
+    newline = head.find(b"\n", end + 1)
     if end < 0 or newline < 0:
         raise AwError(f"{path}: no end of the PLY header within its first {_MAX_HEADER} bytes")
     count, fields, element, form = -1, [], "", ""

@@ -18,7 +18,13 @@ _MOST_LOGIT = 15.0  # its sigmoid is 3e-7 below 1; formats that store alpha cann
 
 
 def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
-    """Return the Gaussians whose values are all finite, with quaternions of norm 1."""
+    """Return the Gaussians that can be drawn, with quaternions of norm 1.
+
+    Rows with a value that is not finite are left out; an opacity of exactly 0 or 1 (infinite logits) stays.
+    """
+    # exact 0 and 1 as converters of 8-bit alpha write them
+    logits = np.nan_to_num(gaussians["opacity_logits"], nan=np.nan, posinf=_MOST_LOGIT, neginf=-_MOST_LOGIT)
+    gaussians = {**gaussians, "opacity_logits": logits}
     sound = np.ones(len(gaussians["means"]), bool)
     for name in _NAMES:
         sound &= np.isfinite(gaussians[name]).all(axis=tuple(range(1, gaussians[name].ndim)))

@@ -71,6 +71,8 @@ def export_runs(
             names in `output`.
     """
     files, notes = read_files(paths)
+    if up is not None and files and scene_folder is None:
+        raise AwError(f"{files[0].ply}: --up needs the cameras of its scene: name its folder with --scene")
     runs = [path for path in paths if not path.is_file()]
     trained, more = find_models(runs) if runs else ([], [])
     for note in (*notes, *more):
@@ -103,8 +105,6 @@ def export_runs(
             if up is not None or run is None:
                 raise
             say(f"{model.label}: the loss is not measured: {error}")
-        if up is not None and scene is None:
-            raise AwError(f"{model.ply}: --up needs the cameras of its scene: name its folder with --scene")
         space = None if up is None or scene is None else space_of(scene)
         views = scene.test if scene is not None and loss else ()
         stem = "point_cloud" if output is None and run is not None else name

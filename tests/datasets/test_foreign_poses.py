@@ -96,7 +96,9 @@ def write_points(path: Path) -> None:
 RADIAL, P1, P2 = [-0.2, 0.12, -0.05, 0.02], 0.003, -0.002
 
 
-def realityscan(root: Path, header: str = "heading,pitch,roll,f,px,py") -> list[Shot]:
+def realityscan(
+    root: Path, header: str = "heading,pitch,roll,f,px,py", spreadsheet: bool = False
+) -> list[Shot]:
     """Angles by the rows of RealityCapture's own world-to-camera matrix; lengths in longer sides."""
     lines = [f"#cameras {COUNT}", f"#name,x,y,alt,{header},k1,k2,k3,k4,t1,t2"]
     truth = shots([f"IMG_{i}.png" for i in range(COUNT)])
@@ -110,7 +112,11 @@ def realityscan(root: Path, header: str = "heading,pitch,roll,f,px,py") -> list[
         numbers = [*shot.centre, *np.degrees(angles), f, px, py, *RADIAL, P1, P2]
         lines.append(",".join([shot.name, *map(repr, map(float, numbers))]))
         write_photo(root / "images" / shot.name, shot)
-    (root / "cameras.csv").write_text("\r\n".join(lines), encoding="utf-8-sig")
+    text = "\r\n".join(lines)
+    if spreadsheet:  # as one saves it in half of Europe
+        (root / "Cameras.CSV").write_text(text.replace(",", ";").replace(".", ",").replace(",png", ".png"))
+    else:
+        (root / "cameras.csv").write_text(text, encoding="utf-8-sig")
     write_points(root / "points.ply")
     return truth
 
@@ -199,7 +205,7 @@ def record3d(root: Path, name: str = "metadata.json", each: bool = True) -> list
     return truth
 
 
-def nerfcapture(root: Path, studio: bool = False) -> list[Shot]:
+def nerfcapture(root: Path, studio: bool = False, folder: str = "images/") -> list[Shot]:
     """Its common camera is a place holder: each frame states its own; file_path lacks the extension."""
     truth = shots([f"{i}.png" for i in range(COUNT)])
     frames = []
@@ -208,7 +214,7 @@ def nerfcapture(root: Path, studio: bool = False) -> list[Shot]:
             shot.pixels = brown(shot.rays(), RADIAL, P1, P2) * lens[:2] + lens[2:]
         write_photo(root / "images" / shot.name, shot)
         frame = dict(zip(("fl_x", "fl_y", "cx", "cy"), lens)) | {"w": 320, "h": 240, "timestamp": 1.5}
-        path = f"images/{Path(shot.name).stem}"
+        path = f"{folder}{Path(shot.name).stem}"
         frames.append({"file_path": path, "depth_path": f"{path}.depth.png"} | frame)
         frames[-1]["transform_matrix"] = shot.to_world().tolist()
     common = {"fl_x": 1.0, "fl_y": 1.0, "cx": 320, "cy": 240, "w": 320, "h": 240, "depth_integer_scale": 1.0}
@@ -245,6 +251,7 @@ def feed_forward(root: Path, model: str = "PINHOLE", share: float = 1.0) -> list
 FORMATS = {
     "realityscan": (realityscan, {}),
     "realityscan 2.2": (realityscan, {"header": "yaw,pitch,roll,f_35mm,px_norm,py_norm"}),
+    "realityscan spreadsheet": (realityscan, {"spreadsheet": True}),
     "metashape": (metashape, {}),
     "metashape 1": (metashape, {"place": "chunk"}),
     "metashape fisheye": (metashape, {"kind": "fisheye"}),
@@ -254,6 +261,9 @@ FORMATS = {
     "record3d": (record3d, {}),
     "record3d r3d": (record3d, {"name": "metadata", "each": False}),
     "instant-ngp nerfcapture": (nerfcapture, {}),
+    "instant-ngp colmap2nerf": (nerfcapture, {"folder": "../../data/fox/images/"}),
+    "instant-ngp Windows": (nerfcapture, {"folder": "C:\\me\\images\\"}),
+    "instant-ngp absolute": (nerfcapture, {"folder": "/home/me/images/"}),
     "nerfstudio": (nerfcapture, {"studio": True}),
     "colmap vggt": (feed_forward, {}),
     "colmap vggt ba": (feed_forward, {"model": "SIMPLE_PINHOLE"}),

@@ -137,6 +137,13 @@ def test_a_label_map_is_no_mask(tmp_path):
     )
 
 
+def test_masks_that_keep_little_are_suspected_to_be_inverted_in_an_import_too(tmp_path):
+    root = layouts.nerfstudio(tmp_path / "raw")
+    cv2.imwrite(str(root / "masks" / "m.png"), np.eye(layouts.HEIGHT, layouts.WIDTH, dtype=np.uint8) * 255)
+    (note,) = (n for n in import_scene(root, tmp_path / "scene").info["imported"]["notes"] if "median" in n)
+    assert "keep only" in note and "are they inverted?" in note
+
+
 def _one_photo(root):
     layouts.write_photos(root / "images", layouts.NAMES[:1])
     layouts.write_model(root / "sparse" / "0", layouts.make_model(layouts.NAMES[:1]))

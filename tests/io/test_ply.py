@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
+from ambiguous_wild.io.ply import has_splats, read_point_ply, read_splat_ply, write_splat_ply
 
 
 def model(n=5, rest=15, seed=0):
@@ -122,3 +122,16 @@ def test_wrong_shapes_are_refused_and_leave_no_file(tmp_path):
         with pytest.raises(AwError, match=f"no {name}"):
             write_splat_ply(tmp_path / "a.ply", broken)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("kind", "white"), [("<u2", 65535), ("<f4", 1.0), ("<f4", 255.0), ("u1", 255)])
+def test_colours_are_read_by_their_range_and_comments_are_no_header(tmp_path, kind, white):
+    names = {"<u2": "ushort", "<f4": "float", "u1": "uchar"}
+    head = ["ply", "format binary_little_endian 1.0", "comment opacity 1 before the end_header"]
+    head += ["element vertex 3", *(f"property float {a}" for a in "xyz")]
+    head += [*(f"property {names[kind]} {c}" for c in ("red", "green", "blue")), "end_header\n"]
+    table = np.zeros(3, [(a, "<f4") for a in "xyz"] + [(c, kind) for c in "rgb"])
+    table["r"], table["g"], table["b"] = [0, white, 0], [white, 0, 0], white * np.array([1, 3, 2]) / 3
+    (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + table.tobytes())
+    assert not has_splats(tmp_path / "a.ply")
+    assert read_point_ply(tmp_path / "a.ply")[1].tolist() == [[0, 255, 85], [255, 0, 255], [0, 0, 170]]

@@ -115,7 +115,8 @@ def test_the_commands_take_files_beside_runs_and_alone(tmp_path: Path) -> None:
     assert Path(ply["path"]) == tmp_path / "export" / "stranger.ply" and ply["psnr_to_model"] == "inf"
     assert ply["gaussians"] == 2499 and spz["psnr_to_model"] > 35
     assert aw(*words).returncode == 2  # the user's files stay
-    assert "--up needs the cameras" in aw(*words, "--overwrite", "--up", "z").stderr
+    assert "--up needs the cameras" in aw(*words, "-o", tmp_path / "turned", "--up", "z").stderr
+    assert not (tmp_path / "turned").exists()
 
 
 def test_what_is_no_splat_file_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:

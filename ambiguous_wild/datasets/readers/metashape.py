@@ -23,7 +23,7 @@ LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "
 
 def find_cameras(root: Path) -> Path | None:
     """Find the folder's XML of cameras; None without one."""
-    return posed.only_file(root, "*.xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
+    return posed.only_file(root, ".xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
 
 
 def read_metashape(root: Path) -> ForeignScene:

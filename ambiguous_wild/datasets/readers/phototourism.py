@@ -6,8 +6,8 @@ import csv
 from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import Evaluation, ForeignScene, read_text, split_by_lists
+from ambiguous_wild.core.scene import Evaluation, Split
+from ambiguous_wild.datasets.foreign import ForeignScene, read_text, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import (
     has_lists,
     model_names,

@@ -38,17 +38,18 @@ def tool_errors(tool: str, path: Path) -> Iterator[None]:
         raise AwError(f"{path} is not as {tool} writes it ({reason}); export it again") from error
 
 
-def only_file(root: Path, pattern: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
-    """Return the folder's only file of this kind; None without one.
+def only_file(root: Path, suffix: str, fits: Callable[[Path], bool] = lambda _: True) -> Path | None:
+    """Return the folder's only file with this extension, in upper or lower case; None without one.
 
     Raises:
         AwError: there are several files.
     """
-    files = [path for path in sorted(root.glob(pattern)) if fits(path)]
-    if len(files) > 1:
-        names = shortlist([path.name for path in files])
+    files = (path for path in sorted(root.iterdir()) if path.suffix.lower() == suffix and path.is_file())
+    fitting = [path for path in files if fits(path)]
+    if len(fitting) > 1:
+        names = shortlist([path.name for path in fitting])
         raise AwError(f"{root} has several files of poses or points: {names}; keep one")
-    return files[0] if files else None
+    return fitting[0] if fitting else None
 
 
 def find_posed(folder: Path, names: Sequence[str], where: Path) -> list[str]:
@@ -147,7 +148,7 @@ def posed_scene(
     """Make a scene of photos below a folder; `points`: a PLY in `root` has the coordinates of the poses."""
     model = model_of_poses(rows)
     split, missing, more = sides(sorted(name for name, _, _ in rows), root)
-    cloud = only_file(root, "*.ply") if points else None
+    cloud = only_file(root, ".ply") if points else None
     if cloud is None:
         return ForeignScene(
             kind, root, model, photos, split, missing=missing, notes=(*notes, *more), points="triangulate"

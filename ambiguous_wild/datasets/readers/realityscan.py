@@ -27,15 +27,19 @@ ORIENTATION = 274  # tag of EXIF
 
 def find_table(root: Path) -> Path | None:
     """Find the folder's CSV with a pose and a focal length for each photo; None without one."""
-    return posed.only_file(root, "*.csv", lambda path: bool(_table(path)))
+    return posed.only_file(root, ".csv", lambda path: bool(_table(path)))
 
 
 def _table(path: Path) -> list[list[str]]:
     """Read header and rows; empty if it is another table."""
     try:
-        lines = [[v.strip() for v in line] for line in csv.reader(read_text(path).splitlines()) if line]
+        text = read_text(path).splitlines()
+        head = " ".join(text[:2])
+        separator = max(",;\t", key=head.count)  # a spreadsheet saves others, with decimal commas
+        lines = [[v.strip() for v in line] for line in csv.reader(text, delimiter=separator)]
     except (AwError, csv.Error):
         return []
+    lines = [line for line in lines if any(line)]
     lines = lines[1:] if lines and lines[0][0].startswith("#cameras") else lines
     columns = [v.removeprefix("#").casefold() for v in lines[0]] if lines else []
     columns = [NAMES.get(column, column) for column in columns]
@@ -50,7 +54,10 @@ def read_realityscan(root: Path) -> ForeignScene:
     columns, *lines = _table(path)
     with posed.tool_errors("RealityScan", path):
         stated = [dict(zip(columns, line, strict=True)) for line in lines]
-        numbers = [{key: float(row[key]) for key in (*POSE, "f", *LENS) if key in row} for row in stated]
+        numbers = [
+            {key: float(row[key].replace(",", ".")) for key in (*POSE, "f", *LENS) if key in row}
+            for row in stated
+        ]
     photos = root / "images" if (root / "images").is_dir() else root
     rows = []
     for name, row in zip(posed.find_posed(photos, [row["name"] for row in stated], path), numbers):

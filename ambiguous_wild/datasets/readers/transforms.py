@@ -56,7 +56,23 @@ def frames_of(data: Mapping[str, object], path: Path) -> list[dict[str, object]]
 
 def frame_name(frame: Mapping[str, object], root: Path) -> str:
     """Return the frame's path relative to the scene, without a leading "./"."""
-    return inside(str(frame["file_path"]).replace("\\", "/"), root)
+    return below(str(frame["file_path"]), root)
+
+
+def below(name: str, root: Path) -> str:
+    """Return a file's path relative to the scene; of a path on another computer the end that exists here.
+
+    Raises:
+        AwError: such a path has no end that is a file of the scene.
+    """
+    pure = PurePosixPath(name.replace("\\", "/"))
+    if not (pure.is_absolute() or ".." in pure.parts or name[1:2] == ":"):
+        return inside(str(pure), root)
+    parts = pure.parts[1 + max((k for k, part in enumerate(pure.parts) if part == ".."), default=0) :]
+    for end in ("/".join(parts[k:]) for k in range(len(parts))):
+        if find_photo(root, inside(end, root)) is not None:
+            return end
+    raise AwError(f"{name[:200]!r} leads out of {root}, which has no copy of it; put it there")
 
 
 def _number(values: Mapping[str, object], key: str, path: Path) -> float | None:
@@ -153,7 +169,7 @@ def read_transforms(root: Path) -> ForeignScene:
     studio = isinstance(points, str) or "camera_model" in data or "applied_transform" in data
     kind = "nerfstudio" if studio else "instant-ngp"
     if isinstance(points, str):
-        xyz, rgb = read_point_ply(root / inside(points, root))
+        xyz, rgb = read_point_ply(root / below(points, root))
         model = Model(model.cameras, model.images, points_without_tracks(xyz, rgb))
         notes.append(f"points from {points}, without the photos that see them")
     where: Literal["model", "triangulate"] = "model" if len(model.points.ids) else "triangulate"
@@ -170,7 +186,7 @@ def _listed(data: Mapping[str, object], path: Path, root: Path, folder: Path) ->
         names = data.get(f"{side}_filenames", [])
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
             raise AwError(f"{path}: {side}_filenames is no list of names")
-        lists[side] = [inside(n, root).removeprefix(prefix) for n in names]
+        lists[side] = [below(n, root).removeprefix(prefix) for n in names]
     return {"train": lists["train"], "test": lists["test"] or lists["val"]}
 
 
@@ -182,7 +198,7 @@ def _masks(
     for name, frame in named.items():
         mask = frame.get("mask_path")
         if isinstance(mask, str) and split.get(name) == "train":
-            mask_files[name] = root / inside(mask, root)
+            mask_files[name] = root / below(mask, root)
     absent = [str(p) for p in mask_files.values() if not p.is_file()]
     if absent:
         raise AwError(f"{len(absent)} masks of {root / 'transforms.json'} are absent: {shortlist(absent, 3)}")

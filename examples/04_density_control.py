@@ -28,7 +28,7 @@ class ByPixels(DensityControl):
         half = gradients.screen.new_tensor([step.camera.width / 2, step.camera.height / 2])
         self.grad_sum += (gradients.screen * half).norm(dim=1) * gradients.count
         self.pixels += gradients.count
-        self.seen += step.rendered.visible.float()
+        self.views_seen += step.rendered.visible.float()
 
     def choose(self, step, gaussians) -> Growth:
         score = self.grad_sum / self.pixels.clamp(min=1)

@@ -51,7 +51,7 @@ class AbsDensity(DensityControl):
 
     config: AbsGsConfig
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "abs_sum": (), "seen": ()}
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "abs_sum": (), "views_seen": ()}
     abs_sum: Tensor  # [N] sum of the absolute gradient's norm over views that saw the row
     last_clamp = 0  # iteration
 
@@ -67,7 +67,7 @@ class AbsDensity(DensityControl):
 
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
         """Choose clones and splits together: rows farthest above their threshold come first."""
-        seen, small = self.seen.clamp(min=1), self.small(gaussians)
+        seen, small = self.views_seen.clamp(min=1), self.small(gaussians)
         signed = self.grad_sum / seen / max(self.config.grow_grad, 1e-12)
         score = torch.where(small, signed, self.abs_sum / seen / self.config.split_grad)
         chosen = largest(score, score >= 1.0, self.room(step, gaussians))

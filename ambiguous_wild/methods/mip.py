@@ -68,7 +68,7 @@ class AbsoluteMipDensity(MipDensity):
     """Density control that also grows by the absolute gradient, as many Gaussians as by the signed one."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": (), "abs_sum": ()}
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": (), "abs_sum": ()}
     abs_sum: Tensor  # [N] sum over views of |dL/du| + |dL/dv| of single pixels, times half the picture's size
 
     @torch.no_grad()
@@ -81,7 +81,7 @@ class AbsoluteMipDensity(MipDensity):
             self.abs_sum += torch.where(step.rendered.visible, norms, torch.zeros_like(norms))
 
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
-        seen, small = self.seen.clamp(min=1), self.small(gaussians)
+        seen, small = self.views_seen.clamp(min=1), self.small(gaussians)
         signed, absolute = self.grad_sum / seen, self.abs_sum / seen
         growing = signed >= self.config.grow_grad
         share = float(growing.float().mean())

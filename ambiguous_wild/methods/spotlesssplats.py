@@ -85,7 +85,7 @@ class PruningDensity(SpotLessDensity):
     """Density control that also removes Gaussians on which pictures hardly depended since the last round."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"squared"})
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": (), "use_sum": ()}
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": (), "use_sum": ()}
     use_sum: Tensor  # [N] sum of squared screen gradients, 1/px^2
 
     @torch.no_grad()

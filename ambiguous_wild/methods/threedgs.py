@@ -10,5 +10,5 @@ from ambiguous_wild.splat.parts import Parts
 
 
 def build(options: NoOptions) -> Parts:
-    """Return the default parts: no mask, density control of 3DGS with a working opacity reset."""
+    """Return the default parts: no mask, growth by `DensityControl` of splat/density.py."""
     return Parts()

@@ -42,7 +42,7 @@ class UncertaintyAware(DensityControl):
     config: UadConfig
     needs: ClassVar[frozenset[str]] = frozenset({"count"})
     reads_keep: ClassVar[bool] = True
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": ()}
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
@@ -57,7 +57,7 @@ class UncertaintyAware(DensityControl):
         norms = torch.linalg.vector_norm(self.statistic(gradients) * scale, dim=1)
         weight = torch.where(step.rendered.visible, weight, torch.zeros_like(weight))
         self.grad_sum += weight * norms
-        self.seen += weight
+        self.views_seen += weight
 
 
 def footprint_mean(

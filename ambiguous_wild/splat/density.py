@@ -39,7 +39,7 @@ class DensityConfig:
     resets: tuple[float, ...] = (3000.0, 6000.0, 9000.0, 12_000.0)
     min_reset_spacing: int = 3000  # real iterations between resets, and before the first
     min_reset_rest: int = 6000  # real iterations left after a reset: until then it costs decibels
-    grow_grad: float = 2e-4  # mean norm of dL/d(u, v), scaled to half the image size
+    grow_grad: float = 2e-4  # mean norm of dL/d(u, v) over the views that saw it, times half the image size
     grow_scale: float = 0.01  # of the scene extent: clone below, split above
     prune_opacity: float = 0.005
     prune_scale: float = 0.1  # of the scene extent, applied after the first reset
@@ -79,14 +79,14 @@ class DensityControl:
     # True as in WildGaussians: rows change before the optimiser's step, which is then left out
     before_optimiser: ClassVar[bool] = False
     # sums for each Gaussian since the last round: attribute name, and the shape after [N]
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "seen": ()}
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}
 
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
         self.config = config
         self.extent = extent
         self.rng = np.random.default_rng([seed, 0xD3])
-        self.grad_sum: Tensor  # [N] sum of the statistic's norm over views that saw the row
-        self.seen: Tensor  # [N] number of those views
+        self.grad_sum: Tensor  # [N] sum of the statistic's norm over the views in which the row was visible
+        self.views_seen: Tensor  # [N] number of those views alone: rarely seen rows are not diluted
         for name, shape in self.sums.items():
             setattr(self, name, torch.zeros(0, *shape))
         self.last_growth = 0  # iteration
@@ -110,7 +110,9 @@ class DensityControl:
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
-        """Add one view's statistic, times half the image size, so that it does not depend on resolution.
+        """Add one view to the sums of the rows that are visible in it; other rows stay as they are.
+
+        The statistic is multiplied by half the image size, so that it does not depend on the resolution.
 
         Args:
             step: the training step of the view.
@@ -124,7 +126,7 @@ class DensityControl:
         visible = step.rendered.visible
         norms = torch.linalg.vector_norm(self.statistic(gradients) * scale, dim=1)
         self.grad_sum += torch.where(visible, norms, torch.zeros_like(norms))
-        self.seen += visible.to(self.seen.dtype)
+        self.views_seen += visible.to(self.views_seen.dtype)
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
@@ -227,10 +229,14 @@ class DensityControl:
 
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
         """Choose the rows that grow in this round, at most `room` of them."""
-        score = self.grad_sum / self.seen.clamp(min=1)
+        score = self.mean_gradient()
         chosen = largest(score, score > self.config.grow_grad, self.room(step, gaussians))
         small = self.small(gaussians)
         return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+
+    def mean_gradient(self) -> Tensor:
+        """Return the mean norm of each row's statistic over the views that saw it, [N]; 0 where none did."""
+        return self.grad_sum / self.views_seen.clamp(min=1)
 
     def room(self, step: Step, gaussians: Gaussians) -> int:
         """Return how many Gaussians may be added now."""

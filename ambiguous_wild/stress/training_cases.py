@@ -111,7 +111,7 @@ def _one_round(g: Gaussians, screen: torch.Tensor, ceiling: int, **config: Any) 
     optimiser.step(_gradients(after, 0.0, screen), torch.zeros(len(after), dtype=torch.bool))
     moments = optimiser.state_dict()
     rows = {len(t) for kind in ("first", "second") for t in moments[kind].values()}
-    return after, rows | {len(density.seen), len(density.grad_sum)} == {len(after)}
+    return after, rows | {len(density.views_seen), len(density.grad_sum)} == {len(after)}
 
 
 @case(9, "density control that would remove all, clones all, meets the cap, meets NaN")

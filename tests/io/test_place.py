@@ -74,8 +74,8 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
     write_splat_ply(ply, inner, scene.place)
     assert read_place(ply) == scene.place
     model = Model("m", ply)
-    before = Renderer(wall, model.look)(plain.test[0].camera).astype(int)
-    after = Renderer(model.read(), model.look)(scene.test[0].camera).astype(int)
+    before = Renderer(wall, model.render_settings)(plain.test[0].camera).astype(int)
+    after = Renderer(model.read(), model.render_settings)(scene.test[0].camera).astype(int)
     assert before.std() > 10 and np.abs(before - after).mean() < 0.5
 
     # files and their metadata give the positions of the user's coordinates back

@@ -28,10 +28,11 @@ def control(config=CONFIG):
     return AbsDensity(config, extent=1.0, seed=0)
 
 
-def step_of(g, iteration=1, ceiling=100):
-    """A picture of 200 x 100 px in which all are visible: gradients count 100 and 50 times."""
+def step_of(g, iteration=1, ceiling=100, hidden=()):
+    """A picture of 200 x 100 px: gradients count 100 and 50 times; all rows but `hidden` are visible."""
     camera = Camera(200, 100, 100.0, 100.0, 100.0, 50.0, torch.eye(4).numpy())
     rendered = SimpleNamespace(visible=torch.ones(len(g), dtype=torch.bool))
+    rendered.visible[list(hidden)] = False
     return SimpleNamespace(
         iteration=iteration, nominal=float(iteration), camera=camera, rendered=rendered, gaussians=g,
         ceiling=ceiling,
@@ -60,12 +61,12 @@ def test_small_ones_grow_by_the_signed_gradient_and_large_ones_by_the_absolute()
     assert chosen(density, g) == ([0], [3])
 
 
-def test_the_statistic_is_the_mean_over_views():
+def test_the_statistic_is_the_mean_over_views_that_saw_the_row():
     g, density = four(), control()
     density.observe(step_of(g), gradients(g, [0.0] * 4, [0.0, 0.0, 9e-6, 5e-6]))
-    density.observe(step_of(g), gradients(g, [0.0] * 4, [0.0, 0.0, 0.0, 5e-6]))
-    assert density.abs_sum.tolist() == pytest.approx([0.0, 0.0, 9e-4, 1e-3])
-    assert density.seen.tolist() == [2.0] * 4
+    density.observe(step_of(g, hidden=[3]), gradients(g, [0.0] * 4, [0.0, 0.0, 0.0, 9e-6]))
+    assert density.abs_sum.tolist() == pytest.approx([0.0, 0.0, 9e-4, 5e-4])
+    assert density.views_seen.tolist() == [2.0, 2.0, 2.0, 1.0]
     assert chosen(density, g) == ([], [2, 3])  # means 4.5e-4 and 5e-4
 
 

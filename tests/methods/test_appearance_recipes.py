@@ -317,7 +317,7 @@ def test_growth_waits_after_a_reset():
     g = gaussians(n=10, rest=3)
     density._match(g)
     density.grad_sum += 5.0
-    density.seen += 1
+    density.views_seen += 1
     density.last_reset = 1000
     for iteration, count in ((1106, 0), (1107, 10)):
         growth = density.choose(SimpleNamespace(iteration=iteration, ceiling=100), g)

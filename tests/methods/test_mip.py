@@ -62,7 +62,7 @@ def test_matched_growth_takes_as_many_by_the_absolute_gradient():
     g = gaussians(n=100, rest=3)
     density = AbsoluteMipDensity(DensityConfig(grow_grad=1.0), extent=1.0, seed=0)
     density._match(g)
-    density.seen += 2
+    density.views_seen += 2
     density.grad_sum[:10] = 4.0  # 2 on average: a tenth of all is above the threshold
     density.abs_sum += 2 * absolute
     growth = density.choose(SimpleNamespace(ceiling=1000), g)
@@ -105,7 +105,7 @@ def test_masked_views_and_small_ones_count_less():
 
     see(1.0, [10.0, 30.0], None)
     see(3.0, [30.0, 10.0], torch.full((view.height, view.width), 0.5))
-    mean = density.grad_sum / density.seen
+    mean = density.grad_sum / density.views_seen
     # (10 * 1 + 15 * 3) / 25 and (30 * 1 + 5 * 3) / 35
     assert mean.tolist() == pytest.approx([55 / 25, 45 / 35])
 

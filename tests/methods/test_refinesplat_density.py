@@ -60,7 +60,7 @@ def test_merging_removes_quiet_twins_and_keeps_statistics_in_step():
     optimiser = SimpleNamespace(select=lambda rows: calls.append(int(rows.sum())), append=calls.append)
     control = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
     control._match(gaussians)
-    control.seen += 1
+    control.views_seen += 1
     control.grad_sum[:] = 0.0
     control.grad_sum[:5] = 1.0  # busy ones stay as they are
     step = SimpleNamespace(nominal=12_000.0)
@@ -68,7 +68,7 @@ def test_merging_removes_quiet_twins_and_keeps_statistics_in_step():
     assert len(merged) == 25
     assert control.merged == 15
     assert calls == [10, 15]
-    assert len(control.seen) == len(control.downhill) == 25
+    assert len(control.views_seen) == len(control.downhill) == 25
     assert control.after_growth(step, merged, optimiser) is merged  # not due again
     other = EntropyAwareDensity(EntropyDensityConfig(), 1.0, 0)
     other.load_state_dict(control.state_dict())

@@ -380,13 +380,13 @@ def test_a_round_on_an_accelerator_merges_what_the_cpu_merges(monkeypatch, most)
         rates = dict.fromkeys(("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest"), 1e-3)
         density = EntropyAwareDensity(EntropyDensityConfig(merge=merging.MergeConfig(most=most)), 1.0, 0)
         density._match(g)
-        density.seen += 1
+        density.views_seen += 1
         density.log.begin(5000)
         step = SimpleNamespace(nominal=5000.0, iteration=5000, gaussians=g)
         on(monkeypatch, False)
         optimiser = SplatAdam(g, rates)
         on(monkeypatch, there)
-        found = merging.merged(g, density.seen > 0, density.config.merge)
+        found = merging.merged(g, density.views_seen > 0, density.config.merge)
         on(monkeypatch, False)
         results.append((density.after_growth(step, g, optimiser), density, found[1]))
     (host, one, a), (device, two, b) = results

@@ -110,7 +110,7 @@ def test_rows_of_everything_go_together(share, left):
     after, events, optimiser = refined(control, gaussians, 60, LEFT_MASKED)
     assert len(after) == left
     assert events == (["prune"] if left == 3 else [])
-    for rows in (control.support.looked, control.support.kept, control.downhill, control.seen):
+    for rows in (control.support.looked, control.support.kept, control.downhill, control.views_seen):
         assert len(rows) in (left, 0)
     if left == 3:
         assert torch.equal(after.means, MEANS[1:])

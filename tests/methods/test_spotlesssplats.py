@@ -154,7 +154,7 @@ def test_gaussians_without_use_are_removed_but_not_new_ones():
     density._match(g)
     density.use_sum[:] = 1e-3
     density.use_sum[:4] = 1e-9
-    density.seen += 1
+    density.views_seen += 1
     density.grad_sum[10:13] = 1.0
     step = SimpleNamespace(iteration=10, nominal=10.0, gaussians=g, ceiling=1000)
     gone, kept = g.means[:4].clone(), g.means[4:10].clone()

@@ -192,10 +192,10 @@ def test_a_photo_that_is_all_masked_moves_nothing_and_is_said(scene, tmp_path, f
     moved = {}
     for iteration in range(1, 13):
         before = trainer.gaussians.clone()
-        seen = trainer.density.seen.clone()
+        seen = trainer.density.views_seen.clone()
         trainer.step()
         if trainer.pace.view(iteration) == 2 and len(seen):
-            assert torch.equal(trainer.density.seen, seen)  # nobody was looked at
+            assert torch.equal(trainer.density.views_seen, seen)  # nobody was looked at
         assert mask.last.rendered.visible.any()  # what the method was shown does not change
         same = all(torch.equal(t, getattr(before, name)) for name, t in trainer.gaussians.items())
         moved[trainer.pace.view(iteration)] = not same

@@ -85,7 +85,7 @@ def test_the_statistic_does_not_depend_on_the_resolution():
         density = DensityControl(DensityConfig(), extent=1.0, seed=0)
         step = step_at(gaussians, 10, 600.0, width=size, height=size)
         density.observe(step, gradients(gaussians, torch.full((8, 2), 1e-4 * factor)))
-        scores.append(density.grad_sum / density.seen)
+        scores.append(density.grad_sum / density.views_seen)
     assert torch.allclose(scores[0], scores[1])
 
 
@@ -98,7 +98,7 @@ def test_rows_that_no_view_saw_do_not_dilute_the_mean():
     density.observe(
         step_at(gaussians, 2, 600.0, visible=~seen), gradients(gaussians, torch.full((8, 2), 0.0))
     )
-    assert density.seen.tolist() == [1] * 8
+    assert density.views_seen.tolist() == [1] * 8
     assert density.grad_sum[2] == pytest.approx(2**0.5)
 
 
@@ -118,7 +118,7 @@ def test_transparent_ones_are_pruned_and_everything_keeps_its_row():
     screen[1] = torch.tensor([1e-2, 0.0])
     after, _, density, optimiser = refined(before, screen, extent=1000.0)
     assert len(after) == 8
-    assert len(density.seen) == len(density.grad_sum) == 8
+    assert len(density.views_seen) == len(density.grad_sum) == 8
     zero = {name: torch.zeros_like(tensor) for name, tensor in after.items()}
     optimiser.bind(after)
     optimiser.step(Gradients(**zero, screen=torch.zeros(8, 2)), torch.ones(8, dtype=torch.bool), RATES)

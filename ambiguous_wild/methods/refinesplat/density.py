@@ -240,8 +240,7 @@ class EntropyAwareDensity(DensityControl):
             return gaussians
         self.last_merge = step.nominal
         # rows that no view has seen since the last round, above all new copies, have no statistic
-        score = self.grad_sum / self.seen.clamp(min=1)
-        candidates = (self.seen > 0) & (score < config.merge_grad)
+        candidates = (self.views_seen > 0) & (self.mean_gradient() < config.merge_grad)
         result = merged(gaussians, candidates, config.merge)
         if result is None:
             return gaussians

@@ -182,7 +182,8 @@ def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry])
         key, equals, value = setting.partition("=")
         method, dot, option = key.partition(".")
         if not equals or not dot:
-            raise AwError(f"--set {setting!r}: write METHOD.KEY=VALUE, e.g. refinesplat.lambda_cr=0.1")
+            example = f"{entries[0].name}.{setting}" if equals else "refinesplat.lambda_cr=0.1"
+            raise AwError(f"--set {setting!r}: write METHOD.KEY=VALUE, e.g. --set {example}")
         applied = False
         for entry in entries:
             keys = entry.option_keys(method, option)

@@ -232,6 +232,7 @@ class Trainer(Run):
             self.watchdog.look_at_loss(step, keep, loss)
         with part("mask loss"):
             method_cotangents = self.parts.mask.cotangent(step, keep)
+            _refuse_a_loss(method_cotangents, step)
         if self.sentinel is None and keep is not None and not bool(keep.any()):
             # Nothing to learn: steps by Adam's momentum alone would drift away from the scene.
             self._skipped.add(step.view)
@@ -339,6 +340,20 @@ class Trainer(Run):
         self._look_back()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
+
+
+def _refuse_a_loss(value: object, step: Step) -> None:
+    """Raise AwError if `cotangent` of a mask policy returned a loss, or a gradient of another shape."""
+    if value is None or isinstance(value, Cotangents):
+        return
+    shape = list(step.rendered.image.shape)
+    if not isinstance(value, Tensor) or list(value.shape) != shape:
+        what = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+        raise AwError(
+            f"cotangent(step, keep) of the method's mask policy gave {what}; it must give the gradient of "
+            "the loss, not the loss: Cotangents(image=torch.autograd.grad(loss, image)[0]), "
+            f"{shape} (docs/extend.md)"
+        )
 
 
 def _for_statistics(step: Step, gradients: Gradients, called_off: Tensor) -> tuple[Step, Gradients]:

@@ -1,5 +1,6 @@
 """The recipes in examples/ and docs/extend.md: the same text, short, and each does what it is for."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 from click.testing import CliRunner
 
 from ambiguous_wild.cli.bench import command as bench
+from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
@@ -24,6 +26,7 @@ RECIPES = {
     "03_appearance_effect": "lamps",
     "04_density_control": "by_pixels",
     "06_view_layer": "view_layers",
+    "07_render_loss": "smooth",
 }
 
 
@@ -53,6 +56,24 @@ def trained(name: str, scene, folder, iterations=200, **config) -> Trainer:
     trainer = Trainer(data, entry.build(entry.options()), config, folder=folder / name)
     trainer.train()
     return trainer
+
+
+def test_a_loss_of_ones_own_acts_and_a_loss_in_place_of_its_gradient_is_refused(tmp_path):
+    scene = load_scene(write_tiny_scene(tmp_path / "scene"))
+    entry = get_method(reference("07_render_loss"))
+    variation = []
+    for weight in (0.0, 10.0):
+        data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
+        parts = entry.build(dataclasses.replace(entry.options(), weight=weight))
+        trainer = Trainer(data, parts, TrainConfig(iterations=60, probes=0), folder=tmp_path / str(weight))
+        trainer.train()
+        image = trainer.render(scene.test[0].camera).image
+        variation.append(float(image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean()))
+    assert variation[1] < 0.8 * variation[0]
+    for wrong in (torch.tensor(1.0), 1.0, torch.zeros(2, 2)):
+        parts.mask.cotangent = lambda step, keep, wrong=wrong: wrong
+        with pytest.raises(AwError, match=r"it must give the gradient of the loss, not the loss"):
+            Trainer(data, parts, TrainConfig(iterations=60, probes=0), folder=tmp_path / "w").train()
 
 
 def error(trainer: Trainer, scene) -> float:

@@ -1,0 +1,33 @@
+"""A mask policy with a loss of its own on the render: total variation of the picture.
+
+aw bench --method 3dgs --method examples/07_render_loss.py:smooth --scene SCENE -o runs
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.step import Step
+
+
+@dataclass(frozen=True)
+class Config:
+    weight: float = 0.01  # of the loss; the photometric loss is a mean over all pixels and channels
+
+
+class Smooth(MaskPolicy):
+    def __init__(self, config: Config):
+        self.config = config
+
+    def cotangent(self, step: Step, keep: torch.Tensor | None) -> Cotangents:
+        image = step.rendered.image.detach().requires_grad_()  # [H, W, 3]; the renderer has no autograd graph
+        variation = image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean()
+        return Cotangents(image=torch.autograd.grad(self.config.weight * variation, image)[0])
+
+
+def smooth(config: Config) -> Parts:
+    return Parts(mask=Smooth(config))

@@ -23,7 +23,7 @@ from ambiguous_wild.harness.chosen_effects import Chosen
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
 from ambiguous_wild.harness.run import error_line, run_cell
-from ambiguous_wild.harness.start import StartFile
+from ambiguous_wild.harness.start import recorded_start
 from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.graft import split_graft
@@ -133,7 +133,6 @@ def make_cell(job: Job) -> Cell:
     config = job.config
     entry = get_method(config["method"])
     scene = _scene(job.scene, config["scene"]["factor"])
-    start = config.get("start")
     cell = Cell(
         method=entry,
         options=from_plain(type(entry.options()), config["options"], f"options of {entry.name}"),
@@ -143,7 +142,7 @@ def make_cell(job: Job) -> Cell:
         device=config["device"],
         chosen=job.chosen,
         protocol="half" if config.get("protocol") == "half" else "full",
-        start=StartFile(Path(start["path"]), start["sha256"]) if start else None,
+        start=recorded_start(config.get("start")),
     )
     if cell.identity != job.identity:
         raise AwError(

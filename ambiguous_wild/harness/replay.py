@@ -13,7 +13,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import from_plain
-from ambiguous_wild.harness.start import StartFile, started
+from ambiguous_wild.harness.start import recorded_start, started
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
@@ -59,14 +59,14 @@ def replay(run: Path) -> Replay:
     entry = get_method(method)
     parts = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
     parts = with_effects(parts, tuple(config.get("effects", ())))
-    given = config.get("start")
-    file = StartFile(Path(given["path"]), given["sha256"]) if given else None
     settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
     scene = load_scene(path, factor=factor)
     with tempfile.TemporaryDirectory(prefix="aw-replay-") as name:
         folder = Path(name)
         data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
-        trainer = Trainer(data, started(parts, file, scene), settings, folder=folder)
+        trainer = Trainer(
+            data, started(parts, recorded_start(config.get("start")), scene), settings, folder=folder
+        )
         if (findings[0] / GOOD).exists():
             trainer.checkpoint_path.parent.mkdir(parents=True)
             shutil.copyfile(findings[0] / GOOD, trainer.checkpoint_path)

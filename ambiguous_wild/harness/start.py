@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,6 +26,14 @@ class StartFile:
 
     path: Path
     sha256: str
+    # what it holds, of a file that was read for planning
+    count: int = field(default=0, compare=False)
+    kind: Literal["splats", "points"] = field(default="points", compare=False)
+
+
+def recorded_start(record: dict[str, str] | None) -> StartFile | None:
+    """Return the file that the key "start" of a run's config.yaml names; None without the key."""
+    return StartFile(Path(record["path"]), record["sha256"]) if record else None
 
 
 def start_file(path: Path) -> StartFile:
@@ -34,8 +42,10 @@ def start_file(path: Path) -> StartFile:
     Raises:
         AwError: the file cannot be read, or is of another kind.
     """
-    _read(path)
-    return StartFile(path.resolve(), sha256_file(path))
+    content = _read(path)
+    is_splats = isinstance(content, Splats)
+    count = len(content.gaussians["means"]) if isinstance(content, Splats) else len(content[0])
+    return StartFile(path.resolve(), sha256_file(path), count, "splats" if is_splats else "points")
 
 
 def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
@@ -69,14 +79,13 @@ def start_line(start: StartFile, method: str, parts: Parts, train: TrainConfig, 
     from ambiguous_wild.splat.pace import room
     from ambiguous_wild.splat.parts import thinned
 
-    content = _read(start.path)
-    is_splats = isinstance(content, Splats)
-    count = len(content.gaussians["means"]) if isinstance(content, Splats) else len(content[0])
     sizes = [(view.camera.height, view.camera.width) for view in scene.train]
     most = room(train, parts.schedule, sizes, parts.density_config.max_gaussians)
-    kept = len(thinned(count, most))
-    thin = f", chosen at random: it may have {most:,} Gaussians (--max-gaussians)" if kept < count else ""
-    of = f"{kept:,} of the {count:,} {'splats' if is_splats else 'points'} of {start.path.name}"
+    kept = len(thinned(start.count, most))
+    thin = (
+        f", chosen at random: it may have {most:,} Gaussians (--max-gaussians)" if kept < start.count else ""
+    )
+    of = f"{kept:,} of the {start.count:,} {start.kind} of {start.path.name}"
     return f"{scene.name}: {method} starts from {of}{thin}"
 
 

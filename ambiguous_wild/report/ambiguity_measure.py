@@ -271,16 +271,12 @@ def load_photo(view: View) -> np.ndarray:  # [H, W, 3] float32 in [0, 1]
 
 def seen_by(features: str, photo: np.ndarray) -> np.ndarray:  # [h, w, 3]
     """Return the photo as the features see it: for labhog at most `LOOKS_PX` large, else unchanged."""
-    import cv2
-
     size = _size(features, photo.shape)
     return photo if size is None else cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
 
 
 def small_mask(features: str, mask: np.ndarray) -> np.ndarray:  # [h, w] bool
     """Return a mask [H, W] at the size of `seen_by`."""
-    import cv2
-
     size = _size(features, mask.shape)
     if size is None:
         return mask

@@ -127,7 +127,6 @@ def _file_names(scenes: Sequence[str], labels: Sequence[str]) -> list[str]:
 
 
 GIF_FPS = 12.0
-PATHS = ("test", "orbit")
 
 
 @dataclass(frozen=True)
@@ -277,8 +276,6 @@ def watch(
     Raises:
         AwError: viser is missing, the port is taken, or the run failed.
     """
-    from ambiguous_wild.core import AwError
-
     shown = LiveView(host, port, paused=paused) if view is None else view
     try:
         say(f"watch it at http://{host}:{shown.port}")

@@ -29,7 +29,6 @@ EFFECTS: dict[str, tuple[str, str, str]] = {
     "sh1": ("", "", "spherical harmonics up to degree 1"),
     "sh2": ("", "", "spherical harmonics up to degree 2"),
 }  # fmt: skip
-COLOUR = ("exposure", "appearance")  # fitted on half a test photo if the protocol says so
 ALL = ("exposure", "appearance", "antialias", "poses")
 DEGREES = {"sh0": 0, "sh1": 1, "sh2": 2}
 

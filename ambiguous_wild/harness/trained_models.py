@@ -241,8 +241,8 @@ def view_runs(
     Raises:
         AwError: no run with a model, several scenes, no scene, or another page in the folder.
     """
-    check_page_folder(output)
     shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    check_page_folder(output)  # after the models: it makes the folder
     return write_page(
         output,
         shown.scene,

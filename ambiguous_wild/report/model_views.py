@@ -185,9 +185,9 @@ def video_runs(
     frames = round(seconds * fps)
     if frames < 2:
         raise AwError(f"{seconds:g} seconds at {fps:g} frames per second are fewer than two frames")
-    for wanted in (output, *([gif] if gif else [])):
-        check_output(wanted)
     shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    for wanted in (output, *([gif] if gif else [])):
+        check_output(wanted)  # after the models: it makes the folder
     for note in shown.notes:
         say(note)
     cameras = _cameras(shown.scene, path, frames, width)

@@ -41,7 +41,7 @@ class Page:
 
 
 def check_page_folder(folder: Path) -> None:
-    """Check, before anything is read, that the page can be written to a folder.
+    """Check, before anything is drawn, that the page can be written to a folder.
 
     Raises:
         AwError: the path is a file, cannot be written, or holds a page of another program.

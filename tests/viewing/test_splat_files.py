@@ -128,7 +128,7 @@ def test_what_is_no_splat_file_is_one_line_and_leaves_nothing(tmp_path: Path) ->
             out = tmp_path / ("o.mp4" if command == "video" else "o")
             done = aw(command, tmp_path / name, "-o", out)
             assert done.returncode == 2 and done.stderr.count("\n") == 1 and name in done.stderr, done.stderr
-            assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["a.ply"]
+            assert [p.name for p in tmp_path.rglob("*")] == ["a.ply"]
 
 
 def test_a_scene_around_a_model_is_upright_for_a_turned_file(tmp_path: Path) -> None:

@@ -70,6 +70,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     iterations = known_iterations(runs) or _iterations(scene, seconds - (time.monotonic() - begin), threads)
     length = ["--iterations", str(iterations)]
     step("plan", scene, *length, "-o", plan, done=plan)
+    say(f"renders of your photos appear while it trains: {runs / '*' / '*' / 'seed0' / 'pictures'}")
     step(
         "bench", "--method", ",".join(METHODS), "--scene", scene, *length, "--plan", plan, "-o", runs, *cores
     )
@@ -88,7 +89,9 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
 def _compile_kernels() -> subprocess.Popen[bytes]:
     """Compile the trainer's kernels in another process, while photos are read and placed."""
     code = "from ambiguous_wild.splat.calibration import warm_up; warm_up()"
-    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
 
 
 def _announced(source: Path, seconds: float) -> str:

@@ -1,6 +1,6 @@
 """Draw the pictures of a run into RUN/pictures.
 
-training_<photo>.png  photo, render, error and masks of a train view, a row for each moment of the run; the rows
+training_<photo>.png  photo, render, error and masks of a train view, a row for each moment of the run; rows
                       appear while it trains
 masks.jpg             train photos with the masks of the trained method
 density.png           where Gaussians were added and merged, and their number over time

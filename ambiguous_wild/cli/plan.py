@@ -6,6 +6,7 @@ import functools
 import json
 import math
 import shutil
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.core import Scene
     from ambiguous_wild.harness.effects_plan import Decision, Plan
 
+COLUMNS = 100  # of the table
 MASKS = (
     "masks: no effect to switch on; a method makes them while it trains (aw bench --method refinesplat, or "
     "another of 'aw methods'), or you give your own (aw build-scene --keep-masks FOLDER)"
@@ -139,18 +141,21 @@ def _check_overwrite(path: Path, probe: bool) -> None:
 
 
 def table(plan: Plan) -> list[str]:
-    """Return the plan as text lines for a terminal."""
-    head = ("effect", "evidence", "found", "from", "gain", "decision", "ms/iteration", "why")
+    """Return the plan as lines of at most `COLUMNS` characters: a table, and a sentence for each effect."""
+    head = ("effect", "decision", "found", "on from", "gain on held-back pixels", "ms/iteration")
     rows = [head, *(_row(d) for d in plan.decisions)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]
-    lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[-1]]).rstrip() for row in rows]
-    effects = ",".join(plan.effects()) or "none"
-    masks = [MASKS] if any(d.effect == "masks" for d in plan.decisions) else []
-    return [*lines, *masks, f"{plan.scene}: --effects {effects}"]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths)).rstrip() for row in rows]
+    for d in plan.decisions:
+        sentence = f"{d.effect} {d.decision}: {d.why} ({d.evidence}, {d.unit})"
+        lines += textwrap.wrap(sentence, COLUMNS, subsequent_indent="  ")
+    if any(d.effect == "masks" for d in plan.decisions):
+        lines += textwrap.wrap(MASKS, COLUMNS, subsequent_indent="  ")
+    return [*lines, f"{plan.scene}: --effects {','.join(plan.effects()) or 'none'}"]
 
 
 def _row(d: Decision) -> tuple[str, ...]:
-    found = "—" if math.isnan(d.value) else f"{d.value:.3g} {d.unit}"
+    found = "—" if math.isnan(d.value) else f"{d.value:.3g}"
     gain = "—" if d.gain_db is None else f"{d.gain_db:+.2f} ± {d.error_db:.2f} dB"
     cost = "—" if d.cost_ms is None else f"{d.cost_ms:+.2f}"
-    return d.effect, d.evidence, found, f"{d.threshold:g}", gain, d.decision, cost, d.why
+    return d.effect, d.decision, found, f"{d.threshold:g}", gain, cost

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-import shutil
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,14 +33,7 @@ MASKS = (
     "--probe/--no-probe",
     default=True,
     show_default=True,
-    help="Try effects and masks in short trainings on small photos; without probes only the limits decide.",
-)
-@click.option(
-    "--iterations",
-    type=click.IntRange(1),
-    default=30_000,
-    show_default=True,
-    help="Length of the run that the plan is for: probes take a tenth of it at most.",
+    help="Find out in short trainings on small photos whether distractors call for masks.",
 )
 @click.option(
     "--costs/--no-costs",
@@ -57,19 +49,16 @@ def command(
     scene: Path,
     factor: int | None,
     probe: bool,
-    iterations: int,
     costs: bool,
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure SCENE and decide which effects it needs: evidence, limit, gain of a probe, decision and cost.
+    """Measure SCENE and decide which effects it needs: evidence, limit, decision, cost, and a sentence why.
 
-    An effect that reaches its limit is tried in two short trainings, with and without it, and measured on pixels
-    that both leave out. 'aw bench --effects auto' decides the same way, but not about masks.
+    'aw bench --effects auto' decides the same way. Masks are not its decision, but that of METHOD.
     """
     from ambiguous_wild.core.errors import AwError
-    from ambiguous_wild.harness.effects_plan import plan_without_training
-    from ambiguous_wild.harness.select_effects import untried
+    from ambiguous_wild.harness.effects_plan import plan_effects
     from ambiguous_wild.io.files import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene
 
@@ -83,12 +72,11 @@ def command(
         from ambiguous_wild.cli.options import prepare_cpu
 
         prepare_cpu(None)
+    plan = plan_effects(loaded)
     if probe:
-        plan = _probed(loaded, iterations, path, as_json)
-    else:
-        plan = untried(plan_without_training(loaded), "--no-probe")
+        plan = _with_masks(plan, loaded, as_json)
     if costs:
-        from ambiguous_wild.harness.residual_probe import effect_costs
+        from ambiguous_wild.harness.mask_plan import effect_costs
 
         plan = plan.with_costs(effect_costs(loaded))
     write_json(path, plan.plain())
@@ -97,30 +85,15 @@ def command(
         return
     for line in table(plan):
         click.echo(line)
-    if plan.cost is not None:
-        click.echo(plan.cost.line())
     click.echo(f"wrote {path}")
 
 
-def _probed(scene: Scene, iterations: int, path: Path, quiet: bool) -> Plan:
-    """Make the plan from probes; finished probes are kept beside its file until it is written."""
+def _with_masks(plan: Plan, scene: Scene, quiet: bool) -> Plan:
     from tqdm import tqdm
 
-    from ambiguous_wild.harness.make_plan import plan_with_probes
-    from ambiguous_wild.splat.pace import TrainConfig
+    from ambiguous_wild.harness.mask_plan import with_masks
 
-    folder = path.parent / f".{path.name}.probes"
-    plan = plan_with_probes(
-        scene,
-        TrainConfig(iterations=iterations),
-        folder,
-        masks=True,
-        prepare=lambda: None,  # done
-        say=lambda text: None if quiet else click.echo(text),
-        bar=functools.partial(tqdm, unit="it", desc="probe", disable=quiet or None),
-    )
-    shutil.rmtree(folder, ignore_errors=True)
-    return plan
+    return with_masks(plan, scene, functools.partial(tqdm, unit="it", desc="masks", disable=quiet or None))
 
 
 def _check_overwrite(path: Path, probe: bool) -> None:

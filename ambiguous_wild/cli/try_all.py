@@ -69,7 +69,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         compiling.wait()
     iterations = known_iterations(runs) or _iterations(scene, seconds - (time.monotonic() - begin), threads)
     length = ["--iterations", str(iterations)]
-    step("plan", scene, *length, "-o", plan, done=plan)
+    step("plan", scene, "--no-probe", "-o", plan, done=plan)
     say(f"renders of your photos appear while it trains: {runs / '*' / '*' / 'seed0' / 'pictures'}")
     step(
         "bench", "--method", ",".join(METHODS), "--scene", scene, *length, "--plan", plan, "-o", runs, *cores

@@ -169,6 +169,7 @@ def supply(line: str, folder: Path) -> None:
 def test_the_commands_in_blocks_run(page: Path, inputs: Path, tmp_path: Path, monkeypatch) -> None:
     for name in ("http_proxy", "https_proxy"):
         monkeypatch.setenv(name, "http://127.0.0.1:9")  # no network
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # for Ray's workers
     monkeypatch.setitem(sys.modules, "viser", None)
     text = page.read_text(encoding="utf-8")
     wrong = []

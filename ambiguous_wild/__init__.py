@@ -19,6 +19,7 @@ _OFFERED = {
     "Metric": "harness.measures",
     "bench": "harness.bench",
     "build_scene": "builder.pipeline",
+    "open_run": "harness.replay",
     "plan": "harness.mask_plan",
     "read_runs": "harness.store",
     "table": "report.comparison",
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.bench import bench as bench
     from ambiguous_wild.harness.mask_plan import plan as plan
     from ambiguous_wild.harness.measures import Metric as Metric
+    from ambiguous_wild.harness.replay import open_run as open_run
     from ambiguous_wild.harness.store import read_runs as read_runs
     from ambiguous_wild.report.comparison import table as table
 

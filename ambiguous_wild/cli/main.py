@@ -114,6 +114,7 @@ COMMANDS = {
     "view": ("view", "Write a page to fly through models and compare them; or watch a training."),
     "video": ("view", "Film models side by side along one camera path: mp4, GIF."),
     "export": ("view", "Write models as compressed PLY, SPZ, SOG and glTF, with the loss in dB."),
+    "explain": ("explain", "Say why a pixel of a train photo is masked or kept."),
     "leaderboard": ("leaderboard", "Check runs, collect them in CSV files and publish them as a page."),
     "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
     "stress": ("stress", "Numerical stress tests against float64; replay of a training that met a NaN."),
@@ -130,7 +131,7 @@ SECTIONS = {
     ),
     "Train": ("plan", "bench", "ablate", "methods", "weights", "doctor"),
     "Compare": ("table", "cost", "study"),
-    "Look": ("view", "video", "export"),
+    "Look": ("view", "video", "explain", "export"),
     "Publish": ("leaderboard", "package"),
     "For maintainers": ("stress", "rescore", "audit", "verify"),
 }  # fmt: skip

@@ -1,10 +1,11 @@
-"""Replay a run that met a value that is not finite, from its last good state."""
+"""Bring the trainer of a run back: after its last step, or where a value was not finite."""
 
 from __future__ import annotations
 
 import json
 import shutil
 import tempfile
+import weakref
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,22 +52,12 @@ def replay(run: Path) -> Replay:
         raise AwError(f"{run} holds no {FOLDER}/*/{REPORT}: all its values were finite; name another run")
     report, config = _read(findings[0] / REPORT), _read(run / "config.yaml")
     try:
-        method, train, device = config["method"], config["train"], torch.device(config["device"])
-        options, path, factor = config["options"], config["scene"]["path"], config["scene"]["factor"]
         last, message = int(report["iteration"]), str(report["message"])
     except (KeyError, TypeError) as error:
-        raise AwError(f"{run} cannot be replayed: its config or report lacks {error}") from None
-    entry = get_method(method)
-    parts = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
-    parts = with_effects(parts, tuple(config.get("effects", ())))
-    settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
-    scene = load_scene(path, factor=factor)
+        raise AwError(f"{run} cannot be replayed: its report lacks {error}") from None
     with tempfile.TemporaryDirectory(prefix="aw-replay-") as name:
         folder = Path(name)
-        data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
-        trainer = Trainer(
-            data, started(parts, recorded_start(config.get("start")), scene), settings, folder=folder
-        )
+        trainer = _trainer(run, config, folder, folder / "cache")
         if (findings[0] / GOOD).exists():
             trainer.checkpoint_path.parent.mkdir(parents=True)
             shutil.copyfile(findings[0] / GOOD, trainer.checkpoint_path)
@@ -79,6 +70,45 @@ def replay(run: Path) -> Replay:
         except NonFinite as error:
             return Replay(message, str(error), start)
     return Replay(message, "", start)
+
+
+def open_run(run: Path | str) -> Trainer:
+    """Return the trainer of a run as it was when the run was last saved, to look into it; never train it.
+
+    `trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view, divisor=1))` is the keep map of a
+    train photo. Nothing is written to the run.
+
+    Raises:
+        AwError: the folder is no run, its method or scene is gone, or a file is damaged.
+    """
+    run = Path(run)
+    if not (run / "config.yaml").is_file():
+        raise AwError(f"{run} is no run of 'aw bench': it holds no config.yaml")
+    cache = Path(tempfile.mkdtemp(prefix="aw-open-"))  # of features, for as long as the trainer lives
+    trainer = _trainer(run, _read(run / "config.yaml"), run, cache)
+    weakref.finalize(trainer, shutil.rmtree, cache, ignore_errors=True)
+    if not trainer.resume():
+        raise AwError(f"{run} holds no checkpoint: run 'aw bench' again")
+    return trainer
+
+
+def _trainer(run: Path, config: dict[Any, Any], folder: Path, cache: Path) -> Trainer:
+    """Return the run's trainer before its first step, with its files in `folder`."""
+    try:
+        method, device, options = config["method"], torch.device(config["device"]), config["options"]
+        path, factor, train = config["scene"]["path"], config["scene"]["factor"], config["train"]
+    except (KeyError, TypeError) as error:
+        raise AwError(f"{run} cannot be opened: its config lacks {error}") from None
+    entry = get_method(method)
+    if entry.passes > 1:
+        raise AwError(f"{run} was trained twice, the second time with the masks in {run / 'masks'}")
+    parts = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
+    parts = with_effects(parts, tuple(config.get("effects", ())))
+    settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
+    scene = load_scene(path, factor=factor)
+    data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=cache)
+    parts = started(parts, recorded_start(config.get("start")), scene)
+    return Trainer(data, parts, settings, folder=folder)
 
 
 def _read(path: Path) -> dict[Any, Any]:

@@ -85,6 +85,9 @@ class GraftedPolicy(MaskPolicy):
     def panels(self, step: Step) -> dict[str, np.ndarray]:
         return self.mask.panels(step)
 
+    def explain(self, step: Step, x: int, y: int) -> list[str]:
+        return self.mask.explain(step, x, y)
+
     def draw(self, folder: Path) -> list[Path]:
         return self.mask.draw(folder)
 

@@ -100,6 +100,10 @@ class MaskPolicy:
         """
         return {}
 
+    def explain(self, step: Step, x: int, y: int) -> list[str]:
+        """Return why the pixel in column x and row y of the photo is kept or masked, in lines."""
+        return []
+
     def draw(self, folder: Path) -> list[Path]:
         """Write the policy's own pictures after the last step; returns their paths."""
         return []

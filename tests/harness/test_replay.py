@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
@@ -9,8 +10,9 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.main import cli
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
-from ambiguous_wild.harness.replay import replay
+from ambiguous_wild.harness.replay import open_run, replay
 from ambiguous_wild.harness.result_file import read_result
+from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.pace import TrainConfig
@@ -86,3 +88,52 @@ def test_a_parameter_found_before_saving_is_found_again(run):
     assert "parameter of log_scales" in report.error
     again = replay(folder)
     assert again.same, again
+
+
+@pytest.fixture(scope="module")
+def masked(tmp_path_factory):
+    """A finished run of refinesplat."""
+    root = tmp_path_factory.mktemp("masked")
+    train = TrainConfig(iterations=300, probes=0)
+    (cell,) = plan_cells(["refinesplat"], [write_tiny_scene(root / "scene")], [0], train)
+    (report,) = run_cells([cell], root / "runs")
+    assert report.outcome == "trained", report.error
+    return report.folder
+
+
+def test_an_opened_run_draws_the_masks_that_it_wrote(masked):
+    before = {p: p.read_bytes() for p in masked.rglob("*") if p.is_file()}
+    trainer = open_run(masked)
+    for view, photo in enumerate(trainer.data.scene.train):
+        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view, divisor=1))
+        written = read_keep_map((masked / "masks" / photo.name).with_suffix(".png"))
+        assert torch.equal(keep > 0.5, torch.from_numpy(written))
+    assert before == {p: p.read_bytes() for p in masked.rglob("*") if p.is_file()}
+
+
+def test_a_pixel_is_explained(masked):
+    written = read_keep_map(sorted((masked / "masks").rglob("*.png"))[0])
+    photo = sorted((masked / "masks").rglob("*.png"))[0].stem
+    said = {}
+    for kept in (True, False):
+        row, column = (int(v) for v in np.argwhere(written == kept)[0])
+        done = CliRunner().invoke(cli, ["explain", str(masked), photo, str(column), str(row)])
+        assert done.exit_code == 0, done.output
+        said[kept] = done.output
+    assert "kept\n" in said[True] and "masked\n" in said[False]
+    assert all("threshold of the scene's instances: " in text for text in said.values())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("nowhere.png", "0", "0"), "unknown train photo"),
+        (("{photo}", "999", "0"), "no pixel 999, 0"),
+    ],
+)
+def test_what_cannot_be_explained_is_named(masked, words, message):
+    photo = sorted((masked / "masks").rglob("*.png"))[0].stem
+    done = CliRunner().invoke(cli, ["explain", str(masked), *(word.format(photo=photo) for word in words)])
+    assert done.exception is not None and message in str(done.exception)
+    with pytest.raises(AwError, match="is no run of 'aw bench'"):
+        open_run(masked.parent)

@@ -292,6 +292,9 @@ class RefineSplatMask(PausingMask):
     def panels(self, step: Step) -> dict[str, np.ndarray]:
         return pictures.panels(self, step, begun=self.begun(step))
 
+    def explain(self, step: Step, x: int, y: int) -> list[str]:
+        return pictures.explain(self, step, x, y)
+
     def draw(self, folder: Path) -> list[Path]:
         return pictures.draw_entropies(self, folder)
 

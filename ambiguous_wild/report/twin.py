@@ -57,9 +57,12 @@ MOVES = (
 NOISE = 1.5 / 255  # simulated photos without noise and sharp JPEGs have up to 1.3 codes of texture
 BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise
 # Response of the simulator, measured on its presets (docs/simulation.md): evidence at a setting of 1.
-SPREAD_OF_STOP = 0.163  # `exposure` of one stop of exposure_drift
+SPREAD_OF_STOP = 0.155  # `exposure` of one stop of exposure_drift: 0.145 to 0.163 in four captures
 SPREAD_OF_DAY = 0.036  # `appearance` of time_of_day at strength 1
 OWN_SAMPLING = 1.3  # `sampling` without zoom
+OF_ZOOM = (
+    0.68  # spread of the logarithm of `sampling` over that of the zooms: wide photos see more near ground
+)
 BACKDROP_M = 7.1  # from the cameras to the walls behind the hub
 PALE = (0.6, 0.7, 0.85)  # of the backdrop, linear light
 LOWEST_M = 2.0  # foot of a backdrop: above the heads of distractors
@@ -233,11 +236,11 @@ def _iso(noise: float) -> float:
 def _zoom(sampling: float) -> tuple[float, float]:
     """Return the range of zooms that adds what the walk lacks of the ratio between pixel sizes.
 
-    The ratio leaves out a twentieth of the photos at both ends; spreads of logarithms add up in squares.
+    Spreads of logarithms add up in squares.
     """
     if math.isnan(sampling) or sampling <= OWN_SAMPLING:
         return 1.0, 1.0
-    spread = math.sqrt(math.log(sampling) ** 2 - math.log(OWN_SAMPLING) ** 2) / 0.9
+    spread = math.sqrt(math.log(sampling) ** 2 - math.log(OWN_SAMPLING) ** 2) / OF_ZOOM
     half = math.exp(min(spread, math.log(8)) / 2)
     low = max(1 / half, 0.5)
     return round(low, 2), round(min(low * half**2, 4.0), 2)

@@ -60,9 +60,8 @@ BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise
 SPREAD_OF_STOP = 0.155  # `exposure` of one stop of exposure_drift: 0.145 to 0.163 in four captures
 SPREAD_OF_DAY = 0.036  # `appearance` of time_of_day at strength 1
 OWN_SAMPLING = 1.3  # `sampling` without zoom
-OF_ZOOM = (
-    0.68  # spread of the logarithm of `sampling` over that of the zooms: wide photos see more near ground
-)
+OF_ZOOM = 0.68  # spread of log `sampling` over that of log zoom: wide photos see more near ground
+BARE = 0.5  # `uncovered` over the share of a photo above the foot of a backdrop: points beside it span a part
 BACKDROP_M = 7.1  # from the cameras to the walls behind the hub
 PALE = (0.6, 0.7, 0.85)  # of the backdrop, linear light
 LOWEST_M = 2.0  # foot of a backdrop: above the heads of distractors
@@ -147,7 +146,11 @@ def spec_like(of: Likeness, width: int | None = None) -> Twin:
     seen = of.evidence
     outward = seen.outward > OUTWARD
     place = "yard" if outward else "courtyard"
-    factor = max(min(of.factor, LONGEST // max(of.size)), 1) if width is None else max(width // of.size[0], 1)
+    factor = (
+        max(min(of.factor, LONGEST // max(of.size)), 1)
+        if width is None
+        else max(round(width / of.size[0]), 1)
+    )
     wide = of.size[0] * factor if width is None else width
     high = max(round(wide * of.size[1] / of.size[0]), 1)
     focal_mm = float(np.clip(of.focal * FULL_FRAME_DIAGONAL_MM, 12, 150))
@@ -259,7 +262,7 @@ def _backdrop(uncovered: float, base: CaptureSpec, half_height: float, zoom: flo
         return ()
     plan, eye = PLANS[base.world.place], float(np.mean(base.eye_m))
     tilt = 0.02 if base.walk == "outward" else -0.06  # slope of the cameras' axes
-    foot = eye + BACKDROP_M * (half_height * (1 - 2 * uncovered) + tilt)
+    foot = eye + BACKDROP_M * (half_height * (1 - 2 * uncovered / BARE) + tilt)
     if foot >= plan.wall_m:
         return ()  # the sky above the walls is enough
     foot = round(max(foot, LOWEST_M), 1)

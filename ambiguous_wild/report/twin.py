@@ -56,7 +56,7 @@ MOVES = (
 )
 NOISE = 1.5 / 255  # simulated photos without noise and sharp JPEGs have up to 1.3 codes of texture
 BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise
-# Response of the simulator, measured on its presets (docs/simulation.md): evidence at a setting of 1.
+# Response of the simulator, measured on simulated captures: evidence at a setting of 1.
 SPREAD_OF_STOP = 0.155  # `exposure` of one stop of exposure_drift: 0.145 to 0.163 in four captures
 SPREAD_OF_DAY = 0.036  # `appearance` of time_of_day at strength 1
 OWN_SAMPLING = 1.3  # `sampling` without zoom

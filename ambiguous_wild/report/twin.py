@@ -51,9 +51,7 @@ from ambiguous_wild.simulate.spec_file import check_spec
 from ambiguous_wild.splat.effects.tracks import BRIGHT, DARK
 
 LONGEST = 960  # px, longer side of a simulated photo, as in the presets
-MOVES = (
-    0.003  # share of features that move: static captures have at most 0.0013, with distractors from 0.0037
-)
+MOVES = 0.003  # share of features that move: static captures have up to 0.0013, others from 0.0037
 NOISE = 1.5 / 255  # simulated photos without noise and sharp JPEGs have up to 1.3 codes of texture
 BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise
 # Response of the simulator, measured on simulated captures: evidence at a setting of 1.
@@ -146,11 +144,8 @@ def spec_like(of: Likeness, width: int | None = None) -> Twin:
     seen = of.evidence
     outward = seen.outward > OUTWARD
     place = "yard" if outward else "courtyard"
-    factor = (
-        max(min(of.factor, LONGEST // max(of.size)), 1)
-        if width is None
-        else max(round(width / of.size[0]), 1)
-    )
+    factor = min(of.factor, LONGEST // max(of.size)) if width is None else round(width / of.size[0])
+    factor = max(factor, 1)
     wide = of.size[0] * factor if width is None else width
     high = max(round(wide * of.size[1] / of.size[0]), 1)
     focal_mm = float(np.clip(of.focal * FULL_FRAME_DIAGONAL_MM, 12, 150))
@@ -158,18 +153,14 @@ def spec_like(of: Likeness, width: int | None = None) -> Twin:
     zoom = _zoom(seen.sampling)
     base = preset(f"{place}-plain")
     in_focal = float(np.hypot(wide, high)) * focal_mm / FULL_FRAME_DIAGONAL_MM
-    occlusion, distractors = of.moving, base.distractors
-    if occlusion is None:
-        occlusion, distractors = (0.0, 0.0), ()
+    least, most = (0.0, 0.0) if of.moving is None else np.clip(of.moving, (0.0, 0.02), (0.3, 0.4)).tolist()
     things = _backdrop(seen.uncovered, base, 0.5 * high / in_focal, zoom[0])
     spec = replace(
         base,
         name=re.sub(r"[^\w-]", "-", of.name) or "scene",
         summary=f"a capture that calls for the effects of {of.name}",
-        distractors=distractors,
-        occlusion=(round(occlusion[0], 3), round(min(max(occlusion[1], 0.02), 0.4), 3))
-        if distractors
-        else occlusion,
+        distractors=base.distractors if most else (),
+        occlusion=(round(least, 3), round(most, 3)),
         train_views=seen.photos,
         test_views=max(of.test, 1),
         width=wide,

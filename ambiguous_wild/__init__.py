@@ -19,7 +19,7 @@ _OFFERED = {
     "Metric": "harness.measures",
     "bench": "harness.bench",
     "build_scene": "builder.pipeline",
-    "plan": "harness.make_plan",
+    "plan": "harness.mask_plan",
     "read_runs": "harness.store",
     "table": "report.comparison",
 }
@@ -27,7 +27,7 @@ _OFFERED = {
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import build_scene as build_scene
     from ambiguous_wild.harness.bench import bench as bench
-    from ambiguous_wild.harness.make_plan import plan as plan
+    from ambiguous_wild.harness.mask_plan import plan as plan
     from ambiguous_wild.harness.measures import Metric as Metric
     from ambiguous_wild.harness.store import read_runs as read_runs
     from ambiguous_wild.report.comparison import table as table

@@ -56,7 +56,7 @@ def picked_by_hand(scene: str) -> list[str]:
 
 
 def train(scene: Scene, effects: str, out: Path, iterations: int, seeds: Sequence[int]) -> dict[str, Any]:
-    """A run a seed: their metrics, the effects that were on, and what was tried before.
+    """A run a seed: their metrics, and the effects that were on.
 
     Raises:
         AwError: the run failed, or is there with another configuration.
@@ -69,12 +69,10 @@ def train(scene: Scene, effects: str, out: Path, iterations: int, seeds: Sequenc
     aw(*words)  # keeps a finished run of the same configuration and scene, refuses another one
     told = runs[0] / "effects.json"  # the plan is the same for every seed
     said = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
-    decisions = (said.get("plan") or {"decisions": []})["decisions"]
     images = [read_result(run / RESULT)["per_image"] for run in runs]
     return {
         "seeds": {m: [_mean(of_run, m) for of_run in images] for m in METRICS},
         "effects": ",".join(said.get("effects") or []) or "none",
-        "tried": {d["effect"]: [d["gain_db"], d["error_db"]] for d in decisions if d["gain_db"] is not None},
     }
 
 
@@ -92,7 +90,7 @@ def measure(scene: Scene, out: Path, iterations: int, seeds: Sequence[int]) -> d
     for name in picked_by_hand(scene.name):
         if name not in runs:
             runs[name] = train(scene, name, out, iterations, seeds)["seeds"]
-    row: dict[str, Any] = {"scene": scene.name, "auto": chosen, "tried": auto["tried"]}
+    row: dict[str, Any] = {"scene": scene.name, "auto": chosen}
     for metric in METRICS:
         sets = {name: fmean(of_set[metric]) for name, of_set in runs.items()}
         if not any(map(math.isnan, sets.values())):
@@ -122,18 +120,15 @@ def to_markdown(data: dict[str, Any]) -> str:
         if not rows:
             continue
         lines += ["", f"## {metric}", "", about, ""]
-        lines.append("| scene | auto chose | auto | none | best by hand | below it | over none | tried |")
-        lines.append("|---|---|---:|---:|---|---:|---:|---|")
+        lines.append("| scene | auto chose | auto | none | best by hand | below it | over none |")
+        lines.append("|---|---|---:|---:|---|---:|---:|")
         for row in rows:
             found = row[metric]
             sets, best = found["sets"], found["best"]
-            tried = "; ".join(
-                f"{name} {gain:+.2f} ± {error:.2f}" for name, (gain, error) in row["tried"].items()
-            )
             lines.append(
                 f"| {row['scene']} | {row['auto']} | {sets[row['auto']]:.2f} | {sets['none']:.2f} "
                 f"| {best} {sets[best]:.2f} | {found['below_best_db']:.2f} "
-                f"| {found['over_none_db']:+.2f} | {tried} |"
+                f"| {found['over_none_db']:+.2f} |"
             )
         below = [row[metric]["below_best_db"] for row in rows]
         worst = min(rows, key=lambda row: row[metric]["over_none_db"])

@@ -28,12 +28,11 @@ from job_queue import Run, exit_code, find_scenes, parser_of, run_all
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import Cell, environment
 from ambiguous_wild.harness.chosen_effects import chosen_by
-from ambiguous_wild.harness.grid import Probing, cell_folder, plan_cells
+from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.run import EFFECTS, refuse_other_config
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.splat.pace import TrainConfig
 
 RESULTS = Path(__file__).parent / "results" / "captures.md"
@@ -119,9 +118,8 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 def measure(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Train what is missing; returns all that the table shows, and a line for each failed run."""
     scenes_given = find_scenes(args.captures)
-    refuse_other_captures(scenes_given, args.results)  # before a plan trains probes
+    refuse_other_captures(scenes_given, args.results)
     train = TrainConfig(iterations=args.iterations, max_gaussians=args.max_gaussians)
-    plans = Probing(train, args.out / ".cache" / "plans", lambda: prepare_cpu(args.jobs, print), print)
     recorded = args.report_only and args.effects == "auto"
     cells = plan_cells(
         args.methods,
@@ -130,8 +128,7 @@ def measure(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         train,
         settings=args.settings,
         device="cpu",
-        effects="none" if recorded else args.effects,  # a plan trains probes
-        probing=plans,
+        effects="none" if recorded else args.effects,
     )
     known = with_recorded_effects(cells, args.out) if recorded else cells
     refuse_other_configs(known, args.out)  # before anything is trained

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from job_queue import exit_code
 
-from ambiguous_wild.harness.residual_probe import small_data
+from ambiguous_wild.harness.mask_plan import small_data
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.effects import ALL, with_effects

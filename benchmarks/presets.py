@@ -32,8 +32,6 @@ QUESTIONS = {
     "masks": ("masks", ("masks",)),
     "colour per photo": ("appearance", ("exposure", "appearance")),
     "antialiasing": ("antialiasing", ("antialias",)),
-    "SH degree 3": ("sh", ("SH degree",)),
-    "poses": ("pose", ("poses",)),
 }
 
 

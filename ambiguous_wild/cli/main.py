@@ -29,7 +29,7 @@ _SCENE = {"--scene": "--only", "--scene-folder": "--scene"}
 # Command -> old name of an option -> present name.
 RENAMED: dict[str, dict[str, str | None]] = {
     "simulate": {**_OUT, "--sheet": "--pictures", "--no-sheet": "--no-pictures"},
-    "plan": {**_OUT},
+    "plan": {**_OUT, "--iterations": GONE},
     "ambiguity-report": {**_OUT, "--masks": "--distractor-masks", "--masks-white": GONE},
     "capture": {**_JOBS},
     "screen": {**_JOBS},

@@ -1,7 +1,23 @@
 """Cameras, scenes, errors and configs, which all packages use. numpy only."""
 
-from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.scene import UNMOVED, Place, Points, Scene, View
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["UNMOVED", "AwError", "Camera", "Place", "Points", "Scene", "View"]
+# imported when they are asked for: a command that needs an error alone loads no numpy
+_MODULES = {"AwError": "errors", "Camera": "camera", "UNMOVED": "scene"}
+_MODULES |= dict.fromkeys(("Place", "Points", "Scene", "View"), "scene")
+
+if TYPE_CHECKING:
+    from ambiguous_wild.core.camera import Camera as Camera
+    from ambiguous_wild.core.errors import AwError as AwError
+    from ambiguous_wild.core.scene import UNMOVED as UNMOVED
+    from ambiguous_wild.core.scene import Place as Place
+    from ambiguous_wild.core.scene import Points as Points
+    from ambiguous_wild.core.scene import Scene as Scene
+    from ambiguous_wild.core.scene import View as View
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"ambiguous_wild.core.{_MODULES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -219,7 +219,6 @@ def bench(
         from ambiguous_wild.harness.cell import RunOptions
         from ambiguous_wild.harness.external import check_program
         from ambiguous_wild.harness.grid import (
-            Probing,
             check_grafts,
             expected_line,
             grouped,
@@ -243,8 +242,6 @@ def bench(
         given_plan = _read_plan(plan)
         cache_dir = out / ".cache" if cache is None else Path(cache)
         say = callbacks.say
-        shortest = dataclasses.replace(config, budget_s=min(budgets_s, default=None))
-        probing = Probing(shortest, cache_dir / "plans", lambda: prepare_cpu(threads, say), say)
         planned = {
             wanted: plan_cells(
                 list(entries.values()),
@@ -258,7 +255,6 @@ def bench(
                 plan=given_plan,
                 protocol=protocol,
                 start=None if start is None else Path(start),
-                probing=probing,
             )
             for wanted in dict.fromkeys(choices)
         }

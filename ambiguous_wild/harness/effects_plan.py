@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -38,7 +38,6 @@ class Evidence:
     appearance: float  # spread at a point after a gain per photo, as a share of the colour range
     sampling: float  # size of a pixel on the scene, coarsest photo over finest
     view_dependence: float  # median amplitude of colour that follows the direction, of the colour range
-    reprojection_px: float  # median error of points in the train photos, px of the loaded images
     observations: int  # number in train photos that are usable for colour
     photos: int = 0  # number of train photos; 0 = not counted
     outward: float = math.nan  # spread of the places that train cameras look at, over that of the cameras
@@ -62,7 +61,6 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
         appearance=remaining_spread(in_logs),
         sampling=sampling_ratio(scene),
         view_dependence=view_dependence(in_codes),
-        reprojection_px=reprojection(scene),
         observations=len(colours.point),
         photos=len(scene.train),
         outward=outward(scene),
@@ -149,24 +147,6 @@ def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
             if len(depth) >= 5:
                 cameras.append((view.camera, float(np.median(depth))))
     return cameras
-
-
-def reprojection(scene: Scene) -> float:
-    """Return the median distance of observed points from their projections, px of the loaded photos."""
-    owner, distances = _point_of_observation(scene), []
-    for index, view in enumerate(scene.views):
-        if view.split != "train":
-            continue
-        rows = np.flatnonzero(scene.points.track_views == index)
-        camera = view.camera
-        xyz = scene.points.xyz[owner[rows]]
-        local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-        front = local[:, 2] > 1e-6
-        local = local[front]
-        uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        distances.append(np.linalg.norm(uv - scene.points.track_xy[rows][front], axis=1))
-    errors = np.concatenate(distances) if distances else np.zeros(0)
-    return float(np.median(errors)) if len(errors) >= LEAST else float("nan")
 
 
 @dataclass(frozen=True)
@@ -259,8 +239,6 @@ APPEARANCE = 0.043
 # must not be taken for light that differs by place.
 OF_SHINE = 1.7
 SAMPLING = 1.5
-VIEW_DEPENDENCE = 0.015
-REPROJECTION_PX = 1.0
 # cameras around an object have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1;
 # for the last a dense start of 30 photos was better (docs/notes/effects.md)
 OUTWARD = 2.0
@@ -293,40 +271,20 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Cost:
-    """The cost of a plan's probes."""
-
-    iterations: int  # of all probes, on small photos
-    seconds: float  # spent by the process that made the plan, without probes that were made before
-    share: float  # expected share of the run that the plan is for
-
-    def line(self) -> str:
-        """Return the cost as a line for a terminal."""
-        return (
-            f"probes: {self.iterations} iterations on small photos, {self.seconds:.0f} s; "
-            f"about {100 * self.share:.1f} % of the run (at most 10 %)"
-        )
-
-
-@dataclass(frozen=True)
 class Plan:
     """The effects that a scene needs, with the evidence for each."""
 
     scene: str
     decisions: tuple[Decision, ...]
     probed: bool = False  # a render was made, so the plan has lines on masks
-    cost: Cost | None = None  # None: no probe was made
 
     def __repr__(self) -> str:
         return f"Plan({self.scene}: --effects {','.join(self.effects()) or 'none'})"
 
     def effects(self, among: Iterable[str] | None = None) -> tuple[str, ...]:
-        """Return the names of effects to switch on, for `--effects`; with `among`, only those in it.
-
-        A lower SH degree is never among them: it saves almost no time and costs a third to half a decibel,
-        on matt scenes too (docs/notes/effects.md).
-        """
-        names = [d.how.removeprefix("--effects ") for d in self.decisions if _adds(d)]
+        """Return the names of effects to switch on, for `--effects`; with `among`, only those in it."""
+        on = [d for d in self.decisions if d.decision == "on" and d.how.startswith("--effects ")]
+        names = [d.how.removeprefix("--effects ") for d in on]
         return tuple(name for name in names if among is None or name in tuple(among))
 
     def plain(self) -> dict[str, object]:
@@ -335,7 +293,6 @@ class Plan:
             "schema": SCHEMA,
             "scene": self.scene,
             "probed": self.probed,
-            "cost": None if self.cost is None else asdict(self.cost),
             "effects": list(self.effects()),
             "decisions": [d.plain() for d in self.decisions],
         }
@@ -346,11 +303,6 @@ class Plan:
             replace(d, cost_ms=costs.get(d.how.removeprefix("--effects "), d.cost_ms)) for d in self.decisions
         )
         return replace(self, decisions=tuple(lines))
-
-
-def _adds(decision: Decision) -> bool:
-    own = decision.effect != "SH degree" and decision.how.startswith("--effects ")
-    return own and decision.decision == "on"
 
 
 def answer(value: float, threshold: float) -> Answer:
@@ -370,8 +322,6 @@ def decide(scene: str, evidence: Evidence) -> Plan:
     if appearance == exposure == "on":
         exposure_why = "the appearance embedding includes it"
     antialias = answer(evidence.sampling, SAMPLING)
-    harmonics = answer(evidence.view_dependence, VIEW_DEPENDENCE)
-    poses = answer(evidence.reprojection_px, REPROJECTION_PX)
     skybox = answer(evidence.uncovered, UNCOVERED)
     lines: tuple[Decision, ...] = (
         Decision(
@@ -390,18 +340,6 @@ def decide(scene: str, evidence: Evidence) -> Plan:
             "times", antialias,
             "photos from near and far" if antialias == "on" else "all photos have about the same resolution",
             "--effects antialias",
-        ),
-        Decision(
-            "SH degree", "colour that follows the viewing direction", evidence.view_dependence,
-            VIEW_DEPENDENCE, "of the colour range", harmonics,
-            "degree 3 is needed" if harmonics == "on" else "colours hardly follow the direction",
-            "--effects sh1",
-        ),
-        Decision(
-            "poses", "reprojection error of the sparse model", evidence.reprojection_px,
-            REPROJECTION_PX, "px", poses,
-            "the poses are inaccurate" if poses == "on" else "the poses fit the photos",
-            "--effects poses",
         ),
         Decision(
             "skybox", "share of the photos where no SfM points lie", evidence.uncovered, UNCOVERED,
@@ -438,7 +376,7 @@ def _dense_start(evidence: Evidence) -> Decision:
                     decision, why, "--effects dense")  # fmt: skip
 
 
-def plan_without_training(scene: Scene) -> Plan:
+def plan_effects(scene: Scene) -> Plan:
     """Measure the train photos at the SfM points and decide; without tracks no photo is read.
 
     Raises:
@@ -446,7 +384,7 @@ def plan_without_training(scene: Scene) -> Plan:
     """
     if not has_tracks(scene):
         count, bare = len(scene.train), uncovered(scene)
-        nothing = Evidence(*(math.nan,) * 5, observations=0, photos=count, uncovered=bare)
+        nothing = Evidence(*(math.nan,) * 4, observations=0, photos=count, uncovered=bare)
         return decide(scene.name, nothing)
     from ambiguous_wild.io.images import load_image_float
 
@@ -467,8 +405,7 @@ def read_plan(path: Path) -> Plan:
             row | {"value": math.nan if row["value"] is None else row["value"]} for row in data["decisions"]
         ]
         decisions = msgspec.convert(rows, tuple[Decision, ...])
-        cost = msgspec.convert(data.get("cost"), Cost | None)
-        return Plan(msgspec.convert(data["scene"], str), decisions, bool(data.get("probed")), cost)
+        return Plan(msgspec.convert(data["scene"], str), decisions, bool(data.get("probed")))
     except FileNotFoundError:
         raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as error:

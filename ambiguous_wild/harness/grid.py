@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from ambiguous_wild.core import Scene
@@ -25,7 +24,7 @@ from ambiguous_wild.harness.chosen_effects import (
     scene_protocol,
     takes_effects,
 )
-from ambiguous_wild.harness.effects_plan import Plan
+from ambiguous_wild.harness.effects_plan import Plan, plan_effects
 from ambiguous_wild.harness.run import (
     left_alone,
     made_anew,
@@ -101,7 +100,6 @@ def plan_cells(
     plan: Plan | None = None,
     protocol: Protocol | None = None,
     start: Path | None = None,
-    probing: Probing | None = None,
 ) -> list[Cell]:
     """Plan every method on every scene with every seed, after a check of all names and options.
 
@@ -117,7 +115,6 @@ def plan_cells(
         plan: plan of the only scene, if it was made before; None = made where one is needed.
         protocol: "full" measures whole test photos, "half" the right half; None = what scene.json says.
         start: a splat file or point cloud to start from; None = the scene's points.
-        probing: how plans are made from probes; None = the limits decide alone.
 
     Raises:
         AwError: unknown method, option or scene; a start that no camera sees; two scenes of the same name.
@@ -154,7 +151,7 @@ def plan_cells(
     cells = []
     for scene in loaded:
         identity = scene_identity(scene)
-        chosen = choose(effects, scene, list(named.values()), plan, probing)
+        chosen = choose(effects, scene, list(named.values()), plan)
         measured = protocol or scene_protocol(scene)
         for entry, options in resolved:
             for seed in dict.fromkeys(seeds):
@@ -299,22 +296,11 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-@dataclass(frozen=True)
-class Probing:
-    """How a plan is made from probes: for runs of which length, and where the probes are kept."""
-
-    train: TrainConfig  # length of the runs
-    folder: Path  # of the probes
-    prepare: Callable[[], None]  # compiles the CPU kernels
-    say: Callable[[str], None]  # gets a line for every decision
-
-
 def choose(
     wanted: str,
     scene: Scene,
     methods: Sequence[MethodEntry],
     plan: Plan | None = None,
-    probing: Probing | None = None,
 ) -> dict[str, Chosen]:
     """Return the effects that every method trains with on this scene, by the method's name.
 
@@ -323,7 +309,6 @@ def choose(
         scene: the scene.
         methods: the methods.
         plan: a plan made before; None = made now if any method needs it.
-        probing: how a plan is made now; None = the limits decide alone.
 
     Raises:
         AwError: an effect is unknown, or the plan is of another scene.
@@ -335,23 +320,7 @@ def choose(
         asked = Chosen(ALL if wanted == "all" else named, "" if wanted == "none" else wanted)
         return {m.name: asked if takes_effects(m) else Chosen() for m in methods}
     if plan is None and any(map(takes_effects, methods)):
-        plan = _make_plan(scene, probing)
+        plan = plan_effects(scene)
     effects = () if plan is None else plan.effects()
     chosen = {m.name: chosen_by(effects, scene, m) for m in methods}
     return {name: dataclasses.replace(c, plan=plan if c.asked else None) for name, c in chosen.items()}
-
-
-def _make_plan(scene: Scene, probing: Probing | None) -> Plan:
-    if probing is None:
-        from ambiguous_wild.harness.effects_plan import plan_without_training
-        from ambiguous_wild.harness.select_effects import untried
-
-        return untried(plan_without_training(scene), "no probes were asked for")
-    from ambiguous_wild.harness.make_plan import plan_with_probes
-
-    plan = plan_with_probes(
-        scene, probing.train, probing.folder, masks=False, prepare=probing.prepare, say=probing.say
-    )
-    if plan.cost is not None:
-        probing.say(f"{scene.name}: {plan.cost.line()}")
-    return plan

@@ -1,6 +1,7 @@
 """Draw the pictures of a run into RUN/pictures.
 
-training_<photo>.png  photo, render, error and masks of a train view, one row for each fixed moment of the run
+training_<photo>.png  photo, render, error and masks of a train view, a row for each moment of the run; rows
+                      appear while it trains
 masks.jpg             train photos with the masks of the trained method
 density.png           where Gaussians were added and merged, and their number over time
 
@@ -21,7 +22,6 @@ from ambiguous_wild.harness.sheets import write_contact
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.palette import ADDED, MERGED, NEUTRAL, plot_colour, ramp
-from ambiguous_wild.splat.parts import MaskPolicy
 from ambiguous_wild.splat.trainer import Trainer
 
 MOMENTS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)  # shares of the run
@@ -43,7 +43,6 @@ class Recorder:
         chosen = np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)
         self.views = [int(v) for v in np.unique(chosen)]
         self.folder = folder
-        self.on = type(trainer.parts.mask).panels is not MaskPolicy.panels  # else the method has no panels
         self.passed = self._passed(trainer)
 
     def _passed(self, trainer: Trainer) -> int:
@@ -53,17 +52,23 @@ class Recorder:
     def __call__(self, trainer: Trainer) -> None:
         """Draw the rows if a moment was passed since the last call."""
         passed = self._passed(trainer)
-        if not self.on or passed == self.passed:
+        if passed == self.passed:
             return
         self.passed = passed
         for view in self.views:
             write_png(self._row(trainer, view, passed), strip(trainer, view))
+        self._join(trainer)
 
     def _row(self, trainer: Trainer, view: int, moment: int) -> Path:
         return self.folder / ROWS / file_stem(trainer, view) / f"{moment}.png"
 
     def finish(self, trainer: Trainer) -> list[Path]:
-        """Join the rows to pictures/training_<photo>.png; return the paths written."""
+        """Join the rows for the last time and remove them; return the paths written."""
+        written = self._join(trainer)
+        shutil.rmtree(self.folder / ROWS, ignore_errors=True)
+        return written
+
+    def _join(self, trainer: Trainer) -> list[Path]:
         written = []
         for view in self.views:
             paths = [self._row(trainer, view, k) for k in range(1, len(MOMENTS) + 1)]
@@ -73,7 +78,6 @@ class Recorder:
                 path.parent.mkdir(exist_ok=True)
                 write_png(path, sheets.stack(rows, 0))
                 written.append(path)
-        shutil.rmtree(self.folder / ROWS, ignore_errors=True)
         return written
 
 

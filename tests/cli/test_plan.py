@@ -16,20 +16,20 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
     done = aw("plan", scene, "-o", tmp_path / "plan.json", "--costs")
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert lines[0].startswith("scene: masks on: ")  # a line for every decision, as it is made
-    assert lines[1].split()[:2] == ["effect", "evidence"]
-    assert "a method makes them while it trains" in lines[-4] and "--keep-masks FOLDER" in lines[-4]
-    assert "of the run (at most 10 %)" in lines[-2]
+    assert lines[0].split()[:2] == ["effect", "decision"]
+    assert max(map(len, lines[:-2])) <= 100
+    text = " ".join(line.strip() for line in lines)
+    assert "a method makes them while it trains" in text and "--keep-masks FOLDER" in text
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert plan["probed"] and plan["scene"] == "scene"
     found = {d["effect"]: d for d in plan["decisions"]}
+    assert all(f"{name} {d['decision']}: {d['why']}" in text for name, d in found.items())
     # a red square stands elsewhere in every photo; there are no tracks to say anything else
     assert found["masks"]["decision"] == "on" and found["masks"]["value"] > 0.02
     assert found["exposure"]["decision"] == "unknown" and found["exposure"]["value"] is None
     assert isinstance(found["antialias"]["cost_ms"], float)
     assert found["masks"]["cost_ms"] is None
     assert isinstance(found["masks"]["gain_db"], float) and found["masks"]["error_db"] > 0
-    assert 0 < plan["cost"]["share"] <= 0.1
     assert list(tmp_path.iterdir()) == [tmp_path / "plan.json"]  # nothing of the probes is left
     assert files(scene) == before
     # made again without a probe it would lose what the probe found
@@ -37,14 +37,6 @@ def test_a_plan_is_a_table_and_a_file_and_leaves_the_scene_alone(scene, tmp_path
     done = aw("plan", scene, "-o", tmp_path / "plan.json", "--no-probe")
     assert done.returncode == 2 and "the result of a probe" in done.stderr
     assert (tmp_path / "plan.json").read_bytes() == kept
-
-
-def test_a_run_too_short_for_probes_is_told_so(scene, tmp_path):
-    done = aw("plan", scene, "-o", tmp_path / "plan.json", "--iterations", "500")
-    assert done.returncode == 0, done.stderr
-    assert "masks not tried: probes may take a tenth of the run, which is too short for them" in done.stdout
-    plan = json.loads((tmp_path / "plan.json").read_text())
-    assert not plan["probed"] and plan["cost"] is None
 
 
 def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):

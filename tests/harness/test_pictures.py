@@ -110,12 +110,17 @@ def test_looking_costs_no_training_time(watched):
     assert (dict(trainer.clock.parts_s), trainer.clock.now()) == before
 
 
-def test_a_method_that_masks_nothing_has_no_training_pictures(scene, tmp_path):
-    trainer = trainer_for(scene, tmp_path, Parts())
+def test_pictures_grow_while_any_method_trains(scene, tmp_path):
+    trainer = trainer_for(scene, tmp_path, Parts())  # no masks, so no panels of a method
     recorder = Recorder(trainer, tmp_path)
-    trainer.train(tick=recorder)
-    assert not recorder.on
-    assert [p for p in draw_all(trainer, recorder, tmp_path) if p.name != "density.png"] == []
+    heights = []
+    while trainer.iteration < 0.25 * trainer.config.iterations:
+        trainer.step()
+        recorder(trainer)
+        paths = sorted((tmp_path / "pictures").glob("training_*.png"))
+        heights.append(read_png_rgb(paths[0]).shape[0] if paths else 0)
+    row = sheets.BAR + sheets.GAP + round(HEIGHT * CELL / WIDTH)
+    assert sorted(set(heights)) == [0, row, 2 * row, 3 * row]
 
 
 def test_pictures_can_be_left_away(scene, tmp_path):

@@ -76,7 +76,7 @@ def simulate_command(
         raise AwError(f"{given} ('aw simulate --list' describes them)")
     twin = None
     if like is not None:
-        twin = _twin(like, width)
+        twin = _twin(like, width, seed)
         spec, called = resized(twin.spec, views), f"--like {shlex.quote(str(like))}"
     else:
         called = str(name)
@@ -144,12 +144,12 @@ def simulate_command(
     click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
 
 
-def _twin(scene: Path, width: int | None) -> Twin:
+def _twin(scene: Path, width: int | None, seed: int) -> Twin:
     """Measure a scene and return the spec of a capture like it."""
     from ambiguous_wild.io.scene_folder import load_scene
     from ambiguous_wild.report.twin import measure_likeness, spec_like
 
-    return spec_like(measure_likeness(load_scene(scene)), width)
+    return spec_like(measure_likeness(load_scene(scene)), width, seed)
 
 
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:

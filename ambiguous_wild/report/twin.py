@@ -24,16 +24,14 @@ from ambiguous_wild.harness.effects_plan import (
     MOST_PHOTOS,
     OF_SHINE,
     OUTWARD,
-    REPROJECTION_PX,
     UNCOVERED,
-    VIEW_DEPENDENCE,
     Evidence,
     has_tracks,
     measure,
 )
 from ambiguous_wild.io.images import load_image_float
 from ambiguous_wild.io.motion_points import read_motion_points
-from ambiguous_wild.simulate.image_effects import READ, SHOT
+from ambiguous_wild.simulate.image_effects import READ, SHOT, PhotoRandom, draw_exposure_drift
 from ambiguous_wild.simulate.presets import preset
 from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
@@ -55,7 +53,9 @@ MOVES = 0.003  # share of features that move: static captures have up to 0.0013,
 NOISE = 1.5 / 255  # simulated photos without noise and sharp JPEGs have up to 1.3 codes of texture
 BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise
 # Response of the simulator, measured on simulated captures: evidence at a setting of 1.
-SPREAD_OF_STOP = 0.155  # `exposure` of one stop of exposure_drift: 0.145 to 0.163 in four captures
+SPREAD_OF_STOP = (
+    0.28  # `exposure` over the standard deviation of the drawn stops: 0.26 to 0.32 in six captures
+)
 SPREAD_OF_DAY = 0.036  # `appearance` of time_of_day at strength 1
 OWN_SAMPLING = 1.3  # `sampling` without zoom
 OF_ZOOM = 0.68  # spread of log `sampling` over that of log zoom: wide photos see more near ground
@@ -131,12 +131,13 @@ def measure_likeness(scene: Scene) -> Likeness:
     )
 
 
-def spec_like(of: Likeness, width: int | None = None) -> Twin:
+def spec_like(of: Likeness, width: int | None = None, seed: int = 0) -> Twin:
     """Return the spec of a capture that calls for the effects of `of`.
 
     Args:
         of: the real capture.
         width: of the simulated photos, px; None: as the real ones, with a longer side of at most `LONGEST`.
+        seed: of the capture; what its photos draw must spread as in the real ones.
 
     Raises:
         AwError: a size or number of photos that no spec may have.
@@ -170,18 +171,20 @@ def spec_like(of: Likeness, width: int | None = None) -> Twin:
         arc_deg=round(arc_deg),
         zoom=zoom,
         world=replace(base.world, things=things, statue=not things or things[0].at_m[2] > STATUE_M),
-        effects=_effects(of, factor),
+        effects=_effects(of, factor, seed),
         designed=Designed(),
     )
     return Twin(check_spec(spec), factor, tuple(_lines(of, spec, factor)))
 
 
-def _effects(of: Likeness, factor: int) -> Effects:
+def _effects(of: Likeness, factor: int, seed: int) -> Effects:
     seen = of.evidence
     shine = 0.0 if math.isnan(seen.view_dependence) else OF_SHINE * seen.view_dependence
     day = seen.appearance - shine if seen.appearance - shine >= APPEARANCE else 0.0  # False for NaN
     strength = min(day / SPREAD_OF_DAY, 2.0)
-    stops = seen.exposure / SPREAD_OF_STOP if seen.exposure >= LEAST_SPREAD and not day else 0.0
+    drawn = [PhotoRandom(seed, k, k / max(seen.photos - 1, 1)) for k in range(seen.photos)]
+    spread = SPREAD_OF_STOP * np.std([draw_exposure_drift(ExposureDrift(1.0), r) for r in drawn], ddof=1)
+    stops = float(seen.exposure / spread) if seen.exposure >= LEAST_SPREAD and not day else 0.0
     iso = _iso(of.noise * factor) if of.noise else 0.0
     return Effects(
         time_of_day=TimeOfDay(strength=round(strength, 2)) if strength else None,
@@ -300,15 +303,12 @@ def _lines(of: Likeness, spec: CaptureSpec, factor: int) -> Iterator[str]:
     yield line("uncovered", seen.uncovered, "of the pixels", plain)
     yield line("gains", seen.exposure, "of the colour range", settings("exposure_drift"))
     yield line("spread at a point", seen.appearance, "of the colour range", settings("time_of_day"))
-    if seen.view_dependence >= VIEW_DEPENDENCE:
-        yield line("colour by direction", seen.view_dependence, "of the colour range", "not simulated")
+    yield line("colour by direction", seen.view_dependence, "of the colour range", "not simulated")
     yield line("noise", 255 * of.noise, "codes of 255 as trained", settings("iso_noise"))
     yield line("blurred photos", of.soft, "of all", settings("defocus"))
     moving = math.nan if of.moving is None else of.moving[1]
     taken = f"occlusion {list(spec.occlusion)}" if spec.distractors else "no distractors"
     yield line("features that move, 90th percentile", moving, "of a photo's", taken)
-    if seen.reprojection_px >= REPROJECTION_PX:
-        yield line("reprojection error", seen.reprojection_px, "px", "not simulated")
 
 
 def _full_size(scene: Scene, view: View) -> Path:

@@ -13,12 +13,13 @@ from PIL import Image
 from ambiguous_wild.harness.effects_plan import Evidence
 from ambiguous_wild.report.twin import SPREAD_OF_STOP, Likeness, arc_of, noise_of, spec_like
 from ambiguous_wild.simulate import image_effects as fx
-from ambiguous_wild.simulate.spec import Defocus, Effects, ExposureDrift
+from ambiguous_wild.simulate.image_effects import PhotoRandom
+from ambiguous_wild.simulate.spec import Defocus, Effects
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec
 from ambiguous_wild.simulate.tracer import linear_to_srgb
 from tests.command_line import aw
 
-PLAIN = Evidence(0.0, 0.01, 1.2, 0.004, 0.05, 5000, photos=30, outward=0.5, uncovered=0.02)
+PLAIN = Evidence(0.0, 0.01, 1.2, 0.004, 5000, photos=30, outward=0.5, uncovered=0.02)
 LIKENESS = Likeness("a.scene", 4, (240, 180), 4, 0.6, 100.0, PLAIN, 0.0, 0.0, None)
 
 
@@ -36,7 +37,6 @@ def test_a_plain_scene_calls_for_nothing() -> None:
 @pytest.mark.parametrize(
     ("evidence", "rest", "expected"),
     [
-        ({"exposure": 0.5 * SPREAD_OF_STOP}, {}, {"effects": Effects(exposure_drift=ExposureDrift(0.5))}),
         ({}, {"soft": 0.2}, {"effects": Effects(defocus=Defocus(share=0.2))}),
         ({"outward": 7.0}, {"arc_deg": 340.0}, {"walk": "outward", "arc_deg": 340}),
         ({}, {"moving": (0.05, 0.2)}, {"occlusion": (0.05, 0.2)}),
@@ -46,6 +46,15 @@ def test_a_plain_scene_calls_for_nothing() -> None:
 def test_what_is_measured_is_named(evidence: dict, rest: dict, expected: dict) -> None:
     of = replace(LIKENESS, evidence=replace(PLAIN, **evidence), **rest)
     assert {key: getattr(spec_like(of).spec, key) for key in expected} == expected
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_drawn_exposures_spread_as_measured(seed: int) -> None:
+    of = replace(LIKENESS, evidence=replace(PLAIN, exposure=0.1))
+    drift = spec_like(of, seed=seed).spec.effects.exposure_drift
+    assert drift is not None
+    stops = [fx.draw_exposure_drift(drift, PhotoRandom(seed, k, k / 29)) for k in range(30)]
+    assert np.std(stops, ddof=1) * SPREAD_OF_STOP == pytest.approx(0.1, rel=0.02)
 
 
 def test_light_by_place_is_hours_of_the_day_and_replaces_exposure() -> None:

@@ -50,6 +50,8 @@ from ambiguous_wild.splat.effects.tracks import BRIGHT, DARK
 
 LONGEST = 960  # px, longer side of a simulated photo, as in the presets
 MOVES = 0.003  # share of features that move: static captures have up to 0.0013, others from 0.0037
+# Distractors cover more than the features that match elsewhere: one to eight times their share in 10 captures.
+OCCLUDED = (0.0, 0.1), (0.3, 0.4)  # least and greatest ends of `occlusion`
 NOISE = 1.5 / 255  # simulated photos without noise and sharp JPEGs have up to 1.3 codes of texture
 BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise
 # Response of the simulator, measured on simulated captures: evidence at a setting of 1.
@@ -154,7 +156,7 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0) -> Twin:
     zoom = _zoom(seen.sampling)
     base = preset(f"{place}-plain")
     in_focal = float(np.hypot(wide, high)) * focal_mm / FULL_FRAME_DIAGONAL_MM
-    least, most = (0.0, 0.0) if of.moving is None else np.clip(of.moving, (0.0, 0.02), (0.3, 0.4)).tolist()
+    least, most = (0.0, 0.0) if of.moving is None else np.clip(of.moving, *OCCLUDED).tolist()
     things = _backdrop(seen.uncovered, base, 0.5 * high / in_focal, zoom[0])
     spec = replace(
         base,

@@ -50,7 +50,7 @@ from ambiguous_wild.splat.effects.tracks import BRIGHT, DARK
 
 LONGEST = 960  # px, longer side of a simulated photo, as in the presets
 MOVES = 0.003  # share of features that move: static captures have up to 0.0013, others from 0.0037
-# Distractors cover more than the features that match elsewhere: one to eight times their share in 10 captures.
+# Distractors cover more than the share of features that move: one to eight times it in ten captures.
 OCCLUDED = (0.0, 0.1), (0.3, 0.4)  # least and greatest ends of `occlusion`
 NOISE = 1.5 / 255  # simulated photos without noise and sharp JPEGs have up to 1.3 codes of texture
 BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise

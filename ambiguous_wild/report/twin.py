@@ -82,7 +82,9 @@ class Likeness:
     evidence: Evidence  # also the number of train photos
     noise: float  # standard deviation in the photos as trained, of the colour range; 0: none in the full ones
     soft: float  # share of the train photos that are blurred
-    moving: tuple[float, float] | None  # 10th and 90th percentile of the share of features that move
+    moving: tuple[
+        float, float, float
+    ]  # share of features that move, of photos: 10th percentile, mean, 90th; or NaN
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def measure_likeness(scene: Scene) -> Likeness:
     sizes = Counter((camera.width, camera.height) for camera in cameras)
     points = read_motion_points(scene.root).values()
     shares = [float(p.moves.mean()) for p in points if len(p.xy)]
-    low, high = np.percentile(shares, [10, 90]) if shares else (0.0, 0.0)
+    low, high = np.percentile(shares, [10, 90]) if shares else (math.nan, math.nan)
     noise = float(np.nanmedian(noises)) if np.isfinite(noises).any() else 0.0
     return Likeness(
         name=scene.name,
@@ -129,7 +131,7 @@ def measure_likeness(scene: Scene) -> Likeness:
         evidence=measure(scene, photos),
         noise=noise * float(np.median(smaller)) if noise >= NOISE else 0.0,
         soft=float(np.mean(np.array(sharp) < BLUR_RATIO * np.median(sharp))),
-        moving=(float(low), float(high)) if shares and np.mean(shares) >= MOVES else None,
+        moving=(float(low), float(np.mean(shares)) if shares else math.nan, float(high)),
     )
 
 
@@ -156,7 +158,8 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0) -> Twin:
     zoom = _zoom(seen.sampling)
     base = preset(f"{place}-plain")
     in_focal = float(np.hypot(wide, high)) * focal_mm / FULL_FRAME_DIAGONAL_MM
-    least, most = (0.0, 0.0) if of.moving is None else np.clip(of.moving, *OCCLUDED).tolist()
+    least, mean, most = of.moving
+    least, most = np.clip((least, most), *OCCLUDED).tolist() if mean >= MOVES else (0.0, 0.0)
     things = _backdrop(seen.uncovered, base, 0.5 * high / in_focal, zoom[0])
     spec = replace(
         base,
@@ -184,7 +187,8 @@ def _effects(of: Likeness, factor: int, seed: int) -> Effects:
     shine = 0.0 if math.isnan(seen.view_dependence) else OF_SHINE * seen.view_dependence
     day = seen.appearance - shine if seen.appearance - shine >= APPEARANCE else 0.0  # False for NaN
     strength = min(day / SPREAD_OF_DAY, 2.0)
-    drawn = [PhotoRandom(seed, k, k / max(seen.photos - 1, 1)) for k in range(seen.photos)]
+    count = max(seen.photos, 3)
+    drawn = [PhotoRandom(seed, k, k / (count - 1)) for k in range(count)]
     spread = SPREAD_OF_STOP * np.std([draw_exposure_drift(ExposureDrift(1.0), r) for r in drawn], ddof=1)
     stops = float(seen.exposure / spread) if seen.exposure >= LEAST_SPREAD and not day else 0.0
     iso = _iso(of.noise * factor) if of.noise else 0.0
@@ -262,7 +266,7 @@ def _backdrop(uncovered: float, base: CaptureSpec, half_height: float, zoom: flo
     if foot >= plan.wall_m:
         return ()  # the sky above the walls is enough
     foot = round(max(foot, LOWEST_M), 1)
-    top = round(max(eye + BACKDROP_M * half_height / zoom, foot + 1.0) - foot, 1)
+    top = round(float(np.clip(eye + BACKDROP_M * half_height / zoom - foot, 1, 12)), 1)
     (left, right), (front, back), (x, y) = plan.x_m, plan.y_m, plan.middle
     walls = {  # place, width, turn; a little in front of the wall
         "wall_back": (x, back - BEFORE_M, right - left, 0.0),
@@ -308,9 +312,8 @@ def _lines(of: Likeness, spec: CaptureSpec, factor: int) -> Iterator[str]:
     yield line("colour by direction", seen.view_dependence, "of the colour range", "not simulated")
     yield line("noise", 255 * of.noise, "codes of 255 as trained", settings("iso_noise"))
     yield line("blurred photos", of.soft, "of all", settings("defocus"))
-    moving = math.nan if of.moving is None else of.moving[1]
     taken = f"occlusion {list(spec.occlusion)}" if spec.distractors else "no distractors"
-    yield line("features that move, 90th percentile", moving, "of a photo's", taken)
+    yield line("features that move", of.moving[1], "of all", taken)
 
 
 def _full_size(scene: Scene, view: View) -> Path:

@@ -20,7 +20,7 @@ from ambiguous_wild.simulate.tracer import linear_to_srgb
 from tests.command_line import aw
 
 PLAIN = Evidence(0.0, 0.01, 1.2, 0.004, 5000, photos=30, outward=0.5, uncovered=0.02)
-LIKENESS = Likeness("a.scene", 4, (240, 180), 4, 0.6, 100.0, PLAIN, 0.0, 0.0, None)
+LIKENESS = Likeness("a.scene", 4, (240, 180), 4, 0.6, 100.0, PLAIN, 0.0, 0.0, (0.0, 0.001, 0.004))
 
 
 def test_a_plain_scene_calls_for_nothing() -> None:
@@ -39,7 +39,7 @@ def test_a_plain_scene_calls_for_nothing() -> None:
     [
         ({}, {"soft": 0.2}, {"effects": Effects(defocus=Defocus(share=0.2))}),
         ({"outward": 7.0}, {"arc_deg": 340.0}, {"walk": "outward", "arc_deg": 340}),
-        ({}, {"moving": (0.05, 0.2)}, {"occlusion": (0.05, 0.2)}),
+        ({}, {"moving": (0.05, 0.1, 0.2)}, {"occlusion": (0.05, 0.2)}),
         ({}, {"size": (180, 240)}, {"width": 720, "height": 960}),
     ],
 )
@@ -78,6 +78,8 @@ def test_plain_boards_are_the_lower_the_more_is_uncovered_and_bar_no_distractor(
         of = replace(LIKENESS, focal=0.8, evidence=replace(PLAIN, uncovered=share))
         things = spec_like(of).spec.world.things
         feet.append(things[0].at_m[2] if things else math.inf)
+    wide = replace(of, focal=0.3, evidence=replace(of.evidence, sampling=9.0, outward=7.0))
+    assert len(spec_like(wide).spec.world.things) == 4  # within the limits of a spec
     assert feet == sorted(feet, reverse=True) and feet[-1] == 2.0 and feet[0] > feet[-1]
 
 

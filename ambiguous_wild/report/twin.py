@@ -20,10 +20,12 @@ from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.effects_plan import (
     APPEARANCE,
+    EXPOSURE,
     LEAST_SPREAD,
     MOST_PHOTOS,
     OF_SHINE,
     OUTWARD,
+    SAMPLING,
     UNCOVERED,
     Evidence,
     has_tracks,
@@ -63,6 +65,8 @@ OWN_SAMPLING = 1.3  # `sampling` without zoom
 OF_ZOOM = 0.68  # spread of log `sampling` over that of log zoom: wide photos see more near ground
 BARE = 0.5  # `uncovered` over the share of a photo above the foot of a backdrop: points beside it span a part
 BACKDROP_M = 7.1  # from the cameras to the walls behind the hub
+# The simulator misses wanted values by up to this factor.
+MISSED, MISSED_BARE = 1.2, 2.0
 PALE = (0.6, 0.7, 0.85)  # of the backdrop, linear light
 LOWEST_M = 2.0  # foot of a backdrop: above the heads of distractors
 STATUE_M = 2.7  # top of the statue on its plinth
@@ -155,7 +159,7 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0) -> Twin:
     high = max(round(wide * of.size[1] / of.size[0]), 1)
     focal_mm = float(np.clip(of.focal * FULL_FRAME_DIAGONAL_MM, 12, 150))
     arc_deg = float(np.clip(of.arc_deg, 20, 360 if outward else 125))
-    zoom = _zoom(seen.sampling)
+    zoom = _zoom(_clear(seen.sampling, SAMPLING))
     base = preset(f"{place}-plain")
     in_focal = float(np.hypot(wide, high)) * focal_mm / FULL_FRAME_DIAGONAL_MM
     least, mean, most = of.moving
@@ -185,12 +189,15 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0) -> Twin:
 def _effects(of: Likeness, factor: int, seed: int) -> Effects:
     seen = of.evidence
     shine = 0.0 if math.isnan(seen.view_dependence) else OF_SHINE * seen.view_dependence
-    day = seen.appearance - shine if seen.appearance - shine >= APPEARANCE else 0.0  # False for NaN
+    by_place = _clear(seen.appearance - shine, APPEARANCE)
+    day = by_place if by_place >= APPEARANCE else 0.0  # False for NaN
     strength = min(day / SPREAD_OF_DAY, 2.0)
     count = max(seen.photos, 3)
     drawn = [PhotoRandom(seed, k, k / (count - 1)) for k in range(count)]
     spread = SPREAD_OF_STOP * np.std([draw_exposure_drift(ExposureDrift(1.0), r) for r in drawn], ddof=1)
-    stops = float(seen.exposure / spread) if seen.exposure >= LEAST_SPREAD and not day else 0.0
+    stops = (
+        float(_clear(seen.exposure, EXPOSURE) / spread) if seen.exposure >= LEAST_SPREAD and not day else 0.0
+    )
     iso = _iso(of.noise * factor) if of.noise else 0.0
     return Effects(
         time_of_day=TimeOfDay(strength=round(strength, 2)) if strength else None,
@@ -236,6 +243,11 @@ def _iso(noise: float) -> float:
     return float(np.clip(100 * (-b + math.sqrt(b * b - 4 * a * c)) / (2 * a), 50, 20_000))
 
 
+def _clear(value: float, limit: float, missed: float = MISSED) -> float:
+    """Return the value, so far from its limit that the twin's is on the same side; NaN stays NaN."""
+    return max(value, limit * missed) if value >= limit else min(value, limit / missed)
+
+
 def _zoom(sampling: float) -> tuple[float, float]:
     """Return the range of zooms that adds what the walk lacks of the ratio between pixel sizes.
 
@@ -260,6 +272,7 @@ def _backdrop(uncovered: float, base: CaptureSpec, half_height: float, zoom: flo
     """
     if not uncovered >= UNCOVERED:
         return ()
+    uncovered = _clear(uncovered, UNCOVERED, MISSED_BARE)
     plan, eye = PLANS[base.world.place], float(np.mean(base.eye_m))
     tilt = 0.02 if base.walk == "outward" else -0.06  # slope of the cameras' axes
     foot = eye + BACKDROP_M * (half_height * (1 - 2 * uncovered / BARE) + tilt)

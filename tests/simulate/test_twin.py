@@ -48,13 +48,17 @@ def test_what_is_measured_is_named(evidence: dict, rest: dict, expected: dict) -
     assert {key: getattr(spec_like(of).spec, key) for key in expected} == expected
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_drawn_exposures_spread_as_measured(seed: int) -> None:
-    of = replace(LIKENESS, evidence=replace(PLAIN, exposure=0.1))
+@pytest.mark.parametrize(
+    ("seed", "measured", "wanted"), [(0, 0.1, 0.1), (1, 0.049, 0.0417), (1, 0.051, 0.06)]
+)
+def test_the_drawn_exposures_spread_as_measured_or_farther_from_the_limit(
+    seed: int, measured: float, wanted: float
+) -> None:
+    of = replace(LIKENESS, evidence=replace(PLAIN, exposure=measured))
     drift = spec_like(of, seed=seed).spec.effects.exposure_drift
     assert drift is not None
     stops = [fx.draw_exposure_drift(drift, PhotoRandom(seed, k, k / 29)) for k in range(30)]
-    assert np.std(stops, ddof=1) * SPREAD_OF_STOP == pytest.approx(0.1, rel=0.02)
+    assert np.std(stops, ddof=1) * SPREAD_OF_STOP == pytest.approx(wanted, rel=0.02)
 
 
 def test_light_by_place_is_hours_of_the_day_and_replaces_exposure() -> None:

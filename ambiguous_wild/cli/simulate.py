@@ -14,12 +14,19 @@ from click.core import ParameterSource
 from ambiguous_wild.cli.options import Number, PathName
 
 if TYPE_CHECKING:
+    from ambiguous_wild.report.twin import Twin
     from ambiguous_wild.simulate.records import PhotoTruth
     from ambiguous_wild.simulate.spec import CaptureSpec
 
 
 @click.command("simulate")
 @click.argument("name", metavar="NAME|SPEC.yaml", required=False)
+@click.option(
+    "--like",
+    type=PathName(),
+    metavar="SCENE",
+    help="Simulate a capture that calls for the same effects as this scene, instead of NAME.",
+)
 @click.option("-o", "--output", type=PathName(file_okay=False), help="Folder to write.")
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of world, walk, distractors."
@@ -40,6 +47,7 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def simulate_command(
     name: str | None,
+    like: Path | None,
     output: Path | None,
     seed: int,
     views: int | None,
@@ -63,14 +71,24 @@ def simulate_command(
     if listing:
         _print_list(PRESETS.values(), as_json)
         return
-    if name is None:
-        raise AwError("name a capture: " + ", ".join(PRESETS) + " ('aw simulate --list' describes them)")
-    spec = resized(read_spec(name) if is_spec_file(name) else preset(name), views, width)
+    if (name is None) == (like is None):
+        given = "NAME and --like exclude each other" if name else "name a capture: " + ", ".join(PRESETS)
+        raise AwError(f"{given} ('aw simulate --list' describes them)")
+    twin = None
+    if like is not None:
+        twin = _twin(like, width, seed)
+        spec, called = resized(twin.spec, views), f"--like {shlex.quote(str(like))}"
+    else:
+        called = str(name)
+        spec = resized(read_spec(called) if is_spec_file(called) else preset(called), views, width)
+    lines = twin.lines if twin else ()
     if print_spec:
-        click.echo(dump_spec(spec), nl=False)
+        click.echo("".join(f"# {line}\n" for line in lines) + dump_spec(spec), nl=False)
         return
     if output is None:
-        raise AwError(f"the output folder is missing: aw simulate {name} -o raw")
+        raise AwError(f"the output folder is missing: aw simulate {called} -o raw")
+    for line in lines:
+        click.echo(line, err=as_json)
 
     from tqdm import tqdm
 
@@ -81,7 +99,7 @@ def simulate_command(
         return tqdm(shots, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
 
     check_output(output)
-    with folder_lock(output, f"aw simulate {name}"):
+    with folder_lock(output, f"aw simulate {called}"):
         sweep_siblings(output)  # left by a killed call
         facts = simulate(spec, output, seed, depth, overwrite, bar)
         if sheet and not (facts["reused"] and (output / "truth" / "sheet.jpg").is_file()):
@@ -122,7 +140,16 @@ def simulate_command(
     if sheet:
         click.echo(f"look at: {output / 'truth' / 'sheet.jpg'}")
     scene = output.parent / f"{output.name}-scene"
-    click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}")
+    factor = f" --factor {twin.factor}" if twin else ""
+    click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
+
+
+def _twin(scene: Path, width: int | None, seed: int) -> Twin:
+    """Measure a scene and return the spec of a capture like it."""
+    from ambiguous_wild.io.scene_folder import load_scene
+    from ambiguous_wild.report.twin import measure_likeness, spec_like
+
+    return spec_like(measure_likeness(load_scene(scene)), width, seed)
 
 
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:

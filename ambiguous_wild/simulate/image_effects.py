@@ -93,8 +93,8 @@ def white_balance(
     return image * np.array(gains, np.float32)
 
 
-_SHOT = 1.2e-4  # variance at full signal and ISO 100: a full well of about 8000 electrons
-_READ = 5e-4  # standard deviation at ISO 100
+SHOT = 1.2e-4  # variance at full signal and ISO 100: a full well of about 8000 electrons
+READ = 5e-4  # standard deviation at ISO 100
 
 
 def draw_iso_noise(settings: IsoNoise, random: PhotoRandom) -> float:
@@ -112,12 +112,12 @@ def iso_noise(
     normal: np.ndarray,  # [H, W, 3] float32, standard normal
     iso: float,
 ) -> np.ndarray:
-    """Add noise of variance `_SHOT` gain signal + (`_READ` gain)^2, gain = iso / 100.
+    """Add noise of variance `SHOT` gain signal + (`READ` gain)^2, gain = iso / 100.
 
     Source: the affine noise model of Foi et al. 2008, IEEE TIP 17(10).
     """
     gain = iso / 100.0
-    variance = _SHOT * gain * np.clip(image, 0.0, None) + (_READ * gain) ** 2
+    variance = SHOT * gain * np.clip(image, 0.0, None) + (READ * gain) ** 2
     return image + np.sqrt(variance).astype(np.float32) * normal
 
 

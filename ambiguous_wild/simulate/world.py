@@ -122,11 +122,14 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
 def circle_of(thing: Thing) -> tuple[float, float, float]:
     """Return x, y and radius in m of the circle on the ground in which no distractor may stand."""
     width, depth, height = thing.size_m
+    if thing.at_m[2] >= OVERHEAD_M:
+        return (thing.at_m[0], thing.at_m[1], 0.0)
     if thing.kind in STATUES or thing.kind == "figure":
         return (thing.at_m[0], thing.at_m[1], 0.3 * height)
     return (thing.at_m[0], thing.at_m[1], 0.5 * max(width, depth))
 
 
+OVERHEAD_M = 2.0  # foot of a thing that hangs above the distractors
 POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 
 # Textures of objects and distractors; `brick` and `gravel` also cover the courtyard's walls and ground,

@@ -88,6 +88,7 @@ def test_a_thing_stands_on_the_ground_at_its_place(kind: str) -> None:
     assert foot == pytest.approx(0.0, abs=0.12) and 1.3 < top < 1.75
     assert (columns.min() + columns.max()) / 2 == pytest.approx(45, abs=5)
     assert circle_of(thing)[:2] == (0.5, -1.0)
+    assert circle_of(replace(thing, at_m=(0.5, -1.0, 2.0)))[2] == 0 < circle_of(thing)[2]  # above all heads
 
 
 def test_a_walker_keeps_to_its_way_and_speed() -> None:

@@ -6,7 +6,6 @@ Identities are hashes that anybody can compute again from the files.
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import os
 import platform
 import shlex
@@ -23,6 +22,7 @@ import ambiguous_wild
 from ambiguous_wild import __version__
 from ambiguous_wild.core import UNMOVED, AwError, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
+from ambiguous_wild.core.errors import installed
 from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
@@ -67,14 +67,6 @@ def environment(device: str) -> Environment:
         facts["gpu"] = torch.cuda.get_device_name(device)
         facts["gsplat_max_alpha"] = max_alpha(device)  # differs between its sources
     return facts
-
-
-def installed(package: str) -> str | None:
-    """Return the version of an installed distribution, or None."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _cpu_name() -> str:

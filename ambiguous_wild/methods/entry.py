@@ -1,8 +1,8 @@
 """A method as the registry knows it: its name, recipe and options. Imports neither torch nor any method.
 
 "NAME+2passes" trains twice, the second time from the start with the final masks of the first, as T-3DGS and
-DualSplat do. The second pass has fixed masks instead of the mask policy, whose losses belong to the first pass;
-density control, effects, fields and schedule stay.
+DualSplat do. The second pass has fixed masks instead of the mask policy, whose losses belong to the first
+pass; density control, effects, fields and schedule stay.
 """
 
 from __future__ import annotations

@@ -257,17 +257,16 @@ def view_runs(
 class Viewer:
     """The page of one or more runs, which a notebook shows in a frame."""
 
-    def __init__(self, paths: Sequence[Path], *, height: int = 640, scene_folder: Path | None = None) -> None:
+    def __init__(self, paths: Sequence[Path], *, height: int = 640) -> None:
         """
         Args:
             paths: run folders, or folders of runs, all of one scene.
             height: height of the frame, px.
-            scene_folder: where the scene lies; None = where the runs say.
 
         Raises:
             AwError: as `view_runs`.
         """
-        shown = read_models(paths, scene_folder=scene_folder)
+        shown = read_models(paths)
         self.labels = tuple(model.label for model in shown.models)
         self.height = height
         self.page, _, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)

@@ -6,7 +6,7 @@ differs, a file was changed since, and the run is refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -44,18 +44,12 @@ class Rescored:
     error: str = ""
 
 
-def rescore(
-    folders: Sequence[Path],
-    *,
-    scene: Path | None = None,
-    tick: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Rescored]:
+def rescore(folders: Sequence[Path], *, scene: Path | None = None) -> list[Rescored]:
     """Add the metrics that can be measured now to every run below the folders.
 
     Args:
         folders: outputs of `aw bench`, or folders of them.
         scene: where the scene lies now; None = where each run says.
-        tick: called with (runs done, runs) after each run.
 
     Raises:
         AwError: no such folder, or no run in it.
@@ -64,12 +58,11 @@ def rescore(
     if not runs:
         raise AwError(f"no run in {', '.join(map(str, folders))}: 'aw bench -o' makes one")
     outcomes, scenes = [], _Scenes(scene)
-    for done, run in enumerate(runs, 1):
+    for run in runs:
         try:
             outcomes.append(_rescore(run, scenes))
         except AwError as error:
             outcomes.append(Rescored(run, "refused", error=str(error)))
-        tick(done, len(runs))
     return outcomes
 
 

@@ -136,22 +136,6 @@ def asked_length(train: TrainConfig) -> str:
     return f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
 
 
-def refuse_other_scene(run: Path, scene: Path, now: str, before: str) -> None:
-    """Raise AwError if a scene has changed since a run was measured on it.
-
-    Args:
-        run: the run's folder.
-        scene: the scene's folder.
-        now: `scene_identity` of the scene as it is.
-        before: `scene_identity` of the scene as the run used it.
-    """
-    if now != before:
-        raise AwError(
-            f"{run} was measured on another state of {scene}: hash {before[:12]}, now {now[:12]}; restore "
-            "the scene, or name the folder of the right one"
-        )
-
-
 def _contents(scene: Scene) -> dict[str, object]:
     """Return cameras, points and photos of a plain COLMAP scene, which lists no hashes of its files."""
     cameras = [v.camera for v in scene.views]

@@ -14,9 +14,8 @@ from typing import Any
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
-from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
-from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.report.board import HIDDEN, Entry
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
@@ -252,7 +251,7 @@ class Scenes:
         """
         self._folder, self._dataset = folder, dataset
         self._datasets = {e.scene_hash: e.dataset for e in board}
-        self._opened: dict[tuple[Path, int | None], tuple[Scene, str]] = {}
+        self._opened = Opened()
 
     def find(self, run: Path, config: RunConfig) -> Scene | None:
         """Return the scene of a run; None if it is not on this machine.
@@ -260,22 +259,8 @@ class Scenes:
         Raises:
             AwError: the folder holds another scene, or a damaged one.
         """
-        asked = config["scene"]
-        path = self._path(asked)
-        if path is None:
-            return None
-        factor = asked.get("factor")
-        key = (path, factor if isinstance(factor, int) else None)
-        if key not in self._opened:
-            scene = load_scene(path, factor=key[1], verify=True)
-            self._opened[key] = scene, scene_identity(scene)
-        scene, identity = self._opened[key]
-        if identity != asked.get("sha256"):
-            raise AwError(
-                f"{run} is of another scene than {path}: the run's has hash {str(asked.get('sha256'))[:12]}, "
-                f"this one {identity[:12]}; name the right one with --scene, or run again on this one"
-            )
-        return scene
+        path = self._path(config["scene"])
+        return None if path is None else open_scene(run, path, opened=self._opened)
 
     def _path(self, asked: SceneConfig) -> Path | None:
         name = str(asked.get("name"))

@@ -20,7 +20,7 @@ import numpy as np
 
 import ambiguous_wild
 from ambiguous_wild import __version__
-from ambiguous_wild.core import UNMOVED, AwError, Scene
+from ambiguous_wild.core import UNMOVED, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.core.errors import installed
 from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol

@@ -166,8 +166,8 @@ def open_scene(
     scene, identity = opened[key]
     if verify and identity != (before := str(config.get("sha256"))):
         raise AwError(
-            f"{run} was measured on another state of {path}: hash {before[:12]}, now {identity[:12]}; restore "
-            "the scene, name the right one with --scene, or run again on this one"
+            f"{run} was measured on another state of {path}: hash {before[:12]}, now {identity[:12]}; "
+            "restore the scene, name the right one with --scene, or run again on this one"
         )
     return scene
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -15,6 +13,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.start import recorded_start, started
 from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.files import own_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
@@ -49,13 +48,13 @@ def replay(run: Path) -> Replay:
     findings = sorted(p.parent for p in (run / FOLDER).glob(f"*/{REPORT}"))
     if not findings:
         raise AwError(f"{run} holds no {FOLDER}/*/{REPORT}: all its values were finite; name another run")
-    report, config = _read(findings[0] / REPORT), _read(run / "config.yaml")
+    report, config = own_json(findings[0] / REPORT), plain_yaml.read_mapping(run / "config.yaml")
     try:
         method, train, device = config["method"], config["train"], torch.device(config["device"])
         options, path, factor = config["options"], config["scene"]["path"], config["scene"]["factor"]
         last, message = int(report["iteration"]), str(report["message"])
     except (KeyError, TypeError) as error:
-        raise AwError(f"{run} cannot be replayed: its config or report lacks {error}") from None
+        raise AwError(f"{run} cannot be replayed: its config or report is damaged: no {error}") from None
     entry = get_method(method)
     parts = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
     parts = with_effects(parts, tuple(config.get("effects", ())))
@@ -79,15 +78,3 @@ def replay(run: Path) -> Replay:
         except NonFinite as error:
             return Replay(message, str(error), start)
     return Replay(message, "", start)
-
-
-def _read(path: Path) -> dict[Any, Any]:
-    if path.suffix != ".json":
-        return plain_yaml.read_mapping(path)
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise AwError(f"cannot read {path}: {error}") from None
-    if not isinstance(report, dict):
-        raise AwError(f"{path} is damaged: a mapping was expected")
-    return report

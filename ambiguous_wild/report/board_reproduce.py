@@ -16,6 +16,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
+from ambiguous_wild.io.files import own_json
 from ambiguous_wild.report.board import HIDDEN, Entry
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
@@ -180,21 +181,13 @@ def preparation(scene: Scene | None) -> list[str]:
     Args:
         scene: scene of a run; None: it is not on this machine.
     """
-    truth = _read(scene.root / "truth" / "capture.json") if scene is not None else {}
+    truth = own_json(scene.root / "truth" / "capture.json") if scene is not None else {}
     settings = scene.info.get("settings") if scene is not None else None
     if scene is None or not truth or not isinstance(settings, dict):
         return []
     simulate = _simulate(truth, scene.name)
     raw = f"raw/{scene.name}"
     return [*simulate, shlex.join(_build(raw, scene.name, settings))] if simulate else []
-
-
-def _read(path: Path) -> Facts:
-    try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
 
 
 def _simulate(truth: Facts, name: str) -> list[str]:
@@ -285,7 +278,7 @@ class Scenes:
             name = scene.info.get("dataset")
             if isinstance(name, str) and name.strip():
                 return name
-            if isinstance(_read(scene.root / "truth" / "capture.json").get("preset"), str):
+            if isinstance(own_json(scene.root / "truth" / "capture.json").get("preset"), str):
                 return SIMULATED
         if scene_hash in self._datasets:
             return self._datasets[scene_hash]

@@ -63,7 +63,7 @@ def with_new_names(args: Sequence[str]) -> list[str]:
     while words and words[0] != "--":
         old, equals, value = words.pop(0).partition("=")
         following = value or "".join(words[:1])
-        folder = "/" in following or Path(following).is_dir()
+        folder = "/" in following or os.path.isdir(following)  # pathlib raises on a long word
         if old not in names or (command in _NAMES_OR_FOLDERS and old == "--scene" and folder):
             renamed.append(old + equals + value)
             continue

@@ -155,12 +155,11 @@ def pairs_of_tests(
     vectors: np.ndarray,  # [N, D]
     names: Sequence[str],
     test_names: set[str],
-    count: int = 2 * SIMILAR,
 ) -> list[tuple[str, str]]:
     """Pair photos of a separate test set with the most similar photos of the walk and of the test set."""
     walk = [i for i, name in enumerate(names) if name not in test_names]
     tests = [i for i, name in enumerate(names) if name in test_names]
-    pairs = {(min(a, b), max(a, b)) for a, b in most_similar(vectors, tests, walk, count)}
+    pairs = {(min(a, b), max(a, b)) for a, b in most_similar(vectors, tests, walk, 2 * SIMILAR)}
     pairs |= {(min(a, b), max(a, b)) for a, b in most_similar(vectors, tests, tests, SIMILAR // 2)}
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 

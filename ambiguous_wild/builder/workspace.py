@@ -15,12 +15,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ambiguous_wild import __version__
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, installed
 from ambiguous_wild.io.files import Held, atomic_dir, file_lock, lock_path, write_json
 
 BUILDER = 15  # raised when a stage gives another result for the same input
@@ -32,13 +31,8 @@ Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`
 @cache
 def versions() -> dict[str, str]:
     """Return the versions that the result depends on, by name; a library under another name is absent."""
-    version_of = {"ambiguous_wild": __version__, "builder": str(BUILDER)}
-    for name in _LIBRARIES:
-        try:
-            version_of[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return version_of
+    version_of = {name: version for name in _LIBRARIES if (version := installed(name)) is not None}
+    return {"ambiguous_wild": __version__, "builder": str(BUILDER), **version_of}
 
 
 def content_key(*parts: Any) -> str:

@@ -91,8 +91,8 @@ def command(
 def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> None:
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.harness.cell import scene_identity
+    from ambiguous_wild.harness.result_file import encoded
     from ambiguous_wild.io.scene_folder import load_scene
-    from ambiguous_wild.report.cost import finite
     from ambiguous_wild.report.cost_recommend import in_words, recommend, speed_here
 
     seconds = parse_budget(budget)
@@ -103,7 +103,7 @@ def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> 
         click.echo("the runs have wall times only: this machine is assumed to be as fast as theirs", err=True)
     if as_json:
         facts = dataclasses.asdict(advice) | {"command": advice.command(str(scene))}
-        click.echo(json.dumps(finite(facts), indent=2))
+        click.echo(json.dumps(encoded(facts), indent=2))
     else:
         click.echo(in_words(advice, str(scene)), nl=False)
 

@@ -8,7 +8,7 @@ import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -31,7 +31,7 @@ KINDS = (
 @click.option("--model", default="", help="Name of one of several COLMAP models.  [default: most photos]")
 @click.option("--factor", type=int, help="Downsampling.  [default: as in the papers]")
 @click.option("--name", default="", help="Name of the scene.  [default: the output folder's]")
-@click.option("--license", "license_", default="", help="Licence of the photos, recorded in scene.json.")
+@click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
 @click.option("--dataset", default="", help="Name of the dataset in tables.  [default: the layout's]")
 @click.option(
     "--drop-test-only-points",
@@ -56,19 +56,10 @@ KINDS = (
 def import_command(
     source: Path,
     output: Path,
-    kind: str | None,
-    model: str,
-    factor: int | None,
-    name: str,
-    license_: str,
-    dataset: str,
-    drop_test_only_points: bool,
-    motion: bool,
-    masks: bool,
     threads: int | None,
-    seed: int,
     overwrite: bool,
     as_json: bool,
+    **settings: Any,  # fields of `ImportSettings`
 ) -> None:
     """Import the scene in SOURCE: NeRF On-the-go, RobustNeRF, Photo Tourism, Drone Imagery, DualSplat,
     NerfBaselines, nerfstudio, instant-ngp, Blender, or COLMAP with images.
@@ -78,10 +69,14 @@ def import_command(
     """
     from ambiguous_wild.datasets.write import ImportSettings, import_scene
 
-    settings = ImportSettings(
-        kind, factor, name, license_, dataset, drop_test_only_points, seed, motion, model, masks
+    done = import_scene(
+        source,
+        output,
+        ImportSettings(**settings),
+        overwrite=overwrite,
+        jobs=threads,
+        progress=not as_json,
     )
-    done = import_scene(source, output, settings, overwrite=overwrite, jobs=threads, progress=not as_json)
     info = done.info
     if as_json:
         facts = {k: v for k, v in info.items() if k not in ("files", "photos", "inputs")}

@@ -57,7 +57,7 @@ def command() -> None:
     help="Copies to keep per scene for the page: N test images and N train photos with masks.",
 )
 @click.option(
-    "--overwrite", "replace", is_flag=True, help="Replace a run on the board that has other numbers."
+    "--overwrite", "replace_other", is_flag=True, help="Replace a run on the board that has other numbers."
 )
 @click.option("--quick", is_flag=True, help="Recompute only PSNR.")
 @click.option("--dry-run", is_flag=True, help="Check only; write nothing.")
@@ -65,34 +65,27 @@ def command() -> None:
 def add_command(
     runs: tuple[Path, ...],
     board: Path,
-    dataset: str | None,
-    scenes: Path | None,
-    images: int,
-    replace: bool,
-    quick: bool,
     dry_run: bool,
     as_json: bool,
+    **options: Any,  # the other arguments of `add`, by their names
 ) -> None:
     """Check RUNS (run folders, or folders of them) and add those that pass.
 
     Changed, partial, failed and foreign runs are refused, one line each; unfinished runs are
     left for later. Adding a run twice changes nothing.
     """
+    from tqdm import tqdm
+
     from ambiguous_wild.core import AwError
     from ambiguous_wild.report.board_edit import add
 
-    with _bar() as tick:
-        reports = add(
-            board,
-            runs,
-            dataset=dataset,
-            scenes=scenes,
-            images=images,
-            replace_other=replace,
-            quick=quick,
-            dry=dry_run,
-            tick=tick,
-        )
+    with tqdm(unit="run", disable=None, file=sys.stderr) as bar:
+
+        def tick(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        reports = add(board, runs, dry=dry_run, tick=tick, **options)
     _print_reports(reports, as_json)
     counts = Counter(r.outcome for r in reports)
     outcomes = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
@@ -116,25 +109,6 @@ def _print_reports(reports: list[AddReport], as_json: bool) -> None:
             )
 
 
-class _bar:
-    """A bar over the runs, shown in a terminal only."""
-
-    def __enter__(self) -> Any:
-        self.bar: Any = None
-        return self.tick
-
-    def tick(self, done: int, total: int) -> None:
-        from tqdm import tqdm
-
-        if self.bar is None:
-            self.bar = tqdm(total=total, unit="run", disable=not sys.stderr.isatty(), file=sys.stderr)
-        self.bar.update(done - self.bar.n)
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-
 @command.command("remove")
 @_board
 @click.option("--method", required=True, help="Remove runs of this method.")
@@ -143,19 +117,11 @@ class _bar:
 @click.option("--setting", help="Only runs of this setting, as written on the board.")
 @click.option("--seed", type=click.IntRange(0), help="Only runs of this seed.")
 @click.option("--dry-run", is_flag=True, help="List the runs; remove nothing.")
-def remove_command(
-    board: Path,
-    method: str,
-    dataset: str | None,
-    scene: str | None,
-    setting: str | None,
-    seed: int | None,
-    dry_run: bool,
-) -> None:
+def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
     """Remove runs and their pictures from the board."""
     from ambiguous_wild.report.board_edit import remove
 
-    gone = remove(board, method=method, dataset=dataset, scene=scene, setting=setting, seed=seed, dry=dry_run)
+    gone = remove(board, dry=dry_run, **chosen)
     for entry in gone:
         click.echo(f"{'would remove' if dry_run else 'removed'}: {entry.name}")
     click.echo(f"{len(gone)} run{'' if len(gone) == 1 else 's'}; board {board}", err=True)
@@ -182,11 +148,9 @@ def remove_command(
 def publish_command(
     board: Path,
     output: Path,
-    reported: bool,
-    reported_from: Path | None,
-    title: str,
     models: tuple[Path, ...],
     as_json: bool,
+    **options: Any,  # the other arguments of `publish`, by their names
 ) -> None:
     """Write CSVs and an offline page from the CSVs of the board.
 
@@ -196,15 +160,7 @@ def publish_command(
 
     from ambiguous_wild.report.board_publish import publish
 
-    done = publish(
-        board,
-        output,
-        reported=reported,
-        reported_from=reported_from,
-        title=title,
-        models=models,
-        say=lambda text: click.echo(text, err=True),
-    )
+    done = publish(board, output, models=models, say=lambda text: click.echo(text, err=True), **options)
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(done), indent=2))
     summary = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures"

@@ -63,7 +63,7 @@ def with_new_names(args: Sequence[str]) -> list[str]:
     while words and words[0] != "--":
         old, equals, value = words.pop(0).partition("=")
         following = value or "".join(words[:1])
-        folder = "/" in following or Path(following).is_dir()
+        folder = "/" in following or os.path.isdir(following)  # pathlib raises on a long word
         if old not in names or (command in _NAMES_OR_FOLDERS and old == "--scene" and folder):
             renamed.append(old + equals + value)
             continue
@@ -110,7 +110,7 @@ COMMANDS = {
     "table": ("table", "Compare runs in tables: terminal, Markdown, CSV, LaTeX, HTML."),
     "rescore": ("table", "Add metrics that were missing when runs ended, from their saved renders."),
     "cost": ("cost", "Accuracy against training time: tables and plots."),
-    "audit": ("audit", "Find errors in tables of results."),
+    "audit": ("table", "Find errors in tables of results."),
     "view": ("view", "Write a page to fly through models and compare them; or watch a training."),
     "video": ("view", "Film models side by side along one camera path: mp4, GIF."),
     "export": ("view", "Write models as compressed PLY, SPZ, SOG and glTF, with the loss in dB."),

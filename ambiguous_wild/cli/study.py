@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -42,6 +43,7 @@ def command() -> None:
 @only_option
 @click.option(
     "--questions",
+    "limit",
     type=click.IntRange(1, 1000),
     default=40,
     show_default=True,
@@ -82,8 +84,8 @@ def command() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def make_command(
     runs: Path | None, photos_of: tuple[Path, ...], output: Path, methods: tuple[str, ...], scenes: tuple[str, ...],
-    questions: int, truth: bool, outline: bool, side: int, quality: int, title: str, seed: int, overwrite: bool,
-    as_json: bool,
+    truth: bool, outline: bool, overwrite: bool, as_json: bool,
+    **settings: Any,  # fields of `StudySettings`
 ) -> None:  # fmt: skip
     """Write the study as one HTML file that works offline and on a phone. It asks about the test renders in RUNS
     (the output of 'aw bench'), about the photos of --scene, or about both.
@@ -105,7 +107,7 @@ def make_command(
         raise AwError(
             f"the page must be named *.html, so that browsers open it: -o {output.with_suffix('.html')}"
         )
-    if not is_text(title):
+    if not is_text(title := settings["title"]):
         raise AwError(f"--title {title!a} contains half a character; set the terminal's encoding to UTF-8")
     same = [
         scene for k, scene in enumerate(photos_of) if scene.resolve() in [s.resolve() for s in photos_of[:k]]
@@ -124,9 +126,12 @@ def make_command(
     asked: list[Question] = [q for scene in photos_of for q in scene_photos(scene, outline=outline)]
     if runs is not None:
         asked += render_pairs(runs, methods=methods, scenes=scenes, truth=truth)
-    settings = StudySettings(title=title, limit=questions, side=side, quality=quality, seed=seed)
     study = make_study(
-        asked, output, key, settings, lambda q: tqdm(q, unit="question", disable=as_json or None)
+        asked,
+        output,
+        key,
+        StudySettings(**settings),
+        lambda q: tqdm(q, unit="question", disable=as_json or None),
     )
     if as_json:
         facts = {k: str(v) if isinstance(v, Path) else v for k, v in vars(study).items()}

@@ -33,7 +33,8 @@ _one_scene = click.option(
 @_one_scene
 @scene_folder_option
 @click.option(
-    "--max-gaussians", type=click.IntRange(1), default=MOST_GAUSSIANS, show_default=True,
+    "--max-gaussians", "most_gaussians", type=click.IntRange(1), default=MOST_GAUSSIANS,
+    show_default=True,
     help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note.",
 )  # fmt: skip
 @plugin_option
@@ -48,6 +49,7 @@ _one_scene = click.option(
 @click.option("--iterations", type=click.IntRange(1), help="With --live: iterations.  [default: 30000]")
 @click.option(
     "--max-train-gaussians",
+    "max_gaussians",
     type=click.IntRange(4),
     help="With --live: largest number of Gaussians.  [default: the method's]",
 )
@@ -76,19 +78,12 @@ def view_command(
     output: Path,
     scene: str | None,
     scene_folder: Path | None,
-    max_gaussians: int,
+    most_gaussians: int,
     plugins: tuple[Path, ...],
     title: str | None,
     live: Path | None,
     method: str,
-    iterations: int | None,
-    max_train_gaussians: int | None,
-    seed: int,
-    threads: int | None,
-    device: str,
-    host: str,
-    port: int,
-    paused: bool,
+    **training: Any,  # the other arguments of `watch`, by their names
 ) -> None:
     """Write a page that shows the models of RUNS (run folders, folders of them, or splat files of any tool: PLY,
     compressed PLY, SPZ, SOG), all of one scene.
@@ -112,10 +107,7 @@ def view_command(
         from ambiguous_wild.report.model_views import watch
 
         folder = Path("runs") if chosen is click.core.ParameterSource.DEFAULT else output
-        watch(
-            live, method, folder, iterations=iterations, max_gaussians=max_train_gaussians, seed=seed,
-            threads=threads, device=device, host=host, port=port, paused=paused, say=say,
-        )  # fmt: skip
+        watch(live, method, folder, say=say, **training)
         return
     if not runs:
         raise AwError("no RUNS: give the folder that 'aw bench -o' wrote, or --live SCENE")
@@ -126,7 +118,7 @@ def view_command(
         output,
         scene=scene,
         scene_folder=scene_folder,
-        most_gaussians=max_gaussians,
+        most_gaussians=most_gaussians,
         title=title,
         say=say,
     )
@@ -235,13 +227,9 @@ def export_command(
     runs: tuple[Path, ...],
     formats: tuple[str, ...],
     output: Path | None,
-    up: str | None,
-    overwrite: bool,
-    loss: bool,
-    scene_folder: Path | None,
     plugins: tuple[Path, ...],
-    threads: int | None,
     as_json: bool,
+    **options: Any,  # the other arguments of `export_runs`, by their names
 ) -> None:
     """Write the models of RUNS (run folders, folders of them, or splat files of any tool: PLY, compressed
     PLY, SPZ, SOG) as compressed PLY, SPZ, SOG, glTF and PLY.
@@ -261,10 +249,7 @@ def export_command(
     for plugin in plugins:
         load_plugin(plugin)
 
-    reports = export_runs(
-        runs, formats, output, loss=loss, scene_folder=scene_folder, threads=threads, overwrite=overwrite,
-        up=up, say=say,
-    )  # fmt: skip
+    reports = export_runs(runs, formats, output, say=say, **options)
     if as_json:
         rows = [
             {k: _plain(v) for k, v in {"label": label, **dataclasses.asdict(e)}.items()}

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import importlib.metadata
 import logging
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+
+def installed(package: str) -> str | None:
+    """Return the version of an installed distribution, or None."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def install_command(extra: str) -> str:

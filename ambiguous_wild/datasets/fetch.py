@@ -25,7 +25,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.builder.workspace import build_lock
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io.archive import extract
-from ambiguous_wild.io.files import check_output, sha256_file, write_json
+from ambiguous_wild.io.files import check_output, own_json, sha256_file, write_json
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 CATALOGUE = Path(__file__).with_name("public.yaml")
@@ -279,10 +279,7 @@ def _copy(
 
 def _read_state(path: Path) -> str:
     """Read the server's tag of the downloaded part; empty if it is not known."""
-    try:
-        return str(json.loads(path.read_text(encoding="utf-8")).get("etag", ""))
-    except (OSError, ValueError, AttributeError):
-        return ""
+    return str(own_json(path).get("etag", ""))
 
 
 def _read_record(folder: Path) -> dict[str, Download]:

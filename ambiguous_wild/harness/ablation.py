@@ -94,10 +94,6 @@ class Planned:
     missing: str = ""  # why there are no cells
     same_as: str = ""  # the default, or an earlier variant, with the same settings
 
-    @property
-    def is_default(self) -> bool:
-        return self.variant.name == DEFAULT
-
 
 @dataclass(frozen=True)
 class Study:

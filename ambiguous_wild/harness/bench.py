@@ -307,10 +307,10 @@ def find_methods(
     A misspelt name is an error before torch is imported. "a,b" are two methods, except in a graft with two
     places (a@mask=b,density=c) and in the name of a file that exists.
     """
+    from ambiguous_wild.methods.entry import second_pass_name, trained_once
     from ambiguous_wild.methods.graft import graft_name
     from ambiguous_wild.methods.references import reference_file
     from ambiguous_wild.methods.registry import get_method, load_plugin
-    from ambiguous_wild.methods.second_pass import second_pass_name, trained_once
 
     for plugin in plugins:
         load_plugin(Path(plugin))

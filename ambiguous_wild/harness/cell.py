@@ -6,7 +6,6 @@ Identities are hashes that anybody can compute again from the files.
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import os
 import platform
 import shlex
@@ -21,8 +20,9 @@ import numpy as np
 
 import ambiguous_wild
 from ambiguous_wild import __version__
-from ambiguous_wild.core import UNMOVED, AwError, Scene
+from ambiguous_wild.core import UNMOVED, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
+from ambiguous_wild.core.errors import installed
 from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
@@ -67,14 +67,6 @@ def environment(device: str) -> Environment:
         facts["gpu"] = torch.cuda.get_device_name(device)
         facts["gsplat_max_alpha"] = max_alpha(device)  # differs between its sources
     return facts
-
-
-def installed(package: str) -> str | None:
-    """Return the version of an installed distribution, or None."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _cpu_name() -> str:
@@ -142,22 +134,6 @@ def scene_identity(scene: Scene) -> str:
 def asked_length(train: TrainConfig) -> str:
     """Return the length that was asked for, "60 s" or "2000 iterations"."""
     return f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
-
-
-def refuse_other_scene(run: Path, scene: Path, now: str, before: str) -> None:
-    """Raise AwError if a scene has changed since a run was measured on it.
-
-    Args:
-        run: the run's folder.
-        scene: the scene's folder.
-        now: `scene_identity` of the scene as it is.
-        before: `scene_identity` of the scene as the run used it.
-    """
-    if now != before:
-        raise AwError(
-            f"{run} was measured on another state of {scene}: hash {before[:12]}, now {now[:12]}; restore "
-            "the scene, or name the folder of the right one"
-        )
 
 
 def _contents(scene: Scene) -> dict[str, object]:

@@ -26,10 +26,10 @@ from ambiguous_wild.harness.run import error_line, run_cell
 from ambiguous_wild.harness.start import recorded_start
 from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods.entry import trained_once
 from ambiguous_wild.methods.graft import split_graft
 from ambiguous_wild.methods.references import reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
-from ambiguous_wild.methods.second_pass import trained_once
 from ambiguous_wild.splat.pace import TrainConfig
 
 # A node that is lost keeps its lock until the file server forgets it (NFS: 90 s by default).

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import weakref
@@ -16,6 +15,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.start import recorded_start, started
 from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.files import own_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
@@ -50,11 +50,11 @@ def replay(run: Path) -> Replay:
     findings = sorted(p.parent for p in (run / FOLDER).glob(f"*/{REPORT}"))
     if not findings:
         raise AwError(f"{run} holds no {FOLDER}/*/{REPORT}: all its values were finite; name another run")
-    report, config = _read(findings[0] / REPORT), _read(run / "config.yaml")
+    report, config = own_json(findings[0] / REPORT), plain_yaml.read_mapping(run / "config.yaml")
     try:
         last, message = int(report["iteration"]), str(report["message"])
     except (KeyError, TypeError) as error:
-        raise AwError(f"{run} cannot be replayed: its report lacks {error}") from None
+        raise AwError(f"{run} cannot be replayed: its report is damaged: no {error}") from None
     with tempfile.TemporaryDirectory(prefix="aw-replay-") as name:
         folder = Path(name)
         trainer = _trainer(run, config, folder, folder / "cache")
@@ -85,7 +85,7 @@ def open_run(run: Path | str) -> Trainer:
     if not (run / "config.yaml").is_file():
         raise AwError(f"{run} is no run of 'aw bench': it holds no config.yaml")
     cache = Path(tempfile.mkdtemp(prefix="aw-open-"))  # of features, for as long as the trainer lives
-    trainer = _trainer(run, _read(run / "config.yaml"), run, cache)
+    trainer = _trainer(run, plain_yaml.read_mapping(run / "config.yaml"), run, cache)
     weakref.finalize(trainer, shutil.rmtree, cache, ignore_errors=True)
     if not trainer.resume():
         raise AwError(f"{run} holds no checkpoint: run 'aw bench' again")
@@ -109,15 +109,3 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, cache: Path) -> Tr
     data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=cache)
     parts = started(parts, recorded_start(config.get("start")), scene)
     return Trainer(data, parts, settings, folder=folder)
-
-
-def _read(path: Path) -> dict[Any, Any]:
-    if path.suffix != ".json":
-        return plain_yaml.read_mapping(path)
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise AwError(f"cannot read {path}: {error}") from None
-    if not isinstance(report, dict):
-        raise AwError(f"{path} is damaged: a mapping was expected")
-    return report

@@ -216,9 +216,9 @@ def write_result(path: Path | str, result: Mapping[str, object]) -> None:
     Raises:
         AwError: the result does not follow the schema.
     """
-    encoded = _encode(result)
-    _checked(encoded, str(path))
-    write_json(path, encoded)
+    data = encoded(result)
+    _checked(data, str(path))
+    write_json(path, data)
 
 
 def read_result(path: Path | str) -> RunResult:
@@ -305,11 +305,12 @@ def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not JSON")
 
 
-def _encode(value: Any) -> Any:
+def encoded(value: Any) -> Any:
+    """Return the value for JSON: null for NaN, "inf" and "-inf" for infinity, Python's own numbers."""
     if isinstance(value, Mapping):
-        return {str(k): _encode(v) for k, v in value.items()}
+        return {str(k): encoded(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_encode(v) for v in value]
+        return [encoded(v) for v in value]
     if isinstance(value, (np.bool_, np.integer, np.floating)):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

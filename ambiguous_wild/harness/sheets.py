@@ -87,15 +87,12 @@ def write_jpeg(path: Path, image: np.ndarray, quality: int = 90) -> None:
         temporary.write_bytes(data)
 
 
-def write_capture_sheet(raw: Path, path: Path | None = None) -> Path:
+def write_capture_sheet(raw: Path) -> None:
     """Write a JPEG of eight train photos, two with their truth, and four test photos.
 
     Args:
-        raw: folder of a capture of `aw simulate`.
-        path: JPEG to write; None: ``RAW/truth/sheet.jpg``, where no builder takes it for a photo.
-
-    Returns:
-        The path written.
+        raw: folder of a capture of `aw simulate`; the sheet is truth/sheet.jpg in it, where no builder takes
+            it for a photo.
 
     Raises:
         AwError: a photo of the capture is missing.
@@ -113,9 +110,7 @@ def write_capture_sheet(raw: Path, path: Path | None = None) -> Path:
         cell(f"test {name}", read_png_rgb(raw / "test" / name), WIDTH)
         for name in spread(test, CAPTURE_COLUMNS)
     ]
-    target = raw / "truth" / NAME if path is None else path
-    write_jpeg(target, grid(cells, CAPTURE_COLUMNS))
-    return target
+    write_jpeg(raw / "truth" / NAME, grid(cells, CAPTURE_COLUMNS))
 
 
 class PhotoFacts(TypedDict):

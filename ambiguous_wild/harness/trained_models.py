@@ -11,7 +11,7 @@ from pathlib import Path
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
-from ambiguous_wild.harness.cell import refuse_other_scene, scene_identity
+from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
 from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders
@@ -132,13 +132,19 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
     return _with_labels(trained), notes
 
 
-def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) -> Scene:
+Opened = dict[tuple[Path, int | None], tuple[Scene, str]]  # folder and factor -> scene and its identity
+
+
+def open_scene(
+    run: Path, folder: Path | None = None, *, verify: bool = True, opened: Opened | None = None
+) -> Scene:
     """Open the scene of a run, with the photos it was trained on.
 
     Args:
         run: the run's folder.
         folder: where the scene lies; None = where the run says.
         verify: compare the files with their hashes, and the scene with the one that the run used.
+        opened: verified scenes of earlier calls, which are not opened again.
 
     Raises:
         AwError: the scene is absent, damaged, or in another state than the run used.
@@ -150,12 +156,19 @@ def open_scene(run: Path, folder: Path | None = None, *, verify: bool = True) ->
     if not path.is_dir():
         raise AwError(
             f"the scene of {run} is not at {path}: move the scene back "
-            "('aw view', 'aw video' and 'aw export' take its folder: --scene)"
+            "('aw view', 'aw video', 'aw export' and 'aw rescore' take its folder: --scene)"
         )
     factor = config.get("factor")
-    scene = load_scene(path, factor=factor if isinstance(factor, int) else None, verify=verify)
-    if verify:
-        refuse_other_scene(run, path, scene_identity(scene), str(config.get("sha256")))
+    key, opened = (path, factor if isinstance(factor, int) else None), {} if opened is None else opened
+    if key not in opened:
+        scene = load_scene(path, factor=key[1], verify=verify)
+        opened[key] = scene, scene_identity(scene) if verify else ""
+    scene, identity = opened[key]
+    if verify and identity != (before := str(config.get("sha256"))):
+        raise AwError(
+            f"{run} was measured on another state of {path}: hash {before[:12]}, now {identity[:12]}; "
+            "restore the scene, name the right one with --scene, or run again on this one"
+        )
     return scene
 
 
@@ -257,17 +270,16 @@ def view_runs(
 class Viewer:
     """The page of one or more runs, which a notebook shows in a frame."""
 
-    def __init__(self, paths: Sequence[Path], *, height: int = 640, scene_folder: Path | None = None) -> None:
+    def __init__(self, paths: Sequence[Path], *, height: int = 640) -> None:
         """
         Args:
             paths: run folders, or folders of runs, all of one scene.
             height: height of the frame, px.
-            scene_folder: where the scene lies; None = where the runs say.
 
         Raises:
             AwError: as `view_runs`.
         """
-        shown = read_models(paths, scene_folder=scene_folder)
+        shown = read_models(paths)
         self.labels = tuple(model.label for model in shown.models)
         self.height = height
         self.page, _, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)

@@ -361,12 +361,18 @@ def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> No
             raise AwError(f"{folder / name} exists, and this command would replace it{how}")
 
 
+def own_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file that this program wrote; empty if it is absent or damaged."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
 def is_record(path: Path, key: str) -> bool:
     """Tell whether a file is a JSON object with this key, which shows that a command of ours wrote it."""
-    try:
-        return key in json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError, RecursionError):
-        return False
+    return key in own_json(path)
 
 
 def write_text(path: Path | str, text: str) -> None:

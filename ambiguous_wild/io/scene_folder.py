@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeGuard, cast
 
@@ -392,8 +391,3 @@ def _points(model: Model, views: tuple[View, ...]) -> Points:
             track_views[rows] = position
         track_xy[rows] = image.xys[index] * scale
     return Points(points.xyz, points.rgb, points.error_px, points.track_offsets, track_views, track_xy)
-
-
-def without_keep(scene: Scene) -> Scene:
-    """Return the scene without keep masks, for methods that find distractors themselves."""
-    return replace(scene, views=tuple(replace(v, keep_path=None) for v in scene.views))

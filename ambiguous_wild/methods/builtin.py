@@ -110,8 +110,8 @@ BUILTIN = (
     MethodEntry(
         name="asymgs-twin",
         summary="two models under different masks are to agree; one of them is the result",
-        recipe="ambiguous_wild.methods.asymgs_twin:build",
-        config="ambiguous_wild.methods.asymgs_twin:TwinConfig",
+        recipe="ambiguous_wild.methods.asymgs:build_twin",
+        config="ambiguous_wild.methods.asymgs:TwinConfig",
         paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its GS-GS form",
     ),
     MethodEntry(

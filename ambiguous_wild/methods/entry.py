@@ -1,4 +1,9 @@
-"""A method as the registry knows it: its name, recipe and options. Imports neither torch nor any method."""
+"""A method as the registry knows it: its name, recipe and options. Imports neither torch nor any method.
+
+"NAME+2passes" trains twice, the second time from the start with the final masks of the first, as T-3DGS and
+DualSplat do. The second pass has fixed masks instead of the mask policy, whose losses belong to the first
+pass; density control, effects, fields and schedule stay.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +43,7 @@ class MethodEntry:
     # an external program, which runs instead of parts on our trainer, see external.py
     program: Program | None = None
     base: str = ""  # for a method that trains twice its name without "+2passes", by which options are set
-    passes: int = 1  # number of trainings; the second uses the final masks of the first, see second_pass.py
+    passes: int = 1  # number of trainings; the second uses the final masks of the first
     # for a method named by its file the value of --method, with the absolute path, see references.py
     given_as: str = ""
     # a line below every table of its runs; {features} stands for the option of that name
@@ -119,3 +124,43 @@ def resolve(target: Any) -> Any:
         return target
     module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+SUFFIX = "+2passes"
+
+
+def second_pass_name(name: str, passes: int) -> str:
+    """Return the name of a method that trains this many times, once or twice.
+
+    Raises:
+        AwError: another number of passes.
+    """
+    if passes not in (1, 2):
+        raise AwError(f"--passes {passes}: a method trains once or twice")
+    return name if passes == 1 or name.endswith(SUFFIX) else name + SUFFIX
+
+
+def trained_once(name: str) -> str:
+    """Return the name without `SUFFIX`."""
+    return name.removesuffix(SUFFIX)
+
+
+def second_pass(entry: MethodEntry) -> MethodEntry:
+    """Return the method that trains twice.
+
+    Raises:
+        AwError: an external program trains it.
+    """
+    if entry.program is not None:
+        raise AwError(
+            f"{entry.name} is trained by another program, which cannot be given masks: no --passes 2"
+        )
+    return dataclasses.replace(
+        entry,
+        name=entry.name + SUFFIX,
+        summary=f"{entry.summary}; then again from the start with the final masks",
+        base=entry.name,
+        passes=2,
+        given_as=entry.given_as and entry.given_as + SUFFIX,
+        ablations=(),
+    )

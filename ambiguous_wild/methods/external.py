@@ -26,7 +26,7 @@ from ambiguous_wild.core.config import Facts, config_hash, from_plain, to_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io import plain_yaml
-from ambiguous_wild.io.files import write_json
+from ambiguous_wild.io.files import own_json, write_json
 from ambiguous_wild.methods.entry import MethodEntry, NoOptions
 from ambiguous_wild.methods.external_process import (
     DONE,
@@ -256,11 +256,8 @@ class CommandProgram:
 
 
 def _read(state: Path) -> dict[str, float]:
-    try:
-        data = json.loads(state.read_text(encoding="utf-8"))
-        return {key: float(data[key]) for key in ("train_s", "render_s") if key in data}
-    except (OSError, ValueError, TypeError, RecursionError):
-        return {}
+    data = own_json(state)
+    return {k: float(data[k]) for k in ("train_s", "render_s") if isinstance(data.get(k), (int, float))}
 
 
 def _revision(folder: Path) -> str | None:

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.methods.entry import MethodEntry, NoOptions, resolve
+from ambiguous_wild.methods.entry import MethodEntry, NoOptions, resolve, trained_once
 from ambiguous_wild.methods.references import is_program, is_reference, reference_file
-from ambiguous_wild.methods.second_pass import trained_once
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.graft_checks import Member

@@ -14,10 +14,9 @@ from pathlib import Path
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.methods.builtin import BUILTIN
-from ambiguous_wild.methods.entry import MethodEntry
+from ambiguous_wild.methods.entry import MethodEntry, second_pass, trained_once
 from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
 from ambiguous_wild.methods.references import import_file, is_reference, read_reference, without_recipe
-from ambiguous_wild.methods.second_pass import second_pass, trained_once
 
 __all__ = [
     "BUILTIN",
@@ -55,7 +54,7 @@ def get_method(name: str) -> MethodEntry:
     """Return the method of this name, in any case of letters.
 
     "host@mask=donor" is a graft, see graft.py. "recipe.py:my_recipe", "external:FILE" and
-    "nerfbaselines:METHOD" are references, see references.py. "NAME+2passes" trains twice, see second_pass.py.
+    "nerfbaselines:METHOD" are references, see references.py. "NAME+2passes" trains twice, see entry.py.
 
     Raises:
         AwError: the name is unknown; the message suggests the nearest.

@@ -24,8 +24,15 @@ from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods import masking_common
-from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, load_adam_state
-from ambiguous_wild.methods.masking_common import MaskedShares, PausingMask, upsampled
+from ambiguous_wild.methods.masking_common import (
+    MaskedShares,
+    MaskNet,
+    PausingMask,
+    adam_of,
+    adam_state,
+    load_adam_state,
+    upsampled,
+)
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig

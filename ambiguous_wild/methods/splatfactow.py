@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import State, check_limits
-from ambiguous_wild.methods.mask_net import enlarged
+from ambiguous_wild.methods.masking_common import enlarged
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves

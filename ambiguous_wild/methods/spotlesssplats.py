@@ -19,11 +19,15 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.dronesplat import label_means, nearest
-from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.methods.masking_common import (
     MaskedShares,
+    MaskNet,
+    adam_of,
+    adam_state,
     annealed,
     bound,
+    enlarged,
+    load_adam_state,
     percentile,
     residual,
     sampled,

@@ -19,12 +19,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State, check_limits
-from ambiguous_wild.methods.mask_net import adam_of, adam_state, load_adam_state
 from ambiguous_wild.methods.masking_common import (
     MaskedShares,
     PausingMask,
+    adam_of,
+    adam_state,
     annealed,
     calibrated,
+    load_adam_state,
     resized,
     sampled,
     upsampled,

@@ -19,6 +19,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.metrics.stats import Interval
 
 COLOUR_THRESHOLD = 0.3  # L2 distance in RGB, of [0, sqrt(3)]
+RESAMPLES = 2000  # of the bootstrap over photos
 COLOUR_AMBIGUOUS_ABOVE = 0.3  # share of distractor pixels
 COLOUR_METRIC = "colour_share_rgb_l2_below_0.3"
 
@@ -89,9 +90,8 @@ def colour_counts(
     distractor: np.ndarray,  # [H, W] bool, True = distractor
     *,
     known: np.ndarray | None = None,  # [H, W] bool: where the background is known; default: everywhere
-    threshold: float = COLOUR_THRESHOLD,
 ) -> ColourCounts:
-    """Count the distractor pixels of one photo that are closer than `threshold` to their background.
+    """Count the distractor pixels of one photo that are closer than `COLOUR_THRESHOLD` to their background.
 
     Raises:
         AwError: sizes differ, or a mask is not boolean.
@@ -110,7 +110,7 @@ def colour_counts(
         pixels=distractor.size,
         distractor=int(distractor.sum()),
         known=residual.size,
-        close=int((residual < threshold).sum()),
+        close=int((residual < COLOUR_THRESHOLD).sum()),
         residual_sum=float(residual.sum()),
     )
 
@@ -124,8 +124,6 @@ def ratio_interval(
     part: Sequence[float] | np.ndarray,  # [n], one per photo
     whole: Sequence[float] | np.ndarray,  # [n]
     *,
-    level: float = 0.95,
-    resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
     """Return sum(part) / sum(whole) with its percentile bootstrap interval over photos.
@@ -145,11 +143,10 @@ def ratio_interval(
     centre = float(a.sum() / b.sum())
     if len(a) < 2:
         return Interval(centre, math.nan, math.nan, count)
-    rows = np.random.default_rng(seed).integers(0, len(a), size=(resamples, len(a)))
+    rows = np.random.default_rng(seed).integers(0, len(a), size=(RESAMPLES, len(a)))
     wholes = b[rows].sum(axis=1)
     ratios = a[rows].sum(axis=1)[wholes > 0] / wholes[wholes > 0]
-    tail = (1.0 - level) / 2.0
-    low, high = np.quantile(ratios, [tail, 1.0 - tail])
+    low, high = np.quantile(ratios, [0.025, 0.975])
     return Interval(centre, float(low), float(high), count)
 
 

@@ -53,8 +53,6 @@ class Confusion:
 def confusion(
     keep: np.ndarray,  # [H, W] bool, uint8 {0, 255} or float in [0, 1]; predicted, 1 = static
     truth: np.ndarray,  # [H, W] the same types; ground truth
-    *,
-    known: np.ndarray | None = None,  # [H, W] bool; pixels whose truth is known, default all
 ) -> Confusion:
     """Pixel counts of one predicted keep map against the true one; soft maps are thresholded at 0.5.
 
@@ -63,9 +61,6 @@ def confusion(
     """
     masked, transient = ~as_keep(keep, "predicted"), ~as_keep(truth, "true")
     _same_size(masked, transient)
-    if known is not None:
-        _same_size(masked, np.asarray(known))
-        masked, transient = masked[known.astype(bool)], transient[known.astype(bool)]
     return Confusion(
         true_positive=int((masked & transient).sum()),
         false_positive=int((masked & ~transient).sum()),

@@ -84,10 +84,6 @@ def bootstrap_interval(
 def paired_interval(
     a: Sequence[float] | np.ndarray,  # [n], one per image
     b: Sequence[float] | np.ndarray,  # [n], the same images in the same order
-    *,
-    level: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
 ) -> Interval:
     """Bootstrap interval of mean(a - b) over the same images: narrower than two separate intervals.
 
@@ -100,7 +96,7 @@ def paired_interval(
     # inf - inf is 0 here: both images are identical to the truth.
     with np.errstate(invalid="ignore"):
         difference = np.where(first == second, 0.0, first - second)
-    return bootstrap_interval(difference, level=level, resamples=resamples, seed=seed)
+    return bootstrap_interval(difference)
 
 
 def _checked(values: Sequence[float] | np.ndarray) -> np.ndarray:

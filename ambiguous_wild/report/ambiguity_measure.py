@@ -127,7 +127,6 @@ class SceneFeatures:
     mean: np.ndarray  # [C], subtracted if whitened
     whiten: np.ndarray  # [C, C]
     distractors: list[sem.Regions]  # of each photo, whitened if the features are
-    statics: list[sem.Regions]
     anchors: sem.Anchors
     usual: float  # cosine at which a match is as good as those within the static scene; NaN = unknown
     objects: bool  # compared with the objects of --objects, not with every static region
@@ -213,7 +212,7 @@ def measure(
     matches = sem.matches(moving, static)
     anchors, usual = sem.anchors(static, every), sem.usual_match(every)
     look = SceneFeatures(
-        features, backend, whitened, mean, whiten, moving, static, anchors, usual, objects is not None
+        features, backend, whitened, mean, whiten, moving, anchors, usual, objects is not None
     )
     measured = []
     for score, of_photo, in_photo in zip(scores, matches, evidence):

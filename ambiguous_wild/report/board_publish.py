@@ -6,7 +6,6 @@ The page's scripts read its data: runs, pictures, methods, reported numbers and 
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import shutil
@@ -22,7 +21,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.harness.measures import measure
-from ambiguous_wild.harness.result_file import RESULT
+from ambiguous_wild.harness.result_file import RESULT, encoded
 from ambiguous_wild.harness.trained_models import TrainedModel, find_models, open_scene
 from ambiguous_wild.io.files import (
     atomic_dir,
@@ -148,7 +147,7 @@ def facts(
         "models": dict(models),
         "images": [
             {k: v for k, v in row.items() if k not in ("sha256", "psnr")}
-            | {"psnr": _number(to_number(row["psnr"], "psnr"))}
+            | {"psnr": encoded(to_number(row["psnr"], "psnr"))}
             for row in index
         ],
         **reported.plain(),
@@ -162,8 +161,8 @@ def _run(e: Entry) -> Facts:
         quality = {k: v for k, v in quality.items() if k not in MASKS}
     alone = e.cost.get(ALONE)
     return {k: getattr(e, k) for k in COLUMNS} | {
-        "quality": _numbers(quality),
-        "cost": _numbers({k: v for k, v in e.cost.items() if k in COSTS}),
+        "quality": encoded(quality),
+        "cost": encoded({k: v for k, v in e.cost.items() if k in COSTS}),
         "alone": None if alone is None else bool(alone),  # None: the load was not recorded
     }
 
@@ -181,17 +180,6 @@ def _method(name: str) -> dict[str, str]:
         "summary": entry.summary, "paper": entry.paper, "paper_url": url,
         "code_url": CODE.get(entry.name, ""),
     }  # fmt: skip
-
-
-def _numbers(values: Mapping[str, float]) -> dict[str, float | str | None]:
-    return {k: _number(v) for k, v in values.items()}
-
-
-def _number(value: float) -> float | str | None:
-    """Return a value for JSON, which has neither NaN nor infinity."""
-    if math.isfinite(value):
-        return value
-    return None if math.isnan(value) else str(value)
 
 
 SOURCE = "reported"

@@ -14,9 +14,9 @@ from typing import Any
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
-from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
-from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.harness.trained_models import Opened, open_scene
+from ambiguous_wild.io.files import own_json
 from ambiguous_wild.report.board import HIDDEN, Entry
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
@@ -181,21 +181,13 @@ def preparation(scene: Scene | None) -> list[str]:
     Args:
         scene: scene of a run; None: it is not on this machine.
     """
-    truth = _read(scene.root / "truth" / "capture.json") if scene is not None else {}
+    truth = own_json(scene.root / "truth" / "capture.json") if scene is not None else {}
     settings = scene.info.get("settings") if scene is not None else None
     if scene is None or not truth or not isinstance(settings, dict):
         return []
     simulate = _simulate(truth, scene.name)
     raw = f"raw/{scene.name}"
     return [*simulate, shlex.join(_build(raw, scene.name, settings))] if simulate else []
-
-
-def _read(path: Path) -> Facts:
-    try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
 
 
 def _simulate(truth: Facts, name: str) -> list[str]:
@@ -252,7 +244,7 @@ class Scenes:
         """
         self._folder, self._dataset = folder, dataset
         self._datasets = {e.scene_hash: e.dataset for e in board}
-        self._opened: dict[tuple[Path, int | None], tuple[Scene, str]] = {}
+        self._opened = Opened()
 
     def find(self, run: Path, config: RunConfig) -> Scene | None:
         """Return the scene of a run; None if it is not on this machine.
@@ -260,22 +252,8 @@ class Scenes:
         Raises:
             AwError: the folder holds another scene, or a damaged one.
         """
-        asked = config["scene"]
-        path = self._path(asked)
-        if path is None:
-            return None
-        factor = asked.get("factor")
-        key = (path, factor if isinstance(factor, int) else None)
-        if key not in self._opened:
-            scene = load_scene(path, factor=key[1], verify=True)
-            self._opened[key] = scene, scene_identity(scene)
-        scene, identity = self._opened[key]
-        if identity != asked.get("sha256"):
-            raise AwError(
-                f"{run} is of another scene than {path}: the run's has hash {str(asked.get('sha256'))[:12]}, "
-                f"this one {identity[:12]}; name the right one with --scene, or run again on this one"
-            )
-        return scene
+        path = self._path(config["scene"])
+        return None if path is None else open_scene(run, path, opened=self._opened)
 
     def _path(self, asked: SceneConfig) -> Path | None:
         name = str(asked.get("name"))
@@ -300,7 +278,7 @@ class Scenes:
             name = scene.info.get("dataset")
             if isinstance(name, str) and name.strip():
                 return name
-            if isinstance(_read(scene.root / "truth" / "capture.json").get("preset"), str):
+            if isinstance(own_json(scene.root / "truth" / "capture.json").get("preset"), str):
                 return SIMULATED
         if scene_hash in self._datasets:
             return self._datasets[scene_hash]

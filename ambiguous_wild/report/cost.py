@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.result_file import encoded
 from ambiguous_wild.harness.timing import seconds_range
 from ambiguous_wild.io.files import is_record, refuse_files_there, write_json, write_text
 from ambiguous_wild.report import plain_formats
@@ -147,7 +147,7 @@ def plain_data(report: CostReport) -> Facts:
         "changes": [_change_row(c) for c in report.changes],
         "notes": list(report.notes),
     }
-    return dict(finite(data))
+    return dict(encoded(data))
 
 
 def _point_row(p: Point) -> Facts:
@@ -185,17 +185,6 @@ def _timeline_rows(curves: Iterable[Curve]) -> Iterable[Facts]:
 
 def _both(name: str, value: Summary) -> dict[str, float]:
     return {name: value.mean, f"{name}_std": value.spread}
-
-
-def finite(value: Any) -> Any:
-    """Return the value with None for NaN and a string for infinity, as in a result file."""
-    if isinstance(value, dict):
-        return {k: finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
-    return value
 
 
 MISSING = "—"

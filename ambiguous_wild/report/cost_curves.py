@@ -284,7 +284,7 @@ def psnr_at(run: CostRun, seconds: np.ndarray) -> np.ndarray:
     return np.interp(seconds, at, psnr, left=math.nan, right=math.nan)
 
 
-def timeline(curve: Curve, scenes: Sequence[str], count: int = 120) -> tuple[np.ndarray, np.ndarray]:
+def timeline(curve: Curve, scenes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean PSNR over training time, where every run of every scene has one.
 
     Returns:
@@ -297,7 +297,7 @@ def timeline(curve: Curve, scenes: Sequence[str], count: int = 120) -> tuple[np.
     end = min(run.points[-1][0] for run in runs)
     if end < begin:
         return np.empty(0), np.empty(0)
-    seconds = np.linspace(begin, end, count)
+    seconds = np.linspace(begin, end, 120)
     by_scene = [np.mean([psnr_at(run, seconds) for run in curve.on(scene)], axis=0) for scene in scenes]
     return seconds, np.mean(by_scene, axis=0)
 

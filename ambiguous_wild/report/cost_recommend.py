@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -229,12 +229,11 @@ def in_words(recommendation: Recommendation, scene: str) -> str:
     return "\n".join([*lines, *recommendation.notes]) + "\n"
 
 
-def speed_here(cost_runs: CostRuns, say: Callable[[str], None] = lambda text: None) -> float:
+def speed_here(cost_runs: CostRuns) -> float:
     """Return the reference seconds per second of this machine, by the calibration of the runs.
 
     Args:
         cost_runs: the runs; their kernel decides on which device this machine is measured.
-        say: gets a line if kernels have to be compiled first.
 
     Raises:
         AwError: the runs used a GPU, and this machine has none that can be used.
@@ -248,8 +247,8 @@ def speed_here(cost_runs: CostRuns, say: Callable[[str], None] = lambda text: No
     kernels = {run.timing.kernel for run in cost_runs.runs if not run.error}
     device = next((device for device, size in KERNELS.items() if size.name in kernels), "cpu")
     if device == "cpu":
-        prepare_cpu(None, say)
+        prepare_cpu(None)
         torch.set_num_threads(1)
     else:
-        choose("cuda", say)
+        choose("cuda", lambda text: None)
     return 1.0 / slowness(device)

@@ -7,7 +7,6 @@ effects or options, and the report measures these differences.
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, Options, RunResult, mean_of, read_result
 from ambiguous_wild.harness.store import ReadConfig, check_names, find_runs, read_config
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
+from ambiguous_wild.io.files import own_json
 from ambiguous_wild.metrics import stats
 
 # settings of training that are no part of `CostRun.rest`: compared on their own, or without any effect
@@ -222,10 +222,7 @@ def _length(train: ReadConfig, cost: Cost) -> Length:
 
 def _asked(folder: Path) -> str:
     """Return the word given to --effects (auto, all), with which effects differ between scenes; else ""."""
-    try:
-        asked = json.loads((folder / "effects.json").read_text(encoding="utf-8")).get("asked", "")
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return ""
+    asked = own_json(folder / "effects.json").get("asked", "")
     return asked if asked in ("auto", "all") else ""
 
 

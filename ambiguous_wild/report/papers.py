@@ -171,10 +171,6 @@ LEAST = 6  # images; five differences have the same sign by chance once in 16 ti
 
 def difference_interval(
     differences: Sequence[np.ndarray],  # of each scene: [n], one method minus another on the same images
-    *,
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> tuple[float, float]:
     """Return the percentile bootstrap interval of the mean over scenes of the mean over images.
 
@@ -182,14 +178,14 @@ def difference_interval(
     """
     if not differences or any(len(d) < 2 or not np.isfinite(d).all() for d in differences):
         return math.nan, math.nan
-    rng = np.random.default_rng(seed)
-    total = np.zeros(resamples)
+    rng = np.random.default_rng(0)
+    total = np.zeros(RESAMPLES)
     for values in differences:
-        total += values[rng.integers(0, len(values), size=(resamples, len(values)))].mean(axis=1)
-    means, tail = np.sort(total / len(differences)), (1.0 - level) / 2.0
+        total += values[rng.integers(0, len(values), size=(RESAMPLES, len(values)))].mean(axis=1)
+    means, tail = np.sort(total / len(differences)), (1.0 - LEVEL) / 2.0
     return (
-        float(means[math.floor(tail * (resamples - 1))]),
-        float(means[math.ceil((1.0 - tail) * (resamples - 1))]),
+        float(means[math.floor(tail * (RESAMPLES - 1))]),
+        float(means[math.ceil((1.0 - tail) * (RESAMPLES - 1))]),
     )
 
 

@@ -6,7 +6,7 @@ differs, a file was changed since, and the run is refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -14,7 +14,7 @@ from typing import Literal, cast
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.cell import code_hash, config_identity, refuse_other_scene, scene_identity
+from ambiguous_wild.harness.cell import code_hash, config_identity
 from ambiguous_wild.harness.evaluate import kernel_threads
 from ambiguous_wild.harness.measures import ImageRow, Metric, measure_images, metrics, records
 from ambiguous_wild.harness.result_file import (
@@ -25,9 +25,9 @@ from ambiguous_wild.harness.result_file import (
     write_result,
 )
 from ambiguous_wild.harness.store import find_runs, lacks, read_config
+from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.io.images import read_png_rgb
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.report.board_verify import check_photos, renders_of
 
 Outcome = Literal["rescored", "complete", "unfinished", "refused"]
@@ -44,18 +44,12 @@ class Rescored:
     error: str = ""
 
 
-def rescore(
-    folders: Sequence[Path],
-    *,
-    scene: Path | None = None,
-    tick: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Rescored]:
+def rescore(folders: Sequence[Path], *, scene: Path | None = None) -> list[Rescored]:
     """Add the metrics that can be measured now to every run below the folders.
 
     Args:
         folders: outputs of `aw bench`, or folders of them.
         scene: where the scene lies now; None = where each run says.
-        tick: called with (runs done, runs) after each run.
 
     Raises:
         AwError: no such folder, or no run in it.
@@ -63,40 +57,16 @@ def rescore(
     runs = find_runs(folders)
     if not runs:
         raise AwError(f"no run in {', '.join(map(str, folders))}: 'aw bench -o' makes one")
-    outcomes, scenes = [], _Scenes(scene)
-    for done, run in enumerate(runs, 1):
+    outcomes, opened = [], Opened()
+    for run in runs:
         try:
-            outcomes.append(_rescore(run, scenes))
+            outcomes.append(_rescore(run, scene, opened))
         except AwError as error:
             outcomes.append(Rescored(run, "refused", error=str(error)))
-        tick(done, len(runs))
     return outcomes
 
 
-class _Scenes:
-    """A cache of opened scenes."""
-
-    def __init__(self, given: Path | None) -> None:
-        self.given = given
-        self._open: dict[tuple[str, int | None], tuple[Scene, str]] = {}
-
-    def find(self, run: Path, result: RunResult, settings: object) -> Scene:
-        """Return the run's scene; raise AwError if it has changed since the run was measured."""
-        config = settings if isinstance(settings, dict) else {}
-        path, factor = str(self.given or config.get("path") or ""), config.get("factor")
-        if not path or not Path(path).is_dir():
-            why = f"the scene of the run is not at {path}" if path else "config.yaml names no scene"
-            raise AwError(f"{run}: {why}: name its folder with --scene")
-        key = path, factor if isinstance(factor, int) else None
-        if key not in self._open:
-            scene = load_scene(path, factor=key[1])
-            self._open[key] = scene, scene_identity(scene)
-        scene, identity = self._open[key]
-        refuse_other_scene(run, Path(path), identity, result["scene_hash"])
-        return scene
-
-
-def _rescore(run: Path, scenes: _Scenes) -> Rescored:
+def _rescore(run: Path, folder: Path | None, opened: Opened) -> Rescored:
     with folder_lock(run, "aw rescore"):
         if not (run / RESULT).is_file():
             return Rescored(run, "unfinished", error=f"no {RESULT}: failed, running or stopped")
@@ -110,7 +80,7 @@ def _rescore(run: Path, scenes: _Scenes) -> Rescored:
         if not result["per_image"]:
             return Rescored(run, "complete", missing=tuple(sorted(result["missing"])))
         half = config.get("protocol", "full") == "half"
-        scene = scenes.find(run, result, config.get("scene"))
+        scene = open_scene(run, folder, opened=opened)
         renders = renders_of(run, result)
         if lacking := shortlist(path.name for path in renders.values() if not path.is_file()):
             raise AwError(f"{run} lacks its renders {lacking}: restore them, or run it again")

@@ -32,7 +32,6 @@ def prepare_suite(
     root: Path,
     output: Path,
     *,
-    jobs: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> PreparedSuite:
     """Find and import the suite's scenes.
@@ -41,7 +40,6 @@ def prepare_suite(
         suite: a suite of `datasets.suites`.
         root: folder with one folder for each scene, in any layout of `aw import`, or scene folders.
         output: folder of the runs; imported scenes are put below it.
-        jobs: number of threads.
         say: gets a line about each step.
 
     Raises:
@@ -54,13 +52,11 @@ def prepare_suite(
     ready = {}
     for scene, folder in folders.items():
         name = scene_id(scene)
-        ready[name] = _ready(suite, name, folder, output / SCENES / name, jobs, say)
+        ready[name] = _ready(suite, name, folder, output / SCENES / name, say)
     return PreparedSuite(suite, ready, tuple(absent))
 
 
-def _ready(
-    suite: Suite, name: str, folder: Path, target: Path, jobs: int | None, say: Callable[[str], None]
-) -> Path:
+def _ready(suite: Suite, name: str, folder: Path, target: Path, say: Callable[[str], None]) -> Path:
     from ambiguous_wild.datasets.write import ImportSettings, import_scene
     from ambiguous_wild.io.scene_folder import read_scene_json
 
@@ -81,7 +77,7 @@ def _ready(
     settings = ImportSettings(
         factor=suite.factor or None, name=name, dataset=suite.dataset, license=suite.license
     )
-    done = import_scene(folder, target, settings, jobs=jobs)
+    done = import_scene(folder, target, settings)
     if not done.up_to_date:
         say(f"imported {folder} ({done.info['imported']['layout']}, {done.why}) into {target}")
         for warning in done.info["warnings"]:
@@ -89,23 +85,21 @@ def _ready(
     return target
 
 
-def suite_methods(suite: Suite, reported_from: Path | None = None) -> list[str]:
+def suite_methods(suite: Suite) -> list[str]:
     """Return our methods that papers report on the suite's dataset; without any, 3DGS and RefineSplat."""
     from ambiguous_wild.methods.registry import all_methods
     from ambiguous_wild.report.papers import read_reported
 
-    numbers = read_reported(reported_from)
-    reported = {plain(n.method) for n in numbers if n.dataset == suite.dataset and not n.setting}
+    reported = {plain(n.method) for n in read_reported() if n.dataset == suite.dataset and not n.setting}
     return [name for name in all_methods() if plain(name) in reported] or ["3dgs", "refinesplat"]
 
 
-def suite_tables(prepared: PreparedSuite, runs: Path, reported_from: Path | None = None) -> list[Table]:
+def suite_tables(prepared: PreparedSuite, runs: Path) -> list[Table]:
     """Return the suite's tables with the scenes as printed: our runs, then the reported rows, never mixed.
 
     Args:
         prepared: from `prepare_suite`.
         runs: folder of the runs.
-        reported_from: folder of reported tables; None = those of this package.
 
     Raises:
         AwError: no finished run.
@@ -115,7 +109,7 @@ def suite_tables(prepared: PreparedSuite, runs: Path, reported_from: Path | None
 
     suite, measured = prepared.suite, read_runs(runs)
     present = set(measured.runs["scene"]) if len(measured.runs) else set()
-    numbers = read_reported(reported_from)
+    numbers = read_reported()
     tables = []
     for title, scenes in suite.tables.items():
         names = [scene_id(s) for s in scenes if scene_id(s) in present]

@@ -6,7 +6,6 @@ Only `torch_facts` imports torch, so that `aw doctor` can call it in another pro
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import os
 import shutil
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict
 
-from ambiguous_wild.core.errors import AwError, install_command, torch_command
+from ambiguous_wild.core.errors import AwError, install_command, installed, torch_command
 from ambiguous_wild.io.files import patient_lock
 
 GSPLAT = "1.5.3"  # the release that gsplat_seam.py is written for
@@ -100,18 +99,11 @@ def look(torch: TorchFacts | None = None) -> GpuFacts:
     return GpuFacts(
         torch=torch_facts() if torch is None else torch,
         driver=first_line("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"),
-        gsplat=_version("gsplat"),
+        gsplat=installed("gsplat"),
         prebuilt=package is not None and any(package.glob("csrc*.so")),
         compiler=shutil.which(os.environ.get("CXX", "c++")),
         hidden=os.environ.get("CUDA_VISIBLE_DEVICES"),
     )
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def why_not(facts: GpuFacts) -> Lack | None:

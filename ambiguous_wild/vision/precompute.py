@@ -22,7 +22,6 @@ from torch import Tensor
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.io.files import atomic_path, sha256_array
 from ambiguous_wild.vision.protocols import (
-    Bar,
     Features,
     Instances,
     NamedInstances,
@@ -113,9 +112,7 @@ class PreciseFeatures(Protocol):
         ...
 
 
-def photo_features(
-    features: Features, photos: Sequence[Tensor], folder: Path, bar: Bar | None = None
-) -> list[Tensor]:
+def photo_features(features: Features, photos: Sequence[Tensor], folder: Path) -> list[Tensor]:
     """Features [h, w, C] of every photo [H, W, 3]; call `features.fit` first.
 
     Cached photos are not computed again. The precision is part of the key: features of a photo and of its
@@ -123,7 +120,7 @@ def photo_features(
     """
     state = {k: _digest(v) if isinstance(v, Tensor) else v for k, v in features.state_dict().items()}
     result = []
-    for photo in (bar or terminal_bar("features"))(photos):
+    for photo in terminal_bar("features")(photos):
         precision = features.precision(photo.device) if isinstance(features, PreciseFeatures) else ""
         name = f"{features.name}-{precision}" if precision else features.name
         key = cache_key("features", name, state, photo.detach().cpu().numpy())
@@ -148,7 +145,6 @@ def instance_labels(
     photos: Sequence[Tensor],
     names: Sequence[str],
     folder: Path,
-    bar: Bar | None = None,
 ) -> SceneLabels:
     """Label maps of every photo, with the scene's identities if the back end provides them.
 
@@ -157,9 +153,8 @@ def instance_labels(
         photos: [H, W, 3] in [0, 1].
         names: names of the photos.
         folder: the cache; photos and chunks in it are not computed again.
-        bar: progress bar; by default one on a terminal.
     """
-    shown = bar or terminal_bar(f"instances ({instances.name.partition('-')[0]})")
+    shown = terminal_bar(f"instances ({instances.name.partition('-')[0]})")
     if isinstance(instances, SceneInstances):
         return SceneLabels(instances.identities(photos, names, folder, shown), True)
     if isinstance(instances, NamedInstances):

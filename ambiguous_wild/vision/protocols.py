@@ -23,18 +23,16 @@ def no_bar(items: Sequence[Any]) -> Iterable[Any]:
     return items
 
 
-def terminal_bar(what: str, unit: str = "photo") -> Bar:
-    """Return a function that wraps a list, so that a terminal shows a bar during iteration.
+def terminal_bar(what: str) -> Bar:
+    """Return a function that wraps a list of photos, so that a terminal shows a bar during iteration.
 
-    Args:
-        what: name of the stage, e.g. ``"instance masks"``.
-        unit: name of one item.
+    `what` is the name of the stage, e.g. ``"instance masks"``.
     """
 
     def wrap(items: Sequence[Any]) -> Iterable[Any]:
         from tqdm import tqdm
 
-        return tqdm(items, desc=what, unit=unit, disable=None, leave=False)  # None: only on a terminal
+        return tqdm(items, desc=what, unit="photo", disable=None, leave=False)  # None: only on a terminal
 
     return wrap
 

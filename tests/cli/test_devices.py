@@ -5,10 +5,10 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli import checks, main
+from ambiguous_wild.cli import doctor, main
 from ambiguous_wild.cli import options as devices
 from ambiguous_wild.cli.bench import command as bench
-from ambiguous_wild.cli.checks import Probe
+from ambiguous_wild.cli.doctor import Probe
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat import readiness
 from tests.splat.test_readiness import CASES, TORCH, found
@@ -76,7 +76,7 @@ def test_a_grid_falls_back_and_runs(here, tmp_path, monkeypatch):
 def test_doctor_says_it_in_the_same_words(here, case):
     machine, what, fix = CASES[case]
     here(machine)
-    said = {c.name: c for c in checks._gpu(Probe(dict(machine.torch)))}
+    said = {c.name: c for c in doctor._gpu(Probe(dict(machine.torch)))}
     (wrong,) = [c for c in said.values() if c.name != "nvidia driver" and not c.ok]
     assert what in wrong.detail and fix in wrong.fix
     with pytest.raises(AwError) as error:
@@ -88,7 +88,7 @@ def test_doctor_says_it_in_the_same_words(here, case):
 def test_doctor_says_where_the_kernels_are(here):
     for words, machine in {"compiled by the first run": {}, "in the wheel": {"prebuilt": True}}.items():
         here(found(**machine))
-        (kernels,) = [c for c in checks._gpu(Probe(TORCH)) if c.name == "gsplat kernels"]
+        (kernels,) = [c for c in doctor._gpu(Probe(TORCH)) if c.name == "gsplat kernels"]
         assert kernels.ok and kernels.detail.startswith(words) and kernels.fix == ""
-    (broken,) = checks._gpu(Probe(None, "no torch"))
+    (broken,) = doctor._gpu(Probe(None, "no torch"))
     assert (broken.name, broken.ok, broken.detail) == ("torch cuda", False, "no torch")

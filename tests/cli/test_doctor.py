@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli import checks
-from ambiguous_wild.cli.checks import PROBES, Check, Probe, all_checks, other_versions, probe, unmet
-from ambiguous_wild.cli.doctor import command
+from ambiguous_wild.cli import doctor
+from ambiguous_wild.cli.doctor import PROBES, Check, Probe, all_checks, command, other_versions, probe, unmet
 from ambiguous_wild.core import AwError
 
 
@@ -36,7 +35,7 @@ def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
         assert bool(c.fix) is not c.ok, c
         if c.fix:
             assert subprocess.run(["bash", "-n", "-c", c.fix]).returncode == 0, c.fix
-            assert c.fix.startswith((*checks.COMMANDS, "export ", "unset ", "df ")), c.fix
+            assert c.fix.startswith((*doctor.COMMANDS, "export ", "unset ", "df ")), c.fix
 
 
 @pytest.mark.parametrize(
@@ -53,16 +52,16 @@ def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
     ],
 )
 def test_words_that_are_no_command_are_a_comment(words: str, line: str) -> None:
-    assert checks.pastable(words) == line
+    assert doctor.pastable(words) == line
 
 
 @pytest.mark.parametrize("tool", ["apt-get", "brew", ""])
 def test_a_system_package_comes_with_the_command_of_the_machine(
     tool: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checks.shutil, "which", lambda name: f"/bin/{name}" if name == tool else None)
-    monkeypatch.setattr(checks.readiness, "first_line", lambda *words: None)
-    fix = checks._git().fix
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/bin/{name}" if name == tool else None)
+    monkeypatch.setattr(doctor.readiness, "first_line", lambda *words: None)
+    fix = doctor._git().fix
     assert fix.startswith("# install git from https://") if not tool else f"{tool} install" in fix
 
 
@@ -70,10 +69,10 @@ def test_what_one_command_needs_comes_with_its_extra(
     monkeypatch: pytest.MonkeyPatch, report: list[Check]
 ) -> None:
     assert {"ray", "choix", "nltk", "nerfbaselines"} <= {c.name for c in report if c.group == "optional"}
-    monkeypatch.setattr(checks, "installed", lambda name: None)
+    monkeypatch.setattr(doctor, "installed", lambda name: None)
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("AW_NERFBASELINES", raising=False)
-    fixes = {c.name: c.fix for c in checks._extras()}
+    fixes = {c.name: c.fix for c in doctor._extras()}
     assert "[ray]" in fixes["ray"]
     assert "[study]" in fixes["choix"] and "[study]" in fixes["nltk"]
     assert fixes["nerfbaselines"].startswith("python3 -m venv")
@@ -93,16 +92,16 @@ def test_lpips_comes_with_the_command_for_the_files_it_lacks(
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("AW_WEIGHTS", str(tmp_path / "my weights"))
-    assert checks._metrics()[0].fix == "aw weights get alexnet lpips-alex"
+    assert doctor._metrics()[0].fix == "aw weights get alexnet lpips-alex"
     (tmp_path / "my weights").mkdir()
     (tmp_path / "my weights" / "alexnet.safetensors").touch()
-    assert checks._metrics()[0].fix == "aw weights get lpips-alex"
+    assert doctor._metrics()[0].fix == "aw weights get lpips-alex"
     (tmp_path / "my weights" / "lpips_alex.pth").touch()
-    assert checks._metrics()[0].ok
+    assert doctor._metrics()[0].ok
 
 
 def test_the_report_prints_every_check(monkeypatch: pytest.MonkeyPatch, report: list[Check]) -> None:
-    monkeypatch.setattr(checks, "all_checks", lambda: report)
+    monkeypatch.setattr(doctor, "all_checks", lambda: report)
     out = CliRunner().invoke(command, [], catch_exceptions=False).output
     for c in report:
         assert f"{'✓' if c.ok else '✗'} {c.name}" in out and c.detail in out and c.fix in out
@@ -119,7 +118,7 @@ def test_a_broken_core_is_an_error_with_what_to_run(
         Check("core", "numba", False, "no threads", "pip install numba"),
         Check("optional", "git", True, "2"),
     ]
-    monkeypatch.setattr(checks, "all_checks", lambda: found)
+    monkeypatch.setattr(doctor, "all_checks", lambda: found)
     done = CliRunner().invoke(command, words)
     assert isinstance(done.exception, AwError) and done.exception.exit_code == 2
     assert "numba" in str(done.exception) and "pip install numba" in str(done.exception)
@@ -160,8 +159,8 @@ def test_a_probe_that_fails_says_how(code: str, words: str, monkeypatch: pytest.
 
 
 def test_a_broken_torchvision_is_named_and_an_absent_one_is_fine() -> None:
-    assert checks._torchvision(None).ok
-    broken = checks._torchvision(Probe(None, "operator torchvision::nms does not exist"))
+    assert doctor._torchvision(None).ok
+    broken = doctor._torchvision(Probe(None, "operator torchvision::nms does not exist"))
     assert (
         not broken.ok
         and broken.group == "optional"
@@ -172,11 +171,11 @@ def test_a_broken_torchvision_is_named_and_an_absent_one_is_fine() -> None:
 def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     probe_ok = Probe({"threads": 2, "layer": "omp"})
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "new" / "cache"))
-    fresh = checks._numba(probe_ok)[1]
+    fresh = doctor._numba(probe_ok)[1]
     assert fresh.ok and "not compiled yet" in fresh.detail
     (tmp_path / "new" / "cache" / "sub").mkdir(parents=True)
     (tmp_path / "new" / "cache" / "sub" / "a.nbi").touch()
-    assert "1 kernels compiled" in checks._numba(probe_ok)[1].detail
-    monkeypatch.setattr(checks.os, "access", lambda path, mode: False)
-    refused = checks._numba(probe_ok)[1]
+    assert "1 kernels compiled" in doctor._numba(probe_ok)[1].detail
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    refused = doctor._numba(probe_ok)[1]
     assert not refused.ok and "NUMBA_CACHE_DIR" in refused.fix

@@ -91,7 +91,14 @@ def test_other_words_stay_as_they_are(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hall").mkdir()
-    for words in (["bench", "--jobs", "2"], ["view", "r", "--scene", "hall"], ["plan", "--", "--out"], []):
+    many = ["bench", "--method", ",".join(["refinesplat"] * 30)]  # longer than a file's name may be
+    for words in (
+        ["bench", "--jobs", "2"],
+        ["view", "r", "--scene", "hall"],
+        ["plan", "--", "--out"],
+        many,
+        [],
+    ):
         assert with_new_names(words) == words
     assert capsys.readouterr().err == ""
     assert with_new_names(["plan", "s", "--out=p"]) == ["plan", "s", "--output=p"]

@@ -71,7 +71,7 @@ def test_equal_settings_share_one_run_and_what_is_not_there_is_a_row(scene):
     assert rows["other", "small-too"].same_as == "size-small"
     assert "unknown option 'not_there'" in rows["other", "to-come"].missing
     assert "unknown method 'no-such-method'" in rows["other", "peer"].missing
-    assert [row.variant.name for row in plan.rows if row.is_default] == ["default", "default"]
+    assert [row.variant.name for row in plan.rows if row.variant.name == "default"] == ["default", "default"]
 
 
 def test_a_run_keeps_its_folder_whatever_groups_are_chosen(scene):
@@ -223,7 +223,7 @@ def test_a_graft_of_the_method_is_a_row_with_settings(scene, tmp_path):
     )
     register(replace(get_method("mine"), ablations=(Group("plug-in", "in others", rows),)))
     plan = plan_study("mine", [scene], [0], SHORT, settings=["grow_scale=0.5"])
-    names = {row.variant.name: row.cells[0] for row in plan.rows if not row.is_default}
+    names = {row.variant.name: row.cells[0] for row in plan.rows if row.variant.name != "default"}
     assert names["plain"].method.name == "3dgs"
     for name, grow in (("with", 0.1), ("without", 0.0002)):
         cell = names[name]

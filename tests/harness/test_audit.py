@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli.audit import command
+from ambiguous_wild.cli.table import audit_command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.report.audit import audit
 from ambiguous_wild.report.audit_numbers import Finding, read_tables
@@ -205,13 +205,13 @@ def test_the_transcription_is_what_was_printed() -> None:
 
 
 def run(*words: object) -> str:
-    done = CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False)
+    done = CliRunner().invoke(audit_command, [str(w) for w in words], catch_exceptions=False)
     assert done.exit_code == 0
     return done.stdout
 
 
 def error(*words: object) -> str:
-    raised = CliRunner().invoke(command, [str(w) for w in words]).exception
+    raised = CliRunner().invoke(audit_command, [str(w) for w in words]).exception
     assert isinstance(raised, AwError), raised
     return str(raised)
 
@@ -230,8 +230,8 @@ def test_the_command_writes_every_format_and_tells_by_its_exit_code(tmp_path: Pa
     assert "<b>" not in run(bad, "--format", "markdown")
     run(bad, "-o", tmp_path / "out.txt")
     assert "mean: " in (tmp_path / "out.txt").read_text()
-    assert CliRunner().invoke(command, [str(bad), "--strict"]).exit_code == 1
-    assert CliRunner().invoke(command, [str(good), "--strict"]).exit_code == 0
+    assert CliRunner().invoke(audit_command, [str(bad), "--strict"]).exit_code == 1
+    assert CliRunner().invoke(audit_command, [str(good), "--strict"]).exit_code == 0
     assert run(good) == "" and "memory" in run()  # without files: those of the checkout
 
 

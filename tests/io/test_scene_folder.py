@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.images import write_png
-from ambiguous_wild.io.scene_folder import load_scene, verify_files, without_keep
+from ambiguous_wild.io.scene_folder import load_scene, verify_files
 from tests.io.model_maker import HEIGHT, WIDTH, make_model, write_scene
 from tests.tiny_scene import write_tiny_scene
 
@@ -90,7 +90,6 @@ def test_keep_masks_reach_training_views_only(tmp_path):
         write_png(tmp_path / "masks" / "train" / name, np.zeros((HEIGHT, WIDTH), np.uint8))
     scene = load_scene(tmp_path)
     assert {v.name for v in scene.views if v.keep_path} == {"p1.png"}
-    assert not any(v.keep_path for v in without_keep(scene).views)
 
 
 def test_default_factor_comes_from_scene_json(tmp_path):

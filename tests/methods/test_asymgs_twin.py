@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from ambiguous_wild.methods.asymgs_twin import TWIN, HardMask, Twin, TwinConfig
+from ambiguous_wild.methods.asymgs import TWIN, HardMask, Twin, TwinConfig
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.fields import STATIC
 from ambiguous_wild.splat.losses import photometric

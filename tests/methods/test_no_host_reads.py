@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ambiguous_wild.methods import dronesplat, masking_common, robustsplat
-from ambiguous_wild.methods.mask_net import MaskNet, adam_of, adam_state, enlarged, load_adam_state
+from ambiguous_wild.methods.masking_common import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.methods.robustsplat import RobustSplatConfig
 from ambiguous_wild.splat import backend, checkpoint
 from ambiguous_wild.splat.step import Step

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from ambiguous_wild.methods.refinesplat import merging, pixels, ranks, structure
+from ambiguous_wild.methods.refinesplat import maps, merging, pixels, structure
 from ambiguous_wild.methods.refinesplat.density import (
     EntropyAwareDensity,
     EntropyDensityConfig,
@@ -85,15 +85,15 @@ def test_medians_and_quantiles_are_numpys(count, both):
     x = noise(count, 8).astype(np.float64)
     x[count:] = np.nan
     expected = np.median(x[:count]) if count else np.nan
-    assert np.allclose(ranks.median(tensor(x)), expected, equal_nan=True, rtol=1e-15)
+    assert np.allclose(maps.median(tensor(x)), expected, equal_nan=True, rtol=1e-15)
     there = np.zeros((6, 9), bool)
     there.ravel()[np.random.default_rng(count).permutation(54)[:count]] = True
     image = noise(9, 6, 9)
-    found, number = ranks.low_quantile(tensor(image), tensor(~there), 0.25)
+    found, number = maps.low_quantile(tensor(image), tensor(~there), 0.25)
     assert int(number) == count
     assert float(found) == pytest.approx(float(np.quantile(image[there], 0.25)) if count else 0.0, rel=1e-6)
     if count:
-        middle, spread = ranks.spread_of(tensor(x))
+        middle, spread = maps.spread_of(tensor(x))
         mad = 1.4826 * np.median(np.abs(x[:count] - expected))
         assert float(middle) == pytest.approx(expected)
         assert float(spread) == pytest.approx(max(mad, 0.05 * expected), rel=1e-12)

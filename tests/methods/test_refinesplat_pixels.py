@@ -9,6 +9,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps
+from ambiguous_wild.methods.refinesplat.maps import Ranks, agree, agreement_weight, common_offset
 from ambiguous_wild.methods.refinesplat.masks import Labels, Masks, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import (
     MultiViewConfig,
@@ -18,7 +19,6 @@ from ambiguous_wild.methods.refinesplat.multiview import (
     nearest_views,
 )
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
-from ambiguous_wild.methods.refinesplat.ranks import Ranks, agree, agreement_weight, common_offset
 from ambiguous_wild.methods.refinesplat.structure import correlation, structure_residual, unrelated_residual
 from tests.methods.on_device import noise, number, tensor
 

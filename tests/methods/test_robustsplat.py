@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods import masking_common
-from ambiguous_wild.methods.mask_net import MaskNet
+from ambiguous_wild.methods.masking_common import MaskNet
 from ambiguous_wild.methods.refinesplat.inputs import train_tracks
 from ambiguous_wild.methods.robustsplat import RobustSplatConfig, RobustSplatMask, _fit, build, coarse_spec
 from ambiguous_wild.vision import backends

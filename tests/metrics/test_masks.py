@@ -49,15 +49,6 @@ def test_pooling_weighs_pixels_and_survives_a_photo_without_distractors() -> Non
     assert pooled([]) == Confusion()
 
 
-def test_unknown_truth_does_not_count() -> None:
-    keep, truth = np.ones((2, 3), bool), np.ones((2, 3), bool)
-    keep[0, 0] = False
-    known = np.ones((2, 3), bool)
-    known[0, 0] = False
-    assert confusion(keep, truth).false_positive == 1
-    assert confusion(keep, truth, known=known) == Confusion(true_negative=5)
-
-
 def test_kinds_of_maps_agree() -> None:
     keep = np.array([[True, False, True]])
     truth = np.array([[True, True, False]])

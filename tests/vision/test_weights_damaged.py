@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ambiguous_wild.cli import checks
+from ambiguous_wild.cli import doctor
 from ambiguous_wild.cli.weights import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import folder_lock
@@ -210,7 +210,7 @@ def test_a_file_in_place_of_the_weights_folder_is_named(
         done = CliRunner().invoke(command, line)
         text = f"{done.output} {done.exception or ''}"
         assert re.search(words, text) and "run: aw weights get" not in text, line
-    for check in (*checks._vision()[1:], *checks._metrics()):
+    for check in (*doctor._vision()[1:], *doctor._metrics()):
         assert re.search(words, check.fix) and check.fix.startswith("# "), check
     assert all(re.search(words, str(reason)) for reason in lpips.available().values())
 

@@ -177,10 +177,10 @@ def read_robustnerf(root: Path, chosen: str = "") -> ForeignScene:
     )
 
 
-def _published_factor(root: Path, model: Model, factor: int = 8) -> int:
-    """Return the factor of the papers, or 1 for photos that were downsampled before COLMAP ran."""
+def _published_factor(root: Path, model: Model) -> int:
+    """Return 8, the factor of the papers, or 1 for photos that were downsampled before COLMAP ran."""
     longest = max(max(c.width, c.height) for c in model.cameras.values())
-    return factor if longest / factor >= 200 or factor in shipped_factors(root) else 1
+    return 8 if longest / 8 >= 200 or 8 in shipped_factors(root) else 1
 
 
 def first_dot(name: str) -> str:

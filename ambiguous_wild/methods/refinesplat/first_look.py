@@ -28,8 +28,8 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.refinesplat.maps import Ranks, common_offset
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
-from ambiguous_wild.methods.refinesplat.ranks import Ranks, common_offset
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
 
 _SETTLED = 0.005  # a round in which a smaller share of pixels changes is the last

@@ -184,13 +184,15 @@ def train_tracks(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return point[used], photo[used], points.track_xy[used]
 
 
+SHORTEST = 3  # views of a track at least
+FEWEST = 100  # observations that a photo needs to be judged
+
+
 def static_instances(
     labels: list[np.ndarray],
     counts: list[int],
     tracks: tuple[np.ndarray, np.ndarray, np.ndarray],
     share: float,
-    shortest: int = 3,
-    fewest: int = 100,
 ) -> list[np.ndarray]:
     """Return for each photo the instances [K] bool with too many triangulated tracks to have moved.
 
@@ -203,17 +205,15 @@ def static_instances(
         counts: K of each photo.
         tracks: from `train_tracks`.
         share: share of the photo's mean density from which an instance is static; 0 = none is.
-        shortest: least number of views of a track.
-        fewest: observations that a photo needs to be judged.
     """
     point, photo, xy = tracks
-    long = np.bincount(point)[point] >= shortest if len(point) else np.zeros(0, bool)
+    long = np.bincount(point)[point] >= SHORTEST if len(point) else np.zeros(0, bool)
     result = []
     for index, (label, count) in enumerate(zip(labels, counts)):
         at = np.floor(xy[(photo == index) & long]).astype(np.int64)
         inside = (at >= 0).all(1) & (at[:, 0] < label.shape[1]) & (at[:, 1] < label.shape[0])
         at = at[inside]
-        if share <= 0 or len(at) < fewest:
+        if share <= 0 or len(at) < FEWEST:
             result.append(np.zeros(count, dtype=bool))
             continue
         hit = np.clip(label[at[:, 1], at[:, 0]], 0, None)

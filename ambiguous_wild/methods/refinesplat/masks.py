@@ -21,9 +21,8 @@ from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_by
 from ambiguous_wild.methods.refinesplat.first_look import FirstLook
-from ambiguous_wild.methods.refinesplat.maps import sized
+from ambiguous_wild.methods.refinesplat.maps import sized, spread_of
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, grown, hysteresis
-from ambiguous_wild.methods.refinesplat.ranks import spread_of
 from ambiguous_wild.methods.refinesplat.threshold import Cut, Pool, learnt, pool_of, t_ent
 from ambiguous_wild.splat.backend import backend_of
 

@@ -33,8 +33,15 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.refinesplat.maps import MapStack, Selected, sized
-from ambiguous_wild.methods.refinesplat.ranks import Ranks, agree, agreement_weight, common_offset
+from ambiguous_wild.methods.refinesplat.maps import (
+    MapStack,
+    Ranks,
+    Selected,
+    agree,
+    agreement_weight,
+    common_offset,
+    sized,
+)
 from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, nearest, resized
 from ambiguous_wild.splat.backend import backend_of
 

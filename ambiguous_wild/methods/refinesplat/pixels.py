@@ -24,9 +24,8 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
-from ambiguous_wild.methods.refinesplat.maps import sized
+from ambiguous_wild.methods.refinesplat.maps import low_quantile, median, sized
 from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
-from ambiguous_wild.methods.refinesplat.ranks import low_quantile, median
 from ambiguous_wild.methods.refinesplat.structure import resized, structure_residual, unrelated_residual
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.vision.sparse_surface import seldom_seen

@@ -34,7 +34,7 @@ from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.moving import moving_labels, moving_map
-from ambiguous_wild.vision.protocols import Features, Instances
+from ambiguous_wild.vision.protocols import Instances
 from ambiguous_wild.vision.segments import GraphSegments
 from ambiguous_wild.vision.sparse_surface import static_surfaces
 
@@ -117,11 +117,10 @@ class RefineSplatMask(PausingMask):
     def __init__(
         self,
         config: RefineSplatConfig,
-        features: Features | None = None,
         instances: Instances | None = None,
     ) -> None:
         self.config = config
-        self.features = features or make_features(config.features)
+        self.features = make_features(config.features)
         self.instances = instances or _instances(config)
         self.visits: dict[int, int] = {}  # view -> number of steps since masks began
         self.points: dict[str, MotionPoints] = {}  # photo's name -> its moving and static features

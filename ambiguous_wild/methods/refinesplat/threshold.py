@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.methods.refinesplat.ranks import spread_of
+from ambiguous_wild.methods.refinesplat.maps import spread_of
 
 Variant = Literal["sigmoid", "softmax"]
 Statistic = Literal["structure", "entropy", "surprise", "contrast", "evidence"]

@@ -7,7 +7,7 @@ the pulls by autograd are here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -280,11 +280,10 @@ def mlp(
     x: Tensor,  # [M, inputs]
     leaf: Mapping[str, Tensor],
     name: str,
-    activation: Callable[[Tensor], Tensor] = torch.relu,
 ) -> Tensor:
-    """Apply the net of `mlp_leaves`, [M, outputs]; the last layer has no activation."""
+    """Apply the net of `mlp_leaves` with ReLU, [M, outputs]; the last layer has no activation."""
     layers = sum(key.startswith(f"{name}_weight") for key in leaf)
     for i in range(layers):
         x = torch.addmm(leaf[f"{name}_bias{i}"], x, leaf[f"{name}_weight{i}"])
-        x = activation(x) if i + 1 < layers else x
+        x = torch.relu(x) if i + 1 < layers else x
     return x

@@ -6,6 +6,7 @@ Iterations, times, views and sizes are cut down; the rest of a line is run as it
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -42,6 +43,9 @@ CANNOT = {
     r"^stress --replay RUN": "a run that met a NaN",
     r"^view --live ": "a server that does not end; refused without viser",
 }
+
+NEED_TRACKS = ("fidelity", "refinesplat")  # pages whose lines ask the tracks of a scene, or what moves in it
+BUILT = "built-scene"
 
 
 def blocks_of(text: str) -> list[list[str]]:
@@ -118,11 +122,14 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, built: Path) -> Path:
         film.write(cv2.imread(str(path)))
     film.release()
     clean = write_tiny_scene(tmp_path_factory.mktemp("clean") / "scene", distractors=False)
-    for name in ("scene", "a", "b", "my-scene", "SCENE"):
+    shutil.copytree(clean, root / "SCENE")
+    for name in ("scene", "a", "b", "my-scene"):
         write_tiny_scene(root / name)
         shutil.copytree(clean / "images", root / name / "truth/clean")
-    for name in ("scene1", "scene2"):
+    for name in ("scene1", "scene2", BUILT):
         shutil.copytree(built / "scene", root / name)
+        facts = root / name / "scene.json"
+        facts.write_text(json.dumps(json.loads(facts.read_text("utf-8")) | {"name": name}), "utf-8")
     shutil.copytree(built / "raw", root / "raw")
     (root / "DIR").mkdir()
     cutout = np.zeros((40, 30, 4), np.uint8)
@@ -184,6 +191,9 @@ def test_the_commands_in_blocks_run(page: Path, inputs: Path, tmp_path: Path, mo
                 shutil.copytree(source, folder / source.name)
             else:
                 shutil.copy(source, folder)
+        if page.stem in NEED_TRACKS:
+            shutil.rmtree(folder / "scene")
+            shutil.move(folder / BUILT, folder / "scene")
         for described in re.findall(r"```yaml\n(name: .*?)```", text, re.S):
             (folder / f"{yaml.safe_load(described)['name']}.yaml").write_text(described)
         for line in block:

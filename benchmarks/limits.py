@@ -233,12 +233,14 @@ def draw(grown: dict[str, Any], path: Path) -> None:
     """Plot the growth, both axes logarithmic."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     figure = Figure(figsize=(7, 3), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     for axes, (name, row) in zip(figure.subplots(1, 2, sharey=True), grown.items()):
         axes.loglog(row["x"], row["ms"], "o-")
         axes.set(xlabel=name, ylabel="ms an iteration", title=f"time ~ {name}^{row['exponent']:.2f}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})

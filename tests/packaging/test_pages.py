@@ -44,7 +44,8 @@ CANNOT = {
     r"^view --live ": "a server that does not end; refused without viser",
 }
 
-NEED_TRACKS = ("fidelity", "refinesplat")  # pages whose lines ask the tracks of a scene, or what moves in it
+# pages whose lines ask for the tracks of this scene, or what moves in it
+NEED_TRACKS = {"fidelity": "scene", "refinesplat": "scene", "simulation": "SCENE"}
 BUILT = "built-scene"
 
 
@@ -122,14 +123,15 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, built: Path) -> Path:
         film.write(cv2.imread(str(path)))
     film.release()
     clean = write_tiny_scene(tmp_path_factory.mktemp("clean") / "scene", distractors=False)
-    shutil.copytree(clean, root / "SCENE")
-    for name in ("scene", "a", "b", "my-scene"):
+    for name in ("scene", "a", "b", "my-scene", "SCENE"):
         write_tiny_scene(root / name)
         shutil.copytree(clean / "images", root / name / "truth/clean")
     for name in ("scene1", "scene2", BUILT):
         shutil.copytree(built / "scene", root / name)
         facts = root / name / "scene.json"
         facts.write_text(json.dumps(json.loads(facts.read_text("utf-8")) | {"name": name}), "utf-8")
+    shutil.rmtree(root / BUILT / "truth")  # as of a capture without distractors
+    (root / BUILT / "scene.json").unlink()  # which names the files of truth/
     shutil.copytree(built / "raw", root / "raw")
     (root / "DIR").mkdir()
     cutout = np.zeros((40, 30, 4), np.uint8)
@@ -192,8 +194,8 @@ def test_the_commands_in_blocks_run(page: Path, inputs: Path, tmp_path: Path, mo
             else:
                 shutil.copy(source, folder)
         if page.stem in NEED_TRACKS:
-            shutil.rmtree(folder / "scene")
-            shutil.move(folder / BUILT, folder / "scene")
+            shutil.rmtree(folder / NEED_TRACKS[page.stem])
+            shutil.move(folder / BUILT, folder / NEED_TRACKS[page.stem])
         for described in re.findall(r"```yaml\n(name: .*?)```", text, re.S):
             (folder / f"{yaml.safe_load(described)['name']}.yaml").write_text(described)
         for line in block:

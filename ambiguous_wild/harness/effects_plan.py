@@ -322,7 +322,10 @@ def decide(scene: str, evidence: Evidence) -> Plan:
     if appearance == exposure == "on":
         exposure_why = "the appearance embedding includes it"
     antialias = answer(evidence.sampling, SAMPLING)
-    skybox = answer(evidence.uncovered, UNCOVERED)
+    dense, skybox = _dense_start(evidence), answer(evidence.uncovered, UNCOVERED)
+    skybox_why = "a background, or plain walls" if skybox == "on" else "SfM found points nearly everywhere"
+    if dense.decision == skybox == "on":  # both fill the room for first Gaussians (docs/notes/effects.md)
+        skybox, skybox_why = "off", "a dense start fills the room for first Gaussians"
     lines: tuple[Decision, ...] = (
         Decision(
             "appearance", "spread at a point after gain and shine", by_place,
@@ -343,11 +346,9 @@ def decide(scene: str, evidence: Evidence) -> Plan:
         ),
         Decision(
             "skybox", "share of the photos where no SfM points lie", evidence.uncovered, UNCOVERED,
-            "of the pixels", skybox,
-            "a background, or plain walls" if skybox == "on" else "SfM found points nearly everywhere",
-            "--effects skybox",
+            "of the pixels", skybox, skybox_why, "--effects skybox",
         ),
-        _dense_start(evidence),
+        dense,
     )  # fmt: skip
     too_few = f"{evidence.observations} observations of SfM points are too few to decide"
     missing = {"skybox": "most photos show too few SfM points to decide"}

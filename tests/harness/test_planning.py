@@ -140,6 +140,13 @@ def test_what_lies_behind_the_scene_calls_for_a_skybox(uncovered, skybox):
     assert chosen.effects == plan.effects()
 
 
+def test_a_dense_start_takes_the_room_of_a_skybox():
+    plan = decide("dots", dataclasses.replace(measured(), uncovered=0.5, photos=FEW_PHOTOS))
+    assert plan.effects() == ("dense",)
+    (line,) = (d for d in plan.decisions if d.effect == "skybox")
+    assert line.decision == "off" and "dense start" in line.why
+
+
 def test_the_uncovered_share_is_where_no_points_lie():
     scene, _ = synthetic()
     share = effects_plan.uncovered(scene)

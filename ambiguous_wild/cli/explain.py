@@ -25,23 +25,31 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     from ambiguous_wild.cli.options import prepare_cpu
     from ambiguous_wild.core.errors import AwError, unknown
     from ambiguous_wild.harness.replay import open_run
-    from ambiguous_wild.splat.parts import MaskPolicy
 
     prepare_cpu(None)
     trainer = open_run(run)
     names = [view.name for view in trainer.data.scene.train]
-    found = [k for k, name in enumerate(names) if photo in (name, Path(name).stem)]
+    found = [names.index(photo)] if photo in names else []
+    found = found or [k for k, name in enumerate(names) if photo in (Path(name).name, Path(name).stem)]
     if not found:
         raise unknown("train photo", photo, names)
-    step = trainer.make_step(trainer.iteration, found[0], divisor=1)
+    if len(found) > 1:
+        raise AwError(f"{photo} names several photos: {', '.join(names[k] for k in found)}; name one in full")
+    step = trainer.make_step(max(trainer.iteration, 1), found[0], divisor=1)
     height, width = step.photo.shape[:2]
     if column >= width or row >= height:
         raise AwError(f"{photo} is trained at {width} x {height}: there is no pixel {column}, {row}")
-    policy = trainer.parts.mask
-    if type(policy).predict is MaskPolicy.predict and type(policy).keep is MaskPolicy.keep:
-        raise AwError(f"{run} is of a method without masks: it keeps every pixel")
-    keep = policy.predict(step)
+    if not trainer.done:
+        say(f"{run} is not finished: these are its masks after {trainer.iteration} iterations")
+    policy, own = trainer.parts.mask, trainer.data.user_keep[found[0]]
+    predicted = policy.predict(step)
+    keep = trainer.combine_user_keep(step, predicted)
     kept = keep is None or bool(keep[row, column] > 0.5)
-    say(f"{photo}, column {column}, row {row}: {'kept' if kept else 'masked'}")
-    for line in policy.explain(step, column, row):
-        say(f"  {line}")
+    say(f"{names[found[0]]}, column {column}, row {row}: {'kept' if kept else 'masked'}")
+    if own is not None and not bool(own[row, column] > 0.5):
+        say("  the capture's own mask leaves it out")
+    if predicted is None:
+        say("  the method masks nothing in this photo, or had not begun to")
+    else:
+        for line in policy.explain(step, column, row) or ["the method gives no reasons"]:
+            say(f"  {line}")

@@ -115,12 +115,13 @@ def _check_overwrite(path: Path, probe: bool) -> None:
 
 def table(plan: Plan) -> list[str]:
     """Return the plan as lines of at most `COLUMNS` characters: a table, and a sentence for each effect."""
-    head = ("effect", "decision", "found", "on from", "gain on held-back pixels", "ms/iteration")
+    head = ("effect", "decision", "found", "limit", "gain on held-back pixels", "ms/iteration")
     rows = [head, *(_row(d) for d in plan.decisions)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths)).rstrip() for row in rows]
     for d in plan.decisions:
-        sentence = f"{d.effect} {d.decision}: {d.why} ({d.evidence}, {d.unit})"
+        unit = f", {d.unit}" if d.unit.startswith("of ") else ""
+        sentence = f"{d.effect} {d.decision}: {d.why} ({d.evidence}{unit})"
         lines += textwrap.wrap(sentence, COLUMNS, subsequent_indent="  ")
     if any(d.effect == "masks" for d in plan.decisions):
         lines += textwrap.wrap(MASKS, COLUMNS, subsequent_indent="  ")
@@ -131,4 +132,5 @@ def _row(d: Decision) -> tuple[str, ...]:
     found = "—" if math.isnan(d.value) else f"{d.value:.3g}"
     gain = "—" if d.gain_db is None else f"{d.gain_db:+.2f} ± {d.error_db:.2f} dB"
     cost = "—" if d.cost_ms is None else f"{d.cost_ms:+.2f}"
-    return d.effect, d.decision, found, f"{d.threshold:g}", gain, cost
+    limit = f"{'at most' if d.unit == 'photos' else 'from'} {d.threshold:g}"
+    return d.effect, d.decision, found, limit, gain, cost

@@ -76,13 +76,18 @@ def simulate_command(
         raise AwError(f"{given} ('aw simulate --list' describes them)")
     twin = None
     if like is not None:
-        twin = _twin(like, width, seed)
-        spec, called = resized(twin.spec, views), f"--like {shlex.quote(str(like))}"
+        twin = _twin(like, width, seed, views)
+        spec, called = twin.spec, f"--like {shlex.quote(str(like))}"
     else:
         called = str(name)
         spec = resized(read_spec(called) if is_spec_file(called) else preset(called), views, width)
     lines = twin.lines if twin else ()
     if print_spec:
+        if twin:
+            lines = (
+                *lines,
+                f"then: aw simulate SPEC.yaml --seed {seed} -o raw; build-scene with --factor {twin.factor}",
+            )
         click.echo("".join(f"# {line}\n" for line in lines) + dump_spec(spec), nl=False)
         return
     if output is None:
@@ -144,12 +149,12 @@ def simulate_command(
     click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
 
 
-def _twin(scene: Path, width: int | None, seed: int) -> Twin:
+def _twin(scene: Path, width: int | None, seed: int, views: int | None) -> Twin:
     """Measure a scene and return the spec of a capture like it."""
     from ambiguous_wild.io.scene_folder import load_scene
     from ambiguous_wild.report.twin import measure_likeness, spec_like
 
-    return spec_like(measure_likeness(load_scene(scene)), width, seed)
+    return spec_like(measure_likeness(load_scene(scene)), width, seed, views)
 
 
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:

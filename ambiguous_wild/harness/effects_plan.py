@@ -318,7 +318,9 @@ def decide(scene: str, evidence: Evidence) -> Plan:
     by_place = evidence.appearance - min(shine, evidence.appearance)  # NaN stays NaN
     appearance = answer(by_place, APPEARANCE)
     exposure = answer(evidence.exposure, EXPOSURE)
-    exposure_why = "a gain per photo explains it" if exposure == "on" else "all photos agree"
+    exposure_why = (
+        "a gain per photo explains it" if exposure == "on" else "the photos are about equally bright"
+    )
     if appearance == exposure == "on":
         exposure_why = "the appearance embedding includes it"
     antialias = answer(evidence.sampling, SAMPLING)
@@ -372,8 +374,12 @@ def _dense_start(evidence: Evidence) -> Decision:
             "dense", "spread of the places looked at, over that of the cameras", evidence.outward, OUTWARD,
             "times", decision, "the cameras look outward", "--effects dense",
         )  # fmt: skip
-    why = "so few photos leave gaps between points" if few else "enough photos show each surface"
-    return Decision("dense", "train photos; on up to the limit", photos or math.nan, FEW_PHOTOS, "photos",
+    why = (
+        "few photos leave gaps between points, which plane sweeps fill"
+        if few
+        else "enough photos show each surface"
+    )
+    return Decision("dense", "number of train photos", photos or math.nan, FEW_PHOTOS, "photos",
                     decision, why, "--effects dense")  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def replay(run: Path) -> Replay:
 
 
 def open_run(run: Path | str) -> Trainer:
-    """Return the trainer of a run as it was when the run was last saved, to look into it; never train it.
+    """Return the trainer of a run as it was when the run was last saved, to look into it.
 
     `trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view, divisor=1))` is the keep map of a
     train photo. Nothing is written to the run.
@@ -84,11 +84,15 @@ def open_run(run: Path | str) -> Trainer:
     run = Path(run)
     if not (run / "config.yaml").is_file():
         raise AwError(f"{run} is no run of 'aw bench': it holds no config.yaml")
-    cache = Path(tempfile.mkdtemp(prefix="aw-open-"))  # of features, for as long as the trainer lives
-    trainer = _trainer(run, plain_yaml.read_mapping(run / "config.yaml"), run, cache)
-    weakref.finalize(trainer, shutil.rmtree, cache, ignore_errors=True)
-    if not trainer.resume():
+    folder = Path(tempfile.mkdtemp(prefix="aw-open-"))  # for as long as the trainer lives
+    trainer = _trainer(run, plain_yaml.read_mapping(run / "config.yaml"), folder, folder / "cache")
+    weakref.finalize(trainer, shutil.rmtree, folder, ignore_errors=True)
+    saved = run / trainer.checkpoint_path.relative_to(folder)
+    if not saved.is_file():
         raise AwError(f"{run} holds no checkpoint: run 'aw bench' again")
+    trainer.checkpoint_path.parent.mkdir(parents=True)
+    shutil.copyfile(saved, trainer.checkpoint_path)
+    trainer.resume()
     return trainer
 
 
@@ -97,8 +101,10 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, cache: Path) -> Tr
     try:
         method, device, options = config["method"], torch.device(config["device"]), config["options"]
         path, factor, train = config["scene"]["path"], config["scene"]["factor"], config["train"]
-    except (KeyError, TypeError) as error:
-        raise AwError(f"{run} cannot be opened: its config lacks {error}") from None
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise AwError(
+            f"{run} cannot be opened: its config.yaml is damaged: {str(error).splitlines()[0]}"
+        ) from None
     entry = get_method(method)
     if entry.passes > 1:
         raise AwError(f"{run} was trained twice, the second time with the masks in {run / 'masks'}")

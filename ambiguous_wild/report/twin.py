@@ -34,7 +34,7 @@ from ambiguous_wild.harness.effects_plan import (
 from ambiguous_wild.io.images import load_image_float
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.simulate.image_effects import READ, SHOT, PhotoRandom, draw_exposure_drift
-from ambiguous_wild.simulate.presets import preset
+from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
     PLANS,
@@ -139,13 +139,14 @@ def measure_likeness(scene: Scene) -> Likeness:
     )
 
 
-def spec_like(of: Likeness, width: int | None = None, seed: int = 0) -> Twin:
+def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int | None = None) -> Twin:
     """Return the spec of a capture that calls for the effects of `of`.
 
     Args:
         of: the real capture.
         width: of the simulated photos, px; None: as the real ones, with a longer side of at most `LONGEST`.
         seed: of the capture; what its photos draw must spread as in the real ones.
+        views: number of train photos; None: as many as the real ones.
 
     Raises:
         AwError: a size or number of photos that no spec may have.
@@ -180,19 +181,20 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0) -> Twin:
         arc_deg=round(arc_deg),
         zoom=zoom,
         world=replace(base.world, things=things, statue=not things or things[0].at_m[2] > STATUE_M),
-        effects=_effects(of, factor, seed),
+        effects=_effects(of, factor, seed, views or seen.photos),
         designed=Designed(),
     )
-    return Twin(check_spec(spec), factor, tuple(_lines(of, spec, factor)))
+    spec = resized(check_spec(spec), views)
+    return Twin(spec, factor, tuple(_lines(of, spec, factor)))
 
 
-def _effects(of: Likeness, factor: int, seed: int) -> Effects:
+def _effects(of: Likeness, factor: int, seed: int, views: int) -> Effects:
     seen = of.evidence
     shine = 0.0 if math.isnan(seen.view_dependence) else OF_SHINE * seen.view_dependence
     by_place = _clear(seen.appearance - shine, APPEARANCE)
     day = by_place if by_place >= APPEARANCE else 0.0  # False for NaN
     strength = min(day / SPREAD_OF_DAY, 2.0)
-    count = max(seen.photos, 3)
+    count = max(views, 3)
     drawn = [PhotoRandom(seed, k, k / (count - 1)) for k in range(count)]
     spread = SPREAD_OF_STOP * np.std([draw_exposure_drift(ExposureDrift(1.0), r) for r in drawn], ddof=1)
     stops = (
@@ -309,7 +311,8 @@ def _lines(of: Likeness, spec: CaptureSpec, factor: int) -> Iterator[str]:
         return f"no {name}" if chosen is None else f"{name} {to_plain(chosen)}"
 
     size = "{}x{}".format(*of.size)
-    yield f"photos: {seen.photos} train and {of.test} test of {size} px -> the same at factor {factor}"
+    taken = f"{spec.train_views} and {spec.test_views}, factor {factor}"
+    yield f"photos: {seen.photos} train and {of.test} test of {size} px -> {taken}"
     yield f"focal length: {of.focal:.2f} of the diagonal -> focal_35mm {spec.focal_35mm:g}"
     yield line(
         "places looked at over cameras", seen.outward, "times", f"walk {spec.walk}, {spec.world.place}"
@@ -331,7 +334,7 @@ def _lines(of: Likeness, spec: CaptureSpec, factor: int) -> Iterator[str]:
 
 def _full_size(scene: Scene, view: View) -> Path:
     """Return the file of a photo before it was made smaller, if the scene has it."""
-    path = scene.root / "images" / view.image_path.name
+    path = scene.root / "images" / view.name
     return path if path.is_file() else view.image_path
 
 

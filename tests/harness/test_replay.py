@@ -1,5 +1,6 @@
 """A run that met a NaN is run up to it again, from its own folder alone."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.main import cli
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness import replay as replay_module
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.replay import open_run, replay
 from ambiguous_wild.harness.result_file import read_result
@@ -121,7 +123,21 @@ def test_a_pixel_is_explained(masked):
         assert done.exit_code == 0, done.output
         said[kept] = done.output
     assert "kept\n" in said[True] and "masked\n" in said[False]
-    assert all("threshold of the scene's instances: " in text for text in said.values())
+    assert "mask: yes" in said[False] and "threshold of the scene's instances: " in said[False]
+
+
+def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
+    load = replay_module.load_train_data
+
+    def with_mask(scene, **more):
+        data = load(scene, **more)
+        own = [torch.zeros(photo.shape[:2]) for photo in data.photos]
+        return dataclasses.replace(data, user_keep=own)
+
+    monkeypatch.setattr(replay_module, "load_train_data", with_mask)
+    photo = sorted((masked / "masks").rglob("*.png"))[0].stem
+    done = CliRunner().invoke(cli, ["explain", str(masked), photo, "0", "0"])
+    assert "masked\n" in done.output and "the capture's own mask leaves it out" in done.output
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps
-from ambiguous_wild.methods.refinesplat.first_look import FirstLook
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.masks import Judged, Masks, MaskStore, enlarge
 from ambiguous_wild.splat.step import Step, TrainData
@@ -27,7 +26,6 @@ class Policy(Protocol):
     data: TrainData
     inputs: FrozenInputs
     points: dict[str, MotionPoints]
-    looks: dict[int, FirstLook]
     masks: MaskStore
 
     @property
@@ -81,33 +79,45 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
 def explain(policy: Policy, step: Step, x: int, y: int) -> list[str]:
     """Return what decided about a pixel of the photo, in the order in which it is asked."""
     maps, masks = policy.examine(step)
-    view, labels, config = step.view, policy.inputs.labels[step.view], policy.config.mask
-    own = float(enlarge(maps.statistic, *labels.shape)[y, x])
-    lines = [f"evidence of the pixel ({config.statistic}): {own:.2f} times what noise alone causes"]
-    if view in policy.looks:
-        factor = policy.looks[view].factor(labels.shape)[y, x]
+    view, config = step.view, policy.config.mask
+    store = policy.masks
+    shape = store.labels.shapes[view]
+    structure, seen = config.statistic == "structure", store.pixels.seen[view]
+    static = store.labels.static.get(view)
+    if structure and seen is not None and not bool(seen[y, x]):
+        return ["too few other photos see this surface: never masked"]
+    own = float(enlarge(maps.statistic, *shape)[y, x])
+    what = "difference in structure, in units of what noise causes" if structure else config.statistic
+    lines = [f"evidence of the pixel: {own:.2f} ({what})"]
+    if structure and view in store.factors:
+        factor = float(store.factors[view][y, x])
         lines.append(f"in it, first look at the photos before training: times {factor:.2f}")
+    labels = store.labels.of_pixel[view].view(shape)
     instance, joined = int(labels[y, x]), own
+    fused = config.combine == "fused" and config.use_local and config.use_global
     if instance > 0:
         mean, pixels = float(masks.means[instance - 1]), int((labels == instance).sum())
         lines.append(f"its instance, {pixels} px: mean evidence {mean:.2f}")
-        if config.combine == "fused" and config.use_local and config.use_global:
-            joined = math.sqrt(max(own, 0.0) * max(mean, 0.0)) if math.isfinite(mean) else 0.0
+        if fused:
+            joined = math.sqrt(max(own, 0.0) * max(mean, 0.0))
             lines.append(f"both joined, the root of their product: {joined:.2f}")
     else:
-        lines.append("no instance: the pixel is judged alone")
+        lines.append("it lies in no instance and is judged alone")
     threshold = float(masks.cut.threshold)
-    lines.append(
-        f"threshold of the scene's instances: {threshold:.2f}; a region that exceeds it reaches down to "
-        f"{config.hold * threshold:.2f}, is filled and grown"
-    )
-    static, seen = policy.masks.labels.static.get(view), policy.masks.pixels.seen[view]
+    if math.isfinite(threshold):
+        reach = f"; a region that exceeds it reaches down to {config.hold * threshold:.2f}" if fused else ""
+        lines.append(f"threshold of the scene's instances: {threshold:.2f}{reach}")
+    else:
+        lines.append("no instance of the scene stands apart from the others")
     if static is not None and bool(static[y, x]):
         lines.append("structure from motion shows that its instance is static: never masked")
-    if config.statistic == "structure" and seen is not None and not bool(seen[y, x]):
-        lines.append("too few other photos see this surface: never masked")
-    rules = [name for name, mask in (("local", masks.local), ("global", masks.global_)) if bool(mask[y, x])]
-    lines.append(f"masked by itself by: {', '.join(rules) or 'neither local nor global mask'}")
+    local, global_ = ("yes" if bool(mask[y, x]) else "no" for mask in (masks.local, masks.global_))
+    lines.append(f"in the local mask: {local}; in the global mask: {global_}")
+    most = store.limited.get(view, config).most
+    if not bool(masks.keep[y, x] < 0.5) and joined > threshold:
+        lines.append(f"the mask may cover {100 * most:.0f} % of the photo: only its surest pixels stay")
+    if bool(masks.keep[y, x] < 0.5) and joined <= config.hold * threshold:
+        lines.append("it lies in a gap or at the rim of a mask, which is filled and grown")
     return lines
 
 

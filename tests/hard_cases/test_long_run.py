@@ -143,7 +143,7 @@ def train(method: str, scene_root: Path, folder: Path) -> list[dict[str, Any]]:
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder.parent / ".cache")
     truth = evaluate.load_test_photos(scene)
     entry = get_method(method)
-    config = TrainConfig(iterations=ITERATIONS, max_gaussians=CAP, probes=30)
+    config = TrainConfig(iterations=ITERATIONS, max_gaussians=CAP, probes=20)  # at rows of the timeline
 
     def probe(draw: Any) -> float:
         return evaluate.mean_psnr(truth, lambda camera: draw(camera).numpy())

@@ -124,7 +124,9 @@ def test_a_run_folder_holds_everything_and_the_numbers_follow_from_it(scene, tmp
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
     expected = {"config.yaml", "env.json", "log.txt", "timeline.csv", "point_cloud.ply", "metrics.json"}
     expected |= {"checkpoint/last.safetensors"} | {f"renders/test/{n}" for n in TEST}
-    assert names == expected | {f"masks/{n}" for n in TRAIN} | {"pictures/masks.jpg"}
+    assert names == expected | {f"masks/{n}" for n in TRAIN} | {"pictures/masks.jpg"} | {
+        f"pictures/training_train_{k}.png" for k in (0, 2, 5)
+    }
 
     result = read_result(run / "metrics.json")
     for row in result["per_image"]:

@@ -200,13 +200,14 @@ def measure(
     clock.rounds = clock.rounds[3:]
     ms = clock.median_ms()
     parts: dict[str, dict[str, Any]] = {part: {"ms": round(value, 3)} for part, value in ms.items()}
-    for part, (flop, size) in work(rendered, len(gaussians), width * height).items():
+    amounts = work(rendered, len(gaussians), width * height)
+    for part, (flop, size) in amounts.items():
         shares = [amount / rate / (ms[part] / 1e3) for amount, rate in zip((flop, size), peak)]
         parts[part] |= {
             "share": round(max(shares), 3),
             "limit": "arithmetic" if shares[0] >= shares[1] else "memory",
         }
-    blended = work(rendered, len(gaussians), width * height)["blend forward"][0] / FORWARD_FLOP
+    blended = amounts["blend forward"][0] / FORWARD_FLOP
     best = 1e3 * min(r["iteration"] for r in clock.rounds)
     return {
         "name": name, "gaussians": len(gaussians), "width": width, "height": height, "runs": runs,

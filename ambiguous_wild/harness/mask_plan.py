@@ -207,6 +207,7 @@ def persists(
 
 
 MOST_PHOTOS = 60  # evenly spaced photos of a pair: 300 iterations visit each five times
+SEED = 0  # of the blocks and of the pair
 LEAST_PHOTOS = 4  # fewer give no useful standard error
 # Without growth masks gain little: static captures -0.02 to +0.01 dB, captures with distractors from 0.05 dB
 # (docs/notes/effects.md)
@@ -293,17 +294,16 @@ def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> Points:
 class Pair:
     """The photos and blocks of one scene, on which the two trainings are compared."""
 
-    def __init__(self, scene: Scene, folder: Path, *, seed: int = 0) -> None:
+    def __init__(self, scene: Scene, folder: Path) -> None:
         """
         Args:
             scene: the scene.
             folder: folder for temporary files.
-            seed: seed of the blocks and of training.
         """
         scene, self.chosen = sampled(scene)
-        data = small_data(scene, folder, seed)
-        self.seed, self.folder = seed, folder
-        self.blocks = held_back(data, seed)
+        data = small_data(scene, folder)
+        self.folder = folder
+        self.blocks = held_back(data, SEED)
         hidden = dataclasses.replace(scene, points=without_blocks(scene, self.blocks))
         self.data = dataclasses.replace(data, scene=hidden)
 
@@ -326,7 +326,7 @@ class Pair:
         policy = HeldBack(self.blocks, patches, masked)
         # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
         parts = dataclasses.replace(Parts(), mask=policy, density_config=FIXED, weighting="images")
-        config = TrainConfig(iterations=iterations, seed=self.seed, probes=0, checkpoint_every_s=1e9)
+        config = TrainConfig(iterations=iterations, seed=SEED, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(self.data, with_effects(parts, effects), config, folder=self.folder)
         trainer.train(tick=lambda _: tick())
         names = [view.name for view in self.data.scene.train]
@@ -441,28 +441,24 @@ def with_occlusion(plan: Plan, occlusion: Occlusion) -> Plan:
 
 
 def effect_costs(scene: Scene) -> dict[str, float]:
-    """Measure the ms of CPU time per iteration that each effect adds on this machine, on small photos."""
-    with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
-        return step_costs(small_data(scene, Path(name)), ALL, Path(name))
-
-
-def step_costs(data: TrainData, effects: Sequence[str], folder: Path) -> dict[str, float]:
-    """Measure the ms of CPU time per iteration that each of the effects adds when it is on alone.
+    """Measure the ms of CPU time per iteration that each effect adds on this machine, on small photos.
 
     All take turns in every round, so that the load of the machine affects them alike; the median is taken.
     """
-    config = TrainConfig(iterations=10_000, probes=0)
-    trainers = {
-        e: Trainer(data, with_effects(Parts(), (e,) if e else ()), config, folder=folder / e)
-        for e in ("", *effects)
-    }
-    times: dict[str, list[float]] = {e: [] for e in trainers}
-    for turn in range(TIMED_ROUNDS + 1):
-        for effect, trainer in trainers.items():
-            begin = time.process_time()  # excludes other programs
-            for _ in range(TIMED_STEPS):
-                trainer.step()
-            if turn:  # the first round compiles and allocates
-                times[effect].append(1e3 * (time.process_time() - begin) / TIMED_STEPS)
-    plain = np.array(times[""])
-    return {e: round(float(np.median(np.array(t) - plain)), 2) for e, t in times.items() if e}
+    with tempfile.TemporaryDirectory(prefix="aw-plan-") as name:
+        folder, config = Path(name), TrainConfig(iterations=10_000, probes=0)
+        data = small_data(scene, folder)
+        trainers = {
+            e: Trainer(data, with_effects(Parts(), (e,) if e else ()), config, folder=folder / e)
+            for e in ("", *ALL)
+        }
+        times: dict[str, list[float]] = {e: [] for e in trainers}
+        for turn in range(TIMED_ROUNDS + 1):
+            for effect, trainer in trainers.items():
+                begin = time.process_time()  # excludes other programs
+                for _ in range(TIMED_STEPS):
+                    trainer.step()
+                if turn:  # the first round compiles and allocates
+                    times[effect].append(1e3 * (time.process_time() - begin) / TIMED_STEPS)
+        plain = np.array(times[""])
+        return {e: round(float(np.median(np.array(t) - plain)), 2) for e, t in times.items() if e}

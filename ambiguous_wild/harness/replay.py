@@ -56,12 +56,7 @@ def replay(run: Path) -> Replay:
     except (KeyError, TypeError) as error:
         raise AwError(f"{run} cannot be replayed: its report is damaged: no {error}") from None
     with tempfile.TemporaryDirectory(prefix="aw-replay-") as name:
-        folder = Path(name)
-        trainer = _trainer(run, config, folder, folder / "cache")
-        if (findings[0] / GOOD).exists():
-            trainer.checkpoint_path.parent.mkdir(parents=True)
-            shutil.copyfile(findings[0] / GOOD, trainer.checkpoint_path)
-            trainer.resume()
+        trainer = _trainer(run, config, Path(name), findings[0] / GOOD)
         start = trainer.iteration
         try:
             while trainer.iteration < last:
@@ -84,34 +79,37 @@ def open_run(run: Path | str) -> Trainer:
     run = Path(run)
     if not (run / "config.yaml").is_file():
         raise AwError(f"{run} is no run of 'aw bench': it holds no config.yaml")
-    folder = Path(tempfile.mkdtemp(prefix="aw-open-"))  # for as long as the trainer lives
-    trainer = _trainer(run, plain_yaml.read_mapping(run / "config.yaml"), folder, folder / "cache")
-    weakref.finalize(trainer, shutil.rmtree, folder, ignore_errors=True)
-    saved = run / trainer.checkpoint_path.relative_to(folder)
+    saved = run / "checkpoint" / "last.safetensors"
     if not saved.is_file():
         raise AwError(f"{run} holds no checkpoint: run 'aw bench' again")
-    trainer.checkpoint_path.parent.mkdir(parents=True)
-    shutil.copyfile(saved, trainer.checkpoint_path)
-    trainer.resume()
+    folder = tempfile.TemporaryDirectory(prefix="aw-open-")
+    trainer = _trainer(run, plain_yaml.read_mapping(run / "config.yaml"), Path(folder.name), saved)
+    weakref.finalize(trainer, folder.cleanup)  # the folder lives as long as the trainer
     return trainer
 
 
-def _trainer(run: Path, config: dict[Any, Any], folder: Path, cache: Path) -> Trainer:
-    """Return the run's trainer before its first step, with its files in `folder`."""
+def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Trainer:
+    """Return the run's trainer as it was saved, or before its first step, with its files in `folder`."""
     try:
         method, device, options = config["method"], torch.device(config["device"]), config["options"]
         path, factor, train = config["scene"]["path"], config["scene"]["factor"], config["train"]
     except (KeyError, TypeError, RuntimeError) as error:
-        raise AwError(
-            f"{run} cannot be opened: its config.yaml is damaged: {str(error).splitlines()[0]}"
-        ) from None
+        what = str(error).splitlines()[0]
+        raise AwError(f"{run} cannot be opened: its config.yaml is damaged (at {what})") from None
     entry = get_method(method)
     if entry.passes > 1:
-        raise AwError(f"{run} was trained twice, the second time with the masks in {run / 'masks'}")
+        raise AwError(
+            f"{run} was trained twice, the second time with the masks in {run / 'masks'}: look there"
+        )
     parts = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
     parts = with_effects(parts, tuple(config.get("effects", ())))
     settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
     scene = load_scene(path, factor=factor)
-    data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=cache)
+    data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
     parts = started(parts, recorded_start(config.get("start")), scene)
-    return Trainer(data, parts, settings, folder=folder)
+    trainer = Trainer(data, parts, settings, folder=folder)
+    if saved.is_file():
+        trainer.checkpoint_path.parent.mkdir(parents=True)
+        shutil.copyfile(saved, trainer.checkpoint_path)
+        trainer.resume()
+    return trainer

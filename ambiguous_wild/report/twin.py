@@ -57,9 +57,8 @@ OCCLUDED = (0.0, 0.1), (0.3, 0.4)  # least and greatest ends of `occlusion`
 NOISE = 1.5 / 255  # simulated photos without noise and sharp JPEGs have up to 1.3 codes of texture
 BLOCK = 8  # px, side of the blocks of which the smoothest tenth tells the noise
 # Response of the simulator, measured on simulated captures: evidence at a setting of 1.
-SPREAD_OF_STOP = (
-    0.28  # `exposure` over the standard deviation of the drawn stops: 0.26 to 0.32 in six captures
-)
+# `exposure` over the standard deviation of the drawn stops: 0.26 to 0.32 in six captures
+SPREAD_OF_STOP = 0.28
 SPREAD_OF_DAY = 0.036  # `appearance` of time_of_day at strength 1
 OWN_SAMPLING = 1.3  # `sampling` without zoom
 OF_ZOOM = 0.68  # spread of log `sampling` over that of log zoom: wide photos see more near ground
@@ -86,9 +85,8 @@ class Likeness:
     evidence: Evidence  # also the number of train photos
     noise: float  # standard deviation in the photos as trained, of the colour range; 0: none in the full ones
     soft: float  # share of the train photos that are blurred
-    moving: tuple[
-        float, float, float
-    ]  # share of features that move, of photos: 10th percentile, mean, 90th; or NaN
+    # share of features that move, of photos: 10th percentile, mean, 90th; or NaN
+    moving: tuple[float, float, float]
 
 
 @dataclass(frozen=True)

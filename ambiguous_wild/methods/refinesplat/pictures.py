@@ -110,13 +110,14 @@ def explain(policy: Policy, step: Step, x: int, y: int) -> list[str]:
     else:
         lines.append("no instance of the scene stands apart from the others")
     if static is not None and bool(static[y, x]):
-        lines.append("structure from motion shows that its instance is static: never masked")
+        return [*lines, "structure from motion shows that its instance is static: never masked"]
     local, global_ = ("yes" if bool(mask[y, x]) else "no" for mask in (masks.local, masks.global_))
     lines.append(f"in the local mask: {local}; in the global mask: {global_}")
-    most = store.limited.get(view, config).most
-    if not bool(masks.keep[y, x] < 0.5) and joined > threshold:
+    masked = bool(masks.keep[y, x] < 0.5)
+    if fused and not masked and joined > threshold:
+        most = store.limited.get(view, config).most
         lines.append(f"the mask may cover {100 * most:.0f} % of the photo: only its surest pixels stay")
-    if bool(masks.keep[y, x] < 0.5) and joined <= config.hold * threshold:
+    if fused and masked and joined <= config.hold * threshold:
         lines.append("it lies in a gap or at the rim of a mask, which is filled and grown")
     return lines
 

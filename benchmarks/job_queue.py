@@ -105,21 +105,21 @@ def parser_of(doc: str | None, results: Path, iterations: int) -> argparse.Argum
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
     parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
-    parser.add_argument("--seeds", nargs="+", type=_seed, default=[0, 1, 2])
-    parser.add_argument("--iterations", type=_count, default=iterations)
-    parser.add_argument("--jobs", type=_count, default=2, help="runs at a time")
+    parser.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2])
+    parser.add_argument("--iterations", type=count, default=iterations)
+    parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--results", type=Path, default=results, help="where the table goes")
     parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     return parser
 
 
-def _count(text: str) -> int:
+def count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is no count from 1 on")
     return int(text)
 
 
-def _seed(text: str) -> int:
+def seed(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is no seed from 0 on")
     return int(text)
@@ -135,7 +135,7 @@ def run_all(runs: Sequence[Run], at_once: int = 1) -> list[str]:
     # one thread each in whatever a run calls: those of libraries wait by spinning, on the others' cores
     env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     failed = []
-    count = 0
+    number = 0
     with ThreadPoolExecutor(at_once) as pool:
         waiting = {
             pool.submit(
@@ -151,9 +151,9 @@ def run_all(runs: Sequence[Run], at_once: int = 1) -> list[str]:
             batch, process = waiting[done], done.result()
             lines = [line.strip() for line in process.stderr.splitlines() if line.strip()] or ["no output"]
             for run in batch:
-                count += 1
+                number += 1
                 psnr = run.psnr()
-                print(f"[{count}/{len(todo)}] {run.name}: {psnr or lines[-1]}", flush=True)
+                print(f"[{number}/{len(todo)}] {run.name}: {psnr or lines[-1]}", flush=True)
                 if psnr is None:
                     failed.append(f"{run.name}: {lines[-1]}")
     return failed

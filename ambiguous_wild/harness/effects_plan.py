@@ -18,7 +18,6 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
-from ambiguous_wild.vision.sparse_surface import has_surface
 
 LEAST = 50  # observations; fewer give no evidence
 LEAST_VIEWS = 6  # photos of a point, to fit four numbers to its colour
@@ -26,7 +25,6 @@ OUTLYING = 4.5  # median deviations from a point's median colour: three standard
 RELIT = 0.5  # if more of a photo's points than this share are far from their medians, its light differs
 LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they are all at one place
 LEAST_SPREAD = 0.01  # of the colour range, or of the logarithm: smallest median deviation that is used
-MOST_PHOTOS = 64  # number of photos whose uncovered share is measured
 MOST = 20_000  # number of points whose view dependence is fitted; more do not change a median
 
 
@@ -41,7 +39,6 @@ class Evidence:
     observations: int  # number in train photos that are usable for colour
     photos: int = 0  # number of train photos; 0 = not counted
     outward: float = math.nan  # spread of the places that train cameras look at, over that of the cameras
-    uncovered: float = math.nan  # share of the train photos where no SfM points lie
 
 
 def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
@@ -64,7 +61,6 @@ def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
         observations=len(colours.point),
         photos=len(scene.train),
         outward=outward(scene),
-        uncovered=uncovered(scene),
     )
 
 
@@ -117,22 +113,6 @@ def outward(scene: Scene) -> float:
     apart, between = (float(np.sqrt(a.var(axis=0).sum())) for a in (cameras, places))
     depth = float(np.median([depth for _, depth in looking]))
     return between / apart if apart > LEAST_APART * depth else float("nan")
-
-
-def uncovered(scene: Scene) -> float:
-    """Return the share of the train photos' pixels without SfM points near them, mean of up to 64 photos.
-
-    Such pixels show in most scenes the background. Tracks are not needed. A photo with too few points for a
-    surface counts as wholly uncovered; the result is NaN if most photos are such.
-    """
-    cameras = [view.camera for view in scene.train]
-    cameras = cameras[:: max(-(-len(cameras) // MOST_PHOTOS), 1)]
-    if not cameras or not len(scene.points):
-        return float("nan")
-    surfaces = [has_surface(camera, scene.points.sure_xyz) for camera in cameras]
-    if 2 * sum(surface is None for surface in surfaces) > len(surfaces):
-        return float("nan")
-    return float(np.mean([1.0 if surface is None else 1.0 - surface.mean() for surface in surfaces]))
 
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
@@ -244,8 +224,6 @@ SAMPLING = 1.5
 OUTWARD = 2.0
 # captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/notes/effects.md)
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24
-# simulated courtyards, rooms and yards have 0.01 to 0.05, real captures 0.09 to 0.66 (docs/notes/effects.md)
-UNCOVERED = 0.07
 
 
 @dataclass(frozen=True)
@@ -324,10 +302,7 @@ def decide(scene: str, evidence: Evidence) -> Plan:
     if appearance == exposure == "on":
         exposure_why = "the appearance embedding includes it"
     antialias = answer(evidence.sampling, SAMPLING)
-    dense, skybox = _dense_start(evidence), answer(evidence.uncovered, UNCOVERED)
-    skybox_why = "a background, or plain walls" if skybox == "on" else "SfM found points nearly everywhere"
-    if dense.decision == skybox == "on":  # both fill the room for first Gaussians (docs/notes/effects.md)
-        skybox, skybox_why = "off", "a dense start fills the room for first Gaussians"
+    dense = _dense_start(evidence)
     lines: tuple[Decision, ...] = (
         Decision(
             "appearance", "spread at a point after gain and shine", by_place,
@@ -346,17 +321,11 @@ def decide(scene: str, evidence: Evidence) -> Plan:
             "photos from near and far" if antialias == "on" else "all photos have about the same resolution",
             "--effects antialias",
         ),
-        Decision(
-            "skybox", "share of the photos where no SfM points lie", evidence.uncovered, UNCOVERED,
-            "of the pixels", skybox, skybox_why, "--effects skybox",
-        ),
+        _skybox(dense),
         dense,
     )  # fmt: skip
     too_few = f"{evidence.observations} observations of SfM points are too few to decide"
-    missing = {"skybox": "most photos show too few SfM points to decide"}
-    lines = tuple(
-        replace(d, why=missing.get(d.effect, too_few)) if d.decision == "unknown" else d for d in lines
-    )
+    lines = tuple(replace(d, why=too_few) if d.decision == "unknown" else d for d in lines)
     return Plan(scene, lines)
 
 
@@ -383,6 +352,16 @@ def _dense_start(evidence: Evidence) -> Decision:
                     decision, why, "--effects dense")  # fmt: skip
 
 
+def _skybox(dense: Decision) -> Decision:
+    """Decide on a skybox: on without a dense start, because both fill the room for first Gaussians.
+
+    It gains in courtyards and rooms too, where SfM found points nearly everywhere (docs/notes/effects.md).
+    """
+    on = dense.decision != "on"
+    why = "what lies behind is not left to haze" if on else "a dense start fills the room for first Gaussians"
+    return replace(dense, effect="skybox", decision="on" if on else "off", why=why, how="--effects skybox")
+
+
 def plan_effects(scene: Scene) -> Plan:
     """Measure the train photos at the SfM points and decide; without tracks no photo is read.
 
@@ -390,8 +369,7 @@ def plan_effects(scene: Scene) -> Plan:
         AwError: a photo cannot be read.
     """
     if not has_tracks(scene):
-        count, bare = len(scene.train), uncovered(scene)
-        nothing = Evidence(*(math.nan,) * 4, observations=0, photos=count, uncovered=bare)
+        nothing = Evidence(*(math.nan,) * 4, observations=0, photos=len(scene.train))
         return decide(scene.name, nothing)
     from ambiguous_wild.io.images import load_image_float
 

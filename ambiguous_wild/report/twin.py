@@ -22,11 +22,9 @@ from ambiguous_wild.harness.effects_plan import (
     APPEARANCE,
     EXPOSURE,
     LEAST_SPREAD,
-    MOST_PHOTOS,
     OF_SHINE,
     OUTWARD,
     SAMPLING,
-    UNCOVERED,
     Evidence,
     has_tracks,
     measure,
@@ -37,19 +35,18 @@ from ambiguous_wild.simulate.image_effects import READ, SHOT, PhotoRandom, draw_
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
-    PLANS,
     CaptureSpec,
     Defocus,
     Designed,
     Effects,
     ExposureDrift,
     IsoNoise,
-    Thing,
     TimeOfDay,
 )
 from ambiguous_wild.simulate.spec_file import check_spec
 from ambiguous_wild.splat.effects.tracks import BRIGHT, DARK
 
+MOST_PHOTOS = 64  # photos whose noise and blur are measured
 LONGEST = 960  # px, longer side of a simulated photo, as in the presets
 MOVES = 0.003  # share of features that move: static captures have up to 0.0013, others from 0.0037
 # Distractors cover more than the share of features that move: one to eight times it in ten captures.
@@ -62,14 +59,7 @@ SPREAD_OF_STOP = 0.28
 SPREAD_OF_DAY = 0.036  # `appearance` of time_of_day at strength 1
 OWN_SAMPLING = 1.3  # `sampling` without zoom
 OF_ZOOM = 0.68  # spread of log `sampling` over that of log zoom: wide photos see more near ground
-BARE = 0.5  # `uncovered` over the share of a photo above the foot of a backdrop: points beside it span a part
-BACKDROP_M = 7.1  # from the cameras to the walls behind the hub
-# The simulator misses wanted values by up to this factor.
-MISSED, MISSED_BARE = 1.2, 2.0
-PALE = (0.6, 0.7, 0.85)  # of the backdrop, linear light
-LOWEST_M = 2.0  # foot of a backdrop: above the heads of distractors
-STATUE_M = 2.7  # top of the statue on its plinth
-BEFORE_M = 0.4  # from a wall to its backdrop: hides the pilasters
+MISSED = 1.2  # the simulator misses wanted values by up to this factor
 
 
 @dataclass(frozen=True)
@@ -163,7 +153,6 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int 
     in_focal = float(np.hypot(wide, high)) * focal_mm / FULL_FRAME_DIAGONAL_MM
     least, mean, most = of.moving
     least, most = np.clip((least, most), *OCCLUDED).tolist() if mean >= MOVES else (0.0, 0.0)
-    things = _backdrop(seen.uncovered, base, 0.5 * high / in_focal, zoom[0])
     spec = replace(
         base,
         name=re.sub(r"[^\w-]", "-", of.name) or "scene",
@@ -178,7 +167,6 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int 
         focal_35mm=round(focal_mm, 1),
         arc_deg=round(arc_deg),
         zoom=zoom,
-        world=replace(base.world, things=things, statue=not things or things[0].at_m[2] > STATUE_M),
         effects=_effects(of, factor, seed, views or seen.photos),
         designed=Designed(),
     )
@@ -243,9 +231,9 @@ def _iso(noise: float) -> float:
     return float(np.clip(100 * (-b + math.sqrt(b * b - 4 * a * c)) / (2 * a), 50, 20_000))
 
 
-def _clear(value: float, limit: float, missed: float = MISSED) -> float:
+def _clear(value: float, limit: float) -> float:
     """Return the value, so far from its limit that the twin's is on the same side; NaN stays NaN."""
-    return max(value, limit * missed) if value >= limit else min(value, limit / missed)
+    return max(value, limit * MISSED) if value >= limit else min(value, limit / MISSED)
 
 
 def _zoom(sampling: float) -> tuple[float, float]:
@@ -259,41 +247,6 @@ def _zoom(sampling: float) -> tuple[float, float]:
     half = math.exp(min(spread, math.log(8)) / 2)
     low = max(1 / half, 0.5)
     return round(low, 2), round(min(low * half**2, 4.0), 2)
-
-
-def _backdrop(uncovered: float, base: CaptureSpec, half_height: float, zoom: float) -> tuple[Thing, ...]:
-    """Return plain boards in front of the walls, at a height at which they fill `uncovered` of a photo.
-
-    Args:
-        uncovered: share of a photo without points; NaN or below the limit of the skybox: no boards.
-        base: gives place and walk.
-        half_height: tangent of half the vertical angle of a photo.
-        zoom: the least.
-    """
-    if not uncovered >= UNCOVERED:
-        return ()
-    uncovered = _clear(uncovered, UNCOVERED, MISSED_BARE)
-    plan, eye = PLANS[base.world.place], float(np.mean(base.eye_m))
-    tilt = 0.02 if base.walk == "outward" else -0.06  # slope of the cameras' axes
-    foot = eye + BACKDROP_M * (half_height * (1 - 2 * uncovered / BARE) + tilt)
-    if foot >= plan.wall_m:
-        return ()  # the sky above the walls is enough
-    foot = round(max(foot, LOWEST_M), 1)
-    top = round(float(np.clip(eye + BACKDROP_M * half_height / zoom - foot, 1, 12)), 1)
-    (left, right), (front, back), (x, y) = plan.x_m, plan.y_m, plan.middle
-    walls = {  # place, width, turn; a little in front of the wall
-        "wall_back": (x, back - BEFORE_M, right - left, 0.0),
-        "wall_left": (left + BEFORE_M, y, back - front, 90.0),
-        "wall_right": (right - BEFORE_M, y, back - front, -90.0),
-        "wall_front": (x, front + BEFORE_M, right - left, 180.0),
-    }
-    chosen = (walls[name] for name in plan.walls)
-    return tuple(
-        Thing(
-            "board", "enamel", (round(at_x, 2), round(at_y, 2), foot), (min(long, 12.0), 0.1, top), yaw, PALE
-        )
-        for at_x, at_y, long, yaw in chosen
-    )
 
 
 def _lines(of: Likeness, spec: CaptureSpec, factor: int) -> Iterator[str]:
@@ -317,10 +270,6 @@ def _lines(of: Likeness, spec: CaptureSpec, factor: int) -> Iterator[str]:
     )
     yield line("arc of the directions", of.arc_deg, "degrees", f"arc_deg {spec.arc_deg:g}")
     yield line("pixel size", seen.sampling, "times", f"zoom {list(spec.zoom)}")
-    plain = (
-        f"plain boards {spec.world.things[0].at_m[2]:g} m above the ground" if spec.world.things else "none"
-    )
-    yield line("uncovered", seen.uncovered, "of the pixels", plain)
     yield line("gains", seen.exposure, "of the colour range", settings("exposure_drift"))
     yield line("spread at a point", seen.appearance, "of the colour range", settings("time_of_day"))
     yield line("colour by direction", seen.view_dependence, "of the colour range", "not simulated")

@@ -52,18 +52,6 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
     return surface(columns, rows).astype(np.float32)
 
 
-def has_surface(camera: Camera, points: np.ndarray) -> np.ndarray | None:
-    """Where `inverse_depth` finds a surface, [h, w] bool, from the sparse points [M, 3] around the frame.
-
-    `static_surfaces` chooses its points from the whole scene, so that a photo of a large scene has few of
-    them.
-    """
-    xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    shape = map_size(camera)
-    surface = inverse_depth(camera, some_points(points[_around(*in_map(camera, xyz, shape), shape)]))
-    return None if surface is None else np.isfinite(surface)
-
-
 def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarray | None]:
     """`inverse_depth` of every camera, from all sparse points [M, 3] of a scene."""
     some = some_points(xyz)

@@ -79,8 +79,8 @@ def synthetic(*, exposure=0.0, place=0.0, zoom=1.0, shine=0.0, seed=0):
 
 
 def measured(**kw):
-    """As of many photos that the scene fills; here are few, to be quick, and dots leave gaps."""
-    return dataclasses.replace(measure(*synthetic(**kw)), photos=FEW_PHOTOS + 1, uncovered=0.0)
+    """As of many photos; here are few, to be quick."""
+    return dataclasses.replace(measure(*synthetic(**kw)), photos=FEW_PHOTOS + 1)
 
 
 def decisions(**kw):
@@ -97,8 +97,8 @@ INJECTED = {
 @pytest.mark.parametrize("seed", [0, 1])
 def test_nothing_is_called_for_where_nothing_was_put_in(seed):
     found = decisions(seed=seed)
-    off = dict.fromkeys([*INJECTED, "skybox", "dense"], "off")
-    assert {name: d.decision for name, d in found.items()} == off
+    off = dict.fromkeys([*INJECTED, "dense"], "off")
+    assert {name: d.decision for name, d in found.items()} == {**off, "skybox": "on"}
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_nothing_is_called_for_where_nothing_was_put_in(seed):
 )  # no effect is for a colour that follows the direction
 def test_what_was_put_in_is_called_for_and_nothing_else(effect):
     answers = {name: d.decision for name, d in decisions(**INJECTED.get(effect, {"shine": 0.25})).items()}
-    assert {name for name, a in answers.items() if a == "on"} == {effect} & {*INJECTED}
+    assert {name for name, a in answers.items() if a == "on"} == {effect} & {*INJECTED} | {"skybox"}
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_what_was_put_in_is_called_for_and_nothing_else(effect):
 def test_few_photos_call_for_a_dense_start(photos, answer):
     plan = decide("dots", dataclasses.replace(measured(), photos=photos))
     assert [d.decision for d in plan.decisions if d.effect == "dense"] == [answer]
-    assert plan.effects() == (("dense",) if answer == "on" else ())
+    assert plan.effects() == (("dense",) if answer == "on" else ("skybox",))
     assert (
         choose("auto", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
         == plan.effects()
@@ -131,54 +131,10 @@ def test_cameras_in_the_middle_of_a_place_call_for_a_dense_start(outward, dense)
     assert shown == ((outward, OUTWARD, "times") if dense == "on" else (25, FEW_PHOTOS, "photos"))
 
 
-@pytest.mark.parametrize(("uncovered", "skybox"), [(0.06, "off"), (0.11, "on"), (math.nan, "unknown")])
-def test_what_lies_behind_the_scene_calls_for_a_skybox(uncovered, skybox):
-    plan = decide("dots", dataclasses.replace(measured(), uncovered=uncovered))
-    assert [d.decision for d in plan.decisions if d.effect == "skybox"] == [skybox]
-    assert plan.effects() == (("skybox",) if skybox == "on" else ())
-    chosen = choose("auto", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"]
-    assert chosen.effects == plan.effects()
-
-
 def test_a_dense_start_takes_the_room_of_a_skybox():
-    plan = decide("dots", dataclasses.replace(measured(), uncovered=0.5, photos=FEW_PHOTOS))
-    assert plan.effects() == ("dense",)
+    plan = decide("dots", dataclasses.replace(measured(), photos=FEW_PHOTOS))
     (line,) = (d for d in plan.decisions if d.effect == "skybox")
     assert line.decision == "off" and "dense start" in line.why
-
-
-def test_the_uncovered_share_is_where_no_points_lie():
-    scene, _ = synthetic()
-    share = effects_plan.uncovered(scene)
-    corners = scene.points.xyz[np.abs(scene.points.xyz).max(axis=1) > 0.5]
-    wide = np.concatenate([corners * 40 + [0, 0, 60.0], scene.points.xyz])  # a far wall behind the dots
-    assert 0.3 < share < 0.8
-    assert effects_plan.uncovered(with_points(scene, wide)) < share / 2
-    assert math.isnan(effects_plan.uncovered(dataclasses.replace(scene, views=())))
-
-
-def with_points(scene, xyz):
-    count = len(xyz)
-    points = dataclasses.replace(
-        scene.points, xyz=xyz, rgb=np.zeros((count, 3), np.uint8), error_px=np.zeros(count),
-        track_offsets=np.zeros(count + 1, np.int64), track_views=np.zeros(0, np.int32),
-        track_xy=np.zeros((0, 2), np.float32),
-    )  # fmt: skip
-    return dataclasses.replace(scene, points=points)
-
-
-def test_a_long_strip_is_as_covered_as_a_short_one():
-    scene, _ = synthetic()
-    wall = np.random.default_rng(0).uniform((-9, -9, 3), (9, 9, 3.01), (4000, 3))
-    short = with_points(scene, wall)
-    elsewhere = np.full((400_000, 3), [1000.0, 0.0, 3.0])  # what other photos look at
-    long = with_points(scene, np.concatenate([wall, elsewhere]))
-    assert effects_plan.uncovered(long) == effects_plan.uncovered(short) < 0.05
-
-
-def test_with_hardly_any_points_nothing_is_said_of_the_background():
-    scene, _ = synthetic()
-    assert math.isnan(effects_plan.uncovered(with_points(scene, scene.points.xyz[:5])))
 
 
 def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
@@ -214,7 +170,7 @@ def test_cameras_at_one_place_look_neither_inward_nor_outward(jitter):
         measured(), outward=effects_plan.outward(dataclasses.replace(scene, views=tuple(views)))
     )
     assert math.isnan(found.outward)
-    assert decide("dots", found).effects() == ()
+    assert decide("dots", found).effects() == ("skybox",)
 
 
 def test_what_stands_before_points_is_no_light_that_differs_by_place(monkeypatch):
@@ -246,7 +202,7 @@ def test_a_scene_without_tracks_reads_no_photo_and_says_unknown(tmp_path):
     empty = dataclasses.replace(scene.points, track_views=np.full_like(scene.points.track_views, -1))
     plan = plan_effects(dataclasses.replace(scene, points=empty))
     answers = {d.effect: d.decision for d in plan.decisions}
-    assert answers.pop("skybox") == "on"  # that asks where points lie, not who saw them
+    assert answers.pop("skybox") == "on"
     assert set(answers.values()) == {"unknown"}
     assert plan.effects() == ("skybox",)
 
@@ -257,7 +213,7 @@ def test_a_plan_survives_its_file(tmp_path):
     write_json(tmp_path / "plan.json", plan.plain())
     again = read_plan(tmp_path / "plan.json")
     assert again.plain() == plan.plain()
-    assert again.effects() == ("antialias",)
+    assert again.effects() == ("antialias", "skybox")
     assert [d.cost_ms for d in again.decisions if d.effect == "antialias"] == [0.5]
     for text in (
         "{half",
@@ -327,7 +283,7 @@ def test_every_method_that_can_takes_the_effects_of_the_scene():
     methods = [get_method(name) for name in ("3dgs", "refinesplat", "refinesplat@mask=truth")]
     program = dataclasses.replace(get_method("3dgs"), name="theirs", program=object())
     chosen = choose("auto", scene, [*methods, program], plan)
-    assert {chosen[m.name].effects for m in methods} == {("exposure", "antialias")}
+    assert {chosen[m.name].effects for m in methods} == {("exposure", "antialias", "skybox")}
     assert chosen["theirs"].effects == () and not chosen["theirs"].asked
     assert choose("poses", scene, [*methods, program], plan)["theirs"].effects == ()
     assert {c.effects for c in choose("none", scene, methods, plan).values()} == {()}
@@ -343,11 +299,9 @@ def tiny(tmp_path_factory):
 SHORT = TrainConfig(iterations=40, probes=0)
 
 
-def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny, monkeypatch):
-    monkeypatch.setattr(decide_module, "LEAST_PHOTOS", 1000)
-    monkeypatch.setattr(decide_module, "OUTWARD", -1.0)
+def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
     (none,) = plan_cells(["refinesplat"], [tiny], [0], SHORT)
-    (auto,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="auto")
+    (auto,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="auto", plan=Plan("scene", ()))
     (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
     assert none.identity == auto.identity != listed.identity
     assert none.config == auto.config
@@ -359,10 +313,10 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     (report,) = run_cells(cells, tmp_path, pictures=False)
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
-    assert said["asked"] == "auto" and said["effects"] == ["antialias"]
+    assert said["asked"] == "auto" and said["effects"] == ["antialias", "skybox"]
     assert {d["effect"] for d in said["plan"]["decisions"]} == {*INJECTED, "skybox", "dense"}
     facts = report.result["facts"]
-    assert facts["effects"] == ["antialias"] and facts["protocol"] == "half"
+    assert facts["effects"] == ["antialias", "skybox"] and facts["protocol"] == "half"
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0
     assert not any(math.isnan(row["psnr"]) for row in report.result["per_image"])
     with pytest.raises(AwError, match="effects was"):

@@ -19,7 +19,7 @@ from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec
 from ambiguous_wild.simulate.tracer import linear_to_srgb
 from tests.command_line import aw
 
-PLAIN = Evidence(0.0, 0.01, 1.2, 0.004, 5000, photos=30, outward=0.5, uncovered=0.02)
+PLAIN = Evidence(0.0, 0.01, 1.2, 0.004, 5000, photos=30, outward=0.5)
 LIKENESS = Likeness("a.scene", 4, (240, 180), 4, 0.6, 100.0, PLAIN, 0.0, 0.0, (0.0, 0.001, 0.004))
 
 
@@ -74,17 +74,6 @@ def test_zoom_adds_what_the_walk_lacks() -> None:
     low, high = spec_like(replace(LIKENESS, evidence=replace(PLAIN, sampling=2.6))).spec.zoom
     assert low * high == pytest.approx(1, abs=0.02) and 3.2 < high / low < 4.2
     assert spec_like(replace(LIKENESS, evidence=replace(PLAIN, sampling=40.0))).spec.zoom == (0.5, 4.0)
-
-
-def test_plain_boards_are_the_lower_the_more_is_uncovered_and_bar_no_distractor() -> None:
-    feet = []
-    for share in (0.1, 0.2, 0.4):
-        of = replace(LIKENESS, focal=0.8, evidence=replace(PLAIN, uncovered=share))
-        things = spec_like(of).spec.world.things
-        feet.append(things[0].at_m[2] if things else math.inf)
-    wide = replace(of, focal=0.3, evidence=replace(of.evidence, sampling=9.0, outward=7.0))
-    assert len(spec_like(wide).spec.world.things) == 4  # within the limits of a spec
-    assert feet == sorted(feet, reverse=True) and feet[-1] == 2.0 and feet[0] > feet[-1]
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 104.0, 300.0])

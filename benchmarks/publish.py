@@ -1,0 +1,101 @@
+"""The published figures of quality, made anew: captures, scenes, runs, board. Stops and goes on.
+
+    python benchmarks/publish.py --work DIR [--data DIR] [--seeds 0 1 2] [--methods ...] [--iterations 1000]
+        [--jobs 2] [--only NAME...]
+
+Captures: presets of `aw simulate`, and distractors pasted on the photos of --data before structure from
+motion (`aw composite`). --data holds a folder of photos for each base, and cutouts/; without it no
+composites are made. All methods of a scene train with the effects of its plan. Checked runs go
+to the board, leaderboard/measured; then `python benchmarks/figures.py` writes the tables from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from job_queue import Run, aw, count, exit_code, run_all, seed
+
+ROOT = Path(__file__).parents[1]
+PRESETS = (
+    *(f"courtyard-{kind}" for kind in ("plain", "colour", "twin", "thin", "sparse", "crowd", "clean")),
+    "room-colour",
+    "yard-cars",
+)
+BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "skull": 5}  # downsampling to about 240 px
+KINDS = ("cutouts", "patches")
+METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
+WORLD = 5  # seed of worlds and of pasted distractors; nothing was tuned on it
+
+
+@dataclass(frozen=True)
+class Capture:
+    """How the photos of a scene are made."""
+
+    name: str
+    dataset: str
+    factor: int
+    words: tuple[str, ...]  # of `aw`, all but the output
+
+    def build(self, work: Path) -> Path:
+        """The scene folder; it is built if it is not there."""
+        raw, scene = work / "raw" / self.name, work / "scenes" / self.name
+        if not (scene / "scene.json").is_file():
+            print(f"making {self.name}", flush=True)
+            if not raw.is_dir():
+                aw(*self.words, "-o", str(raw))
+            aw("build-scene", str(raw), "-o", str(scene), "--factor", str(self.factor))
+        return scene
+
+
+def captures(data: Path | None) -> Iterator[Capture]:
+    """All captures; those of real photos only with a folder of photos."""
+    for name in PRESETS:
+        words = ("simulate", name, "--width", "480", "--seed", str(WORLD))
+        yield Capture(name, "simulated", 2, words)
+    for base, factor in BASES.items() if data is not None else ():
+        for kind in KINDS:
+            words = ("composite", str(data / base), "--seed", str(WORLD))
+            words += ("--cutouts", str(data / "cutouts")) if kind == "cutouts" else ("--patches",)
+            yield Capture(f"{base}-{kind}", "composites", factor, words)
+
+
+def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
+    """A run for each method and seed."""
+    for number in args.seeds:
+        words = ("--scene", str(scene), "--seed", str(number), "--iterations", str(args.iterations))
+        words += ("--device", "cpu", "--threads", "1", "--no-pictures", "-o", str(args.work / "runs"))
+        for method in args.methods:
+            folder = args.work / "runs" / scene.name / method / f"seed{number}"
+            yield Run(f"{method} on {scene.name}, seed {number}", folder, method, words)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--work", type=Path, required=True, help="captures, scenes and runs")
+    parser.add_argument("--data", type=Path, help="real photos, a folder for each base, and cutouts/")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="captures to make; all by default")
+    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2])
+    parser.add_argument("--iterations", type=count, default=1000)
+    parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
+    parser.add_argument("--board", type=Path, default=ROOT / "leaderboard")
+    args = parser.parse_args(words)
+    chosen = [c for c in captures(args.data) if args.only is None or c.name in args.only]
+    scenes = {capture: capture.build(args.work) for capture in chosen}
+    failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
+    for capture in scenes:
+        # the photos of the bases may not be passed on
+        images = "1" if capture.dataset == "simulated" else "0"
+        add = ("leaderboard", "add", str(args.work / "runs" / capture.name), "--board", str(args.board))
+        print(aw(*add, "--dataset", capture.dataset, "--images", images, "--overwrite"), end="", flush=True)
+    for line in failed:
+        print(f"failed: {line}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(main))

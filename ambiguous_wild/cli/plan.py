@@ -132,5 +132,7 @@ def _row(d: Decision) -> tuple[str, ...]:
     found = "—" if math.isnan(d.value) else f"{d.value:.3g}"
     gain = "—" if d.gain_db is None else f"{d.gain_db:+.2f} ± {d.error_db:.2f} dB"
     cost = "—" if d.cost_ms is None else f"{d.cost_ms:+.2f}"
-    limit = f"{'at most' if d.unit == 'photos' else 'from'} {d.threshold:g}"
+    limit = (
+        f"{'at most' if d.effect in ('dense', 'skybox') and d.unit != 'times' else 'from'} {d.threshold:g}"
+    )
     return d.effect, d.decision, found, limit, gain, cost

@@ -357,9 +357,14 @@ def _skybox(dense: Decision) -> Decision:
 
     It gains in courtyards and rooms too, where SfM found points nearly everywhere (docs/notes/effects.md).
     """
-    on = dense.decision != "on"
-    why = "what lies behind is not left to haze" if on else "a dense start fills the room for first Gaussians"
-    return replace(dense, effect="skybox", decision="on" if on else "off", why=why, how="--effects skybox")
+    taken = dense.decision == "on"
+    why = (
+        "a dense start fills the room for first Gaussians"
+        if taken
+        else "haze must not explain what lies behind"
+    )
+    return Decision("skybox", "number of dense starts", float(taken), 0.0, "dense starts",
+                    "off" if taken else "on", why, "--effects skybox")  # fmt: skip
 
 
 def plan_effects(scene: Scene) -> Plan:

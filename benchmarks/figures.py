@@ -26,7 +26,7 @@ GROUPS = {
     "drone photos, 40": ("seneca-",),
     "tree by phone, 23": ("monstree-",),
     "facade, 11": ("sceaux-",),
-    "skull, dark, flash, 30": ("skull-",),
+    "drone photos, 12": ("tiny_aerial-",),
 }
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 

@@ -25,7 +25,7 @@ PRESETS = (
     "room-colour",
     "yard-cars",
 )
-BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "skull": 5}  # downsampling to about 240 px
+BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "tiny_aerial": 2}  # downsampling to 240 px and more
 KINDS = ("cutouts", "patches")
 METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
 WORLD = 5  # seed of worlds and of pasted distractors; nothing was tuned on it

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from torch import Tensor
 
-from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel, threads
+from ambiguous_wild.splat.cpu.compile import inner_kernel, kernel, parallel_kernel, threads
 from ambiguous_wild.splat.cpu.simd import (
     any_lane,
     fma,
@@ -37,26 +37,26 @@ _TINY_M = np.float32(1e-30)
 _TINY_V = np.float32(1.2e-38)
 
 
-@kernel
+@inner_kernel
 def _moments(m, v, g):
     m = fma(g, _REST1, m * _BETA1)
     v = fma(g * g, _REST2, v * _BETA2)
     return select(magnitude(m) >= _TINY_M, m, np.float32(0.0)), select(v >= _TINY_V, v, np.float32(0.0))
 
 
-@kernel
+@inner_kernel
 def _change(m, v, rate, root):
     """rate m / (sqrt(v) root + EPS), with rate = lr / bias1 and root = 1 / sqrt(bias2)."""
     return m * rate / fma(square_root(v), root, _EPS)
 
 
-@kernel
+@inner_kernel
 def _read(array, at, count):
     """Read up to 16 values; without a mask if there are 16: a step takes 0.3 ms, with masks 0.6 ms."""
     return load(array, at) if count == 16 else load_some(array, at, count)
 
 
-@kernel
+@inner_kernel
 def _write(array, at, value, count):
     """Write up to 16 values, as `_read`."""
     if count == 16:
@@ -65,7 +65,7 @@ def _write(array, at, value, count):
         store_some(array, at, value, count)
 
 
-@kernel
+@inner_kernel
 def _dense_range(begin, end, p, m, v, g, rate, root):
     """Step the values begin .. end - 1 of flat arrays."""
     for at in range(begin, end, 16):
@@ -92,7 +92,7 @@ def dense(p, m, v, g, rate, root, parts):
         _dense_part(part, parts, p, m, v, g, rate, root)
 
 
-@kernel
+@inner_kernel
 def _advance(p, m, v, at, count, first, last, rates, roots):
     """Take steps first .. last - 1, with gradient zero, for up to 16 values from flat index `at`."""
     value = _read(p, at, count)
@@ -117,7 +117,7 @@ def _advance(p, m, v, at, count, first, last, rates, roots):
     _write(v, at, square, count)
 
 
-@kernel
+@inner_kernel
 def _row_catch_up(row, width, p, m, v, last, now, rates, roots):
     if last[row] < now:
         for at in range(row * width, row * width + width, 16):

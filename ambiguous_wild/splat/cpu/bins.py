@@ -32,7 +32,7 @@ from ambiguous_wild.splat.cpu.project import (
     VARIANCE_X,
     VARIANCE_Y,
 )
-from ambiguous_wild.splat.cpu.simd import prefetch
+from ambiguous_wild.splat.cpu.simd import ceiling, floor, prefetch
 
 TILE = 16  # px, width and height; a row of a tile is one vector
 PARTS = 16  # work items of the parallel loops over ranks
@@ -98,13 +98,13 @@ def depth_order(slots, records):
 def first_pixel(border, size):
     """Return the first pixel whose centre is not before `border`: at least 0, past the end if none."""
     # bounded before conversion to an integer: for a distant centre, centre - extent can round to any value
-    return math.ceil(min(max(border - 0.5 - _SLACK, 0.0), size + TILE))
+    return ceiling(min(max(border - 0.5 - _SLACK, 0.0), size + TILE))
 
 
 @kernel
 def last_pixel(border, size):
     """Return the last pixel whose centre is not behind `border`: at most size - 1, negative if none."""
-    return math.floor(max(min(border - 0.5 + _SLACK, size - 1.0), -1.0))
+    return floor(max(min(border - 0.5 + _SLACK, size - 1.0), -1.0))
 
 
 @kernel
@@ -261,8 +261,8 @@ def pixel_centres():
 @kernel
 def _block_range(middle, extent):
     """Return the first block, and one past the last, with pixel centres within `extent` of `middle`."""
-    low = math.ceil(middle - extent - np.float32(0.501))
-    high = math.floor(middle + extent - np.float32(0.499))
+    low = ceiling(middle - extent - np.float32(0.501))
+    high = floor(middle + extent - np.float32(0.499))
     return np.int64(max(low, 0)) // SIDE, np.int64(min(high, TILE - 1)) // SIDE + 1
 
 

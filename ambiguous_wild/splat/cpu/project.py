@@ -20,7 +20,7 @@ import math
 import numba
 import numpy as np
 
-from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
+from ambiguous_wild.splat.cpu.compile import fused_inner_kernel, fused_kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.simd import (
     LANES,
     at_least,
@@ -65,7 +65,7 @@ def basis(x, y, z, degree, out):
         out[14] = -C3[0] * x * (x * x - 3.0 * y * y)
 
 
-@fused_kernel
+@fused_inner_kernel
 def direction_gradient(x, y, z, degree, d):
     """Return sum_j d[j] * d(basis j)/d(x, y, z), for harmonics as polynomials of three free variables."""
     gx = -C1 * d[2]
@@ -208,7 +208,7 @@ def footprint(quat, cam, x, y, z):
     return p, q, a, b, (r00, r01, r02, r10, r11, r12, r20, r21, r22)
 
 
-@fused_kernel
+@fused_inner_kernel
 def take(given, k, i, means, quats, log_scales, opacity_logits):
     """Put Gaussian i into column k of `given` [>= 11, GROUP]."""
     given[0, k] = means[i, 0]

@@ -21,7 +21,7 @@ from ambiguous_wild.splat.cpu.blend import (
     SUM_RED,
     SUM_SQUARED,
 )
-from ambiguous_wild.splat.cpu.compile import fused_kernel, parallel_kernel
+from ambiguous_wild.splat.cpu.compile import fused_inner_kernel, fused_kernel, parallel_kernel
 from ambiguous_wild.splat.cpu.project import (
     BLUE,
     C0,
@@ -98,7 +98,7 @@ def _quaternion_gradient(quat, norm, g):
     return (dw - w * along) / norm, (dx - x * along) / norm, (dy - y * along) / norm, (dz - z * along) / norm
 
 
-@fused_kernel
+@fused_inner_kernel
 def _reverse_eight(given, at, cam, antialias, gradients):
     """Compute gradients [16, GROUP] from the sums of columns at .. at + 7 of `given` [18, GROUP].
 
@@ -171,7 +171,7 @@ def _reverse_eight(given, at, cam, antialias, gradients):
     store(gradients, 2 * GROUP + at, cam[2] * cx + cam[6] * cy + cam[10] * cz)
 
 
-@fused_kernel
+@fused_inner_kernel
 def _reverse_harmonics(i, colour, means, sh_rest, degree, centre, values, weights, d_sh_rest):
     """Chain dL/d(red, green, blue) to the harmonics of Gaussian i; returns their part of dL/dmean."""
     terms = (degree + 1) * (degree + 1) - 1
@@ -211,7 +211,7 @@ def _mark(first, stop, n, ids, sh, dirty):
         dirty[i] = seen[i - first]
 
 
-@fused_kernel
+@fused_inner_kernel
 def _write(
     i, k, total, gradients, colour, screen, screen_extra, screen_abs, tally, d_means, d_quats, d_log_scales,
     d_opacity_logits, d_sh0,

@@ -81,10 +81,11 @@ def _call(builder: Any, name: str, result: Any, arguments: Sequence[Any]) -> Any
 
 
 def _lanewise(builder: Any, name: str, *arguments: Any) -> Any:
-    """Call a function of LLVM that works lane by lane."""
-    vector = arguments[0].type
-    width = "f32" if vector.element == _F32 else "f64"
-    return _call(builder, f"llvm.{name}.v{vector.count}{width}", vector, arguments)
+    """Call a function of LLVM that works lane by lane, or on a scalar."""
+    kind = arguments[0].type
+    count = f"v{kind.count}" if isinstance(kind, ir.VectorType) else ""
+    width = "f32" if getattr(kind, "element", kind) == _F32 else "f64"
+    return _call(builder, f"llvm.{name}.{count}{width}", kind, arguments)
 
 
 def _operator(op: Any, emit: Any, *, compares: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Later masks cover no more of a photo than its first look allows."""
+"""Later masks cover no more of a photo than its first look allows, in a crowd no other pixels."""
 
 import dataclasses
 
@@ -24,3 +24,14 @@ def test_a_mask_is_limited_by_the_photos_first_look(scene):
             (policy.keep(step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3))) == 0).float().mean()
         )
     assert shares[1] <= GAPS * policy.looks[1].most < shares[0], shares
+
+
+def test_in_a_crowd_nothing_is_masked_that_the_first_look_keeps(scene):
+    mask, outside = dataclasses.replace(FAST.mask, ceiling_least=0.0), []
+    for crowd in (0.0, 1.0):  # the share from which there is one
+        look = dataclasses.replace(FAST.first_look, crowd=crowd, least=0.0, most=0.0)
+        policy = fresh(scene, dataclasses.replace(FAST, mask=mask, first_look=look))
+        masked = policy.keep(step_of(scene.data, 1, torch.zeros(HEIGHT, WIDTH, 3))) == 0
+        assert masked.any()
+        outside.append(bool((masked & (policy.first[1] > 0.5)).any()))
+    assert outside == [False, True]

@@ -90,6 +90,8 @@ class FirstLook:
     least: float  # if a smaller share of the photo would be masked, nothing is
     weight: float  # largest factor of later evidence
     most: float = 1.0  # largest share of the photo that later masks cover
+    # in a crowd later masks lie within those of the first look: the ground between people shows in few photos
+    within: bool = False
 
     def keep(self, shape: tuple[int, int]) -> np.ndarray | None:
         """Return the pixels that are kept at first, [H, W] bool; None if all are."""
@@ -167,9 +169,12 @@ def first_look(
         before, answers = answers, [answer(view, views, answers, answers) for view in everything]
         if _changed(before, answers) < _SETTLED:
             break
-    weight = config.crowd_weight if masked_share(answers) >= config.crowd else config.weight
+    crowd = masked_share(answers) >= config.crowd
+    weight = config.crowd_weight if crowd else config.weight
     return [
-        None if passing is None else FirstLook(passing, config.least, weight, _most(passing, inverse, config))
+        None
+        if passing is None
+        else FirstLook(passing, config.least, weight, _most(passing, inverse, config), crowd)
         for passing, inverse in zip(answers, surfaces, strict=True)
     ]
 

@@ -235,6 +235,12 @@ class MaskStore:
             for view, look in looks.items()
             if look.weight != 1
         }
+        # view -> pixels outside of which nothing is masked, [H, W] bool; absent if there is no such limit
+        self.within = {
+            view: torch.from_numpy(~keep).to(device)
+            for view, look in looks.items()
+            if look.within and (keep := look.keep(photos[view].shape[:2])) is not None
+        }
         self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
         self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] float32, if it has one
         wide, views = torch.float64, len(photos)
@@ -293,6 +299,8 @@ class MaskStore:
             seen, ceiling = self.pixels.seen[view], self.pixels.ceiling(unit)
         else:
             maps = self.compare(step)
+        if view in self.within:
+            seen = self.within[view] if seen is None else seen & self.within[view]
         w2 = torch.sigmoid(self.theta) if mask.w2 is None else mask.w2
         others = self.means, self.distances
         return maps, make_masks(view, maps, self.labels, others, w2, mask, ceiling, seen)

@@ -86,6 +86,8 @@ def explain(policy: Policy, step: Step, x: int, y: int) -> list[str]:
     static = store.labels.static.get(view)
     if structure and seen is not None and not bool(seen[y, x]):
         return ["too few other photos see this surface: never masked"]
+    if view in store.within and not bool(store.within[view][y, x]):
+        return ["first look at the photos before training: a crowd, but not this pixel; never masked"]
     own = float(enlarge(maps.statistic, *shape)[y, x])
     what = "difference in structure, in units of what noise causes" if structure else config.statistic
     lines = [f"evidence of the pixel: {own:.2f} ({what})"]

@@ -83,12 +83,15 @@ def kernel(function: Callable[..., Any]) -> Any:
     return forgiving(numba.njit(cache=True, error_model="numpy")(function))
 
 
+_njit: Any = numba.njit  # `_nrt` is an option without a documented type
+
+
 def inner_kernel(function: Callable[..., Any]) -> Any:
     """Like `kernel`, for what a kernel calls often; it may not make arrays.
 
     References to arrays are not counted: two atomic operations for each array of a call took 40 % of Adam.
     """
-    return forgiving(numba.njit(cache=True, error_model="numpy", _nrt=False)(function))
+    return forgiving(_njit(cache=True, error_model="numpy", _nrt=False)(function))
 
 
 def fused_kernel(function: Callable[..., Any]) -> Any:
@@ -103,7 +106,7 @@ def fused_inner_kernel(function: Callable[..., Any]) -> Any:
     """Like `fused_kernel` and `inner_kernel`, and compiled into its caller."""
     fast = {"contract", "arcp"}
     return forgiving(
-        numba.njit(cache=True, error_model="numpy", fastmath=fast, _nrt=False, forceinline=True)(function)
+        _njit(cache=True, error_model="numpy", fastmath=fast, _nrt=False, forceinline=True)(function)
     )
 
 

@@ -65,7 +65,7 @@ def test_a_run_that_fails_is_in_the_report_and_the_next_one_runs(scene, tmp_path
 
     monkeypatch.setattr(Trainer, "step", breaks)
     lines = []
-    report = small(scene, tmp_path / "runs", seeds=[0, 1], callbacks=Lines(lines.append))
+    report = small(scene, tmp_path / "runs", seeds=[0, 1], effects="none", callbacks=Lines(lines.append))
     assert [run.outcome for run in report.runs] == ["failed", "trained"]
     assert (
         report.failed[0].error.startswith("RuntimeError: shapes differ; traceback: ")

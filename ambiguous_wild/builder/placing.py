@@ -273,11 +273,12 @@ class Placement:
         mapper.complete_and_merge_tracks(options.triangulation)
         for error in (LOOSE_PX, TIGHT_PX) if final else (LOOSE_PX,):
             options.mapper.filter_max_reproj_error = error
+            careful = final and (error == TIGHT_PX or len(self.poses) <= DIRECT)
             mapper.iterative_global_refinement(
-                ADJUSTMENTS if final else 1,
+                ADJUSTMENTS if careful else 1,
                 STILL,
                 options.mapper,
-                adjustment_options(matched.distorted, len(self.poses), final=final),
+                adjustment_options(matched.distorted, len(self.poses), final=careful),
                 options.triangulation,
             )
         mapper.end_reconstruction(False)

@@ -37,7 +37,7 @@ ROUNDS = 8  # rounds of placing anew, besides those that only add photos
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
-DIRECT = 100  # photos above which adjustments are solved iteratively: direct ones grow as their square
+DIRECT = 100  # photos above which adjustments are solved iteratively; 200: in half of the time
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 ADJUSTMENTS, STILL = 3, 2e-3  # joint adjustments at most; share of changed observations that ends them
 

@@ -97,7 +97,7 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
         neighbours=5 if many else 2,
         growth=2.0,
         refinements=1,
-        # Every photo is placed anew after this; more rounds changed no pose and took most of the time.
+        # All photos are placed anew afterwards, and of many the last digits cost most of the time.
         tolerance=1e-4 if len(photos) > ALL_PAIRS else 0.0,
         local_refinements=1,
         local_cameras=4,

@@ -367,8 +367,8 @@ def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
     options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
     if photos > DIRECT:
         options.ceres.auto_select_solver_type = False
-        options.ceres.solver_options.linear_solver_type = "ITERATIVE_SCHUR"
-        options.ceres.solver_options.preconditioner_type = "SCHUR_JACOBI"
+        solver: Any = options.ceres.solver_options  # its enumerations take names
+        solver.linear_solver_type, solver.preconditioner_type = "ITERATIVE_SCHUR", "SCHUR_JACOBI"
     return options
 
 

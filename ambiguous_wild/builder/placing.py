@@ -37,6 +37,7 @@ ROUNDS = 8  # rounds of placing anew, besides those that only add photos
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
+DIRECT = 100  # photos above which adjustments are solved iteratively; 200: in half of the time
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 ADJUSTMENTS, STILL = 3, 2e-3  # joint adjustments at most; share of changed observations that ends them
 
@@ -113,7 +114,7 @@ class Placement:
             config.add_image(number)
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(
-            adjustment_options(self.matched.distorted, final=True), config, self.model
+            adjustment_options(self.matched.distorted, len(self.poses), final=True), config, self.model
         )
         adjuster.solve()
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
@@ -272,11 +273,12 @@ class Placement:
         mapper.complete_and_merge_tracks(options.triangulation)
         for error in (LOOSE_PX, TIGHT_PX) if final else (LOOSE_PX,):
             options.mapper.filter_max_reproj_error = error
+            careful = final and (error == TIGHT_PX or len(self.poses) <= DIRECT)
             mapper.iterative_global_refinement(
-                ADJUSTMENTS if final else 1,
+                ADJUSTMENTS if careful else 1,
                 STILL,
                 options.mapper,
-                adjustment_options(matched.distorted, final=final),
+                adjustment_options(matched.distorted, len(self.poses), final=careful),
                 options.triangulation,
             )
         mapper.end_reconstruction(False)
@@ -353,7 +355,7 @@ def plausible(model: Any) -> bool:
     return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
 
 
-def adjustment_options(distorted: bool, *, final: bool) -> Any:
+def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
     """Return options of a joint adjustment on one thread in which a match that does not fit counts little."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = distorted
@@ -363,6 +365,10 @@ def adjustment_options(distorted: bool, *, final: bool) -> Any:
     options.ceres.solver_options.max_num_iterations = 50 if final else 10
     options.ceres.solver_options.function_tolerance = 1e-6 if final else 1e-4
     options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
+    if photos > DIRECT:
+        options.ceres.auto_select_solver_type = False
+        solver: Any = options.ceres.solver_options  # its enumerations take names
+        solver.linear_solver_type, solver.preconditioner_type = "ITERATIVE_SCHUR", "SCHUR_JACOBI"
     return options
 
 

@@ -25,6 +25,7 @@ RATIO = 0.8  # of the angle to the nearest descriptor over that to the second ne
 FARTHEST = 0.7  # radians between two descriptors that match
 CHANCE = 5  # matches that may be chance: with fewer, only the best pairs of a photo are kept
 KEPT = 4  # number of these best pairs
+FAR, FAR_LEAST = 0.5, 20  # share of partners that are far, and their smallest number of matches
 WORDS = 64  # visual words
 SAMPLE = 20_000  # descriptors that the words are learnt from
 MOST = 1500  # descriptors of a photo that are used: the largest features come first in COLMAP
@@ -92,15 +93,21 @@ def most_similar(
     queries: Sequence[int],  # rows that look for partners
     among: Sequence[int],  # rows that may be partners
     count: int = SIMILAR,
+    far: int = 0,
 ) -> list[tuple[int, int]]:
-    """Return (query, partner) pairs, at most `count` a query, the most similar first; equal ones by row."""
+    """Return (query, partner) pairs, the most similar first; equal ones by row.
+
+    Each query gets at most `count`, and `far` more, ever farther from each other, of the more similar half.
+    """
     pool = np.array(among, np.intp)
+    ranks = np.union1d(np.arange(count), np.geomspace(count, max(count, len(pool) / 2), far).astype(int))
+    ranks = ranks[ranks < len(pool)]
     pairs: list[tuple[int, int]] = []
     for start in range(0, len(queries), _ROWS):
         chunk = np.array(queries[start : start + _ROWS], np.intp)
         alike = vectors[chunk] @ vectors[pool].T
         alike[chunk[:, None] == pool[None]] = -np.inf
-        best = np.argsort(-alike, axis=1, kind="stable")[:, :count]
+        best = np.argsort(-alike, axis=1, kind="stable")[:, ranks]
         for row, query in enumerate(chunk):
             pairs += [(int(query), int(pool[k])) for k in best[row] if np.isfinite(alike[row, k])]
     return pairs
@@ -119,7 +126,8 @@ def retrieval_pairs(
     """Pair each photo with those that share most features and with the next ones in the order of capture.
 
     Photos of a separate test set get no next ones. Up to `ALL_PAIRS` photos every pair is compared; above,
-    each photo is compared with the `SHORTLIST` times `similar` photos that have the most similar vectors.
+    each photo is compared with `SHORTLIST` times `similar` photos, most of them those with the most similar
+    vectors, and some of its partners are far.
 
     Args:
         read: returns the descriptors of a photo; called several times a name.
@@ -146,8 +154,10 @@ def retrieval_pairs(
     if len(names) <= ALL_PAIRS:
         listed = [(a, b) for a in asking for b in everyone if a != b]
     else:
-        listed = most_similar(embed(read, names, seed), asking, everyone, SHORTLIST * similar)
-    pairs |= best_partners(shared_features(read, names, listed, jobs), dict.fromkeys(asking, similar))
+        near = (SHORTLIST - 1) * similar
+        listed = most_similar(embed(read, names, seed), asking, everyone, near, similar)
+    spread = FAR if len(names) > ALL_PAIRS else 0.0
+    pairs |= best_partners(shared_features(read, names, listed, jobs), dict.fromkeys(asking, similar), spread)
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 
 
@@ -215,15 +225,27 @@ def _matches(a: np.ndarray, b: np.ndarray) -> int:
     return int(np.sum(mutual & (first < RATIO * second) & (first < FARTHEST)))
 
 
-def best_partners(shared: Mapping[tuple[int, int], int], wanted: Mapping[int, int]) -> set[tuple[int, int]]:
-    """Choose the best pairs of each photo, at most `wanted`, and at most `KEPT` that may be chance."""
+def best_partners(
+    shared: Mapping[tuple[int, int], int], wanted: Mapping[int, int], far: float = 0.0
+) -> set[tuple[int, int]]:
+    """Choose the best pairs of each photo, at most `wanted`, and at most `KEPT` that may be chance.
+
+    `far` is the share of pairs that are spread over all that are no chance, instead of the best: in a dense
+    capture the best are next to each other, and such a chain of short steps bends.
+    """
     partners: dict[int, list[tuple[int, int]]] = {}
     for (a, b), count in shared.items():
         partners.setdefault(a, []).append((-count, b))
         partners.setdefault(b, []).append((-count, a))
     best = set()
     for photo, most in wanted.items():
-        for rank, (minus, other) in enumerate(sorted(partners.get(photo, []))[:most]):
+        ranked = sorted(partners.get(photo, []))
+        sure = sum(-minus >= FAR_LEAST for minus, _ in ranked)
+        near = most - round(far * most)
+        if sure > most > near:
+            ranks = np.linspace(near, sure - 1, most - near).astype(int)
+            ranked = [*ranked[:near], *(ranked[k] for k in ranks)]
+        for rank, (minus, other) in enumerate(ranked[:most]):
             if -minus >= CHANCE or rank < KEPT:
                 best.add((min(photo, other), max(photo, other)))
     return best

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from ambiguous_wild.builder.records import PhotoRecord
-from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, NEIGHBOURS
+from ambiguous_wild.builder.retrieval import ALL_PAIRS, EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, NEIGHBOURS
 from ambiguous_wild.core.errors import AwError
 
 CameraMode = Literal["auto", "single", "per-device", "per-folder", "per-image"]
@@ -65,6 +65,7 @@ class SfmPlan:
     neighbours: int  # next photos in the order of capture, for "retrieval"
     growth: float  # all cameras are adjusted whenever the model has grown by this factor
     refinements: int  # rounds of such an adjustment, at most
+    tolerance: float  # relative change of the error that ends a round; 0: when the gradient is small
     local_refinements: int  # rounds of the adjustment after a photo was placed, at most
     local_cameras: int  # cameras in that adjustment: the new one and those that share most points with it
     continues: bool = False  # only photos left out so far look for partners, besides the pairs matched so far
@@ -96,6 +97,8 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
         neighbours=5 if many else 2,
         growth=2.0,
         refinements=1,
+        # All photos are placed anew afterwards, and of many the last digits cost most of the time.
+        tolerance=1e-4 if len(photos) > ALL_PAIRS else 0.0,
         local_refinements=1,
         local_cameras=4,
     )
@@ -110,6 +113,7 @@ def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
         neighbours=5,
         growth=1.1,
         refinements=5,
+        tolerance=0.0,
         local_refinements=2,
         local_cameras=6,
     )

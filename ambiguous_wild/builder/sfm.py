@@ -82,8 +82,9 @@ class MappingJob(TypedDict):
     output: str  # folder
     progress: str  # file that holds the number of placed photos
     mapper: str
-    growth: float  # of `SfmPlan`, as the three below
+    growth: float  # of `SfmPlan`, as the four below
     refinements: int
+    tolerance: float
     local_refinements: int
     local_cameras: int
     seed: int
@@ -306,6 +307,7 @@ def map_scene(
         "mapper": settings.mapper,
         "growth": plan.growth,
         "refinements": plan.refinements,
+        "tolerance": plan.tolerance,
         "local_refinements": plan.local_refinements,
         "local_cameras": plan.local_cameras,
         "seed": settings.seed,

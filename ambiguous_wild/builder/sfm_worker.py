@@ -358,6 +358,7 @@ def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: boo
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
     options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
     options.ba_global_max_refinements = job["refinements"]
+    options.ba_global_function_tolerance = job["tolerance"]
     options.ba_local_max_refinements = job["local_refinements"]
     options.mapper.ba_local_num_images = job["local_cameras"]
     counter = Path(job["progress"])

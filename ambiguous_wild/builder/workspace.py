@@ -22,7 +22,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, installed
 from ambiguous_wild.io.files import Held, atomic_dir, file_lock, lock_path, write_json
 
-BUILDER = 15  # raised when a stage gives another result for the same input
+BUILDER = 16  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 _RESULT = "stage.json"
 Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`

@@ -90,3 +90,14 @@ def test_what_looks_like_chance_is_left_out():
     assert shared_features({"a": np.zeros((1, 128), np.uint8)}.__getitem__, ["a", "a"], [(0, 1)], 1) == {
         (0, 1): 0
     }
+
+
+def test_some_partners_are_far_in_a_dense_capture():
+    shared = {(a, b): max(100 - 2 * (b - a), 0) for a in range(90) for b in range(a + 1, 90)}
+    chain = [b - a for a, b in best_partners(shared, dict.fromkeys(range(90), 8))]
+    spread = [b - a for a, b in best_partners(shared, dict.fromkeys(range(90), 8), far=0.5)]
+    assert max(chain) == 8 and max(spread) == 40  # of 20 matches: fewer are not trusted
+    assert len(spread) <= 90 * 8 and spread.count(1) == 89  # the nearest are still partners
+    vectors = np.array([[np.cos(k / 50), np.sin(k / 50)] for k in range(90)])
+    found = [b for _, b in most_similar(vectors, [0], range(90), 16, 8)]
+    assert found[:16] == list(range(1, 17)) and len(found) == 24 and found[-1] == 46

@@ -39,3 +39,10 @@ def test_the_tables_of_readme_and_docs_are_those_of_the_board():
             assert figures.written(page, text) == text, "run python benchmarks/figures.py"
             changed, count = re.subn(r"(<!-- figures: .*\n.*\n.*\n\| )", r"\1wrong ", text)
             assert count == len(figures.TABLES[page]) and figures.written(page, changed) == text
+
+
+def test_the_readme_counts_the_scenes_on_which_refinesplat_is_first():
+    with benchmark("figures") as figures:
+        psnr = [[methods[m]["psnr"] for m in figures.RANKED] for methods in figures.board().values()]
+        first = sum(row[figures.RANKED.index("refinesplat")] == max(row) for row in psnr)
+        assert f"first on {first} of {len(psnr)} scenes" in (figures.ROOT / "README.md").read_text("utf-8")

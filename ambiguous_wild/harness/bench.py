@@ -262,8 +262,6 @@ def bench(
         warnings = check_grafts(cells)
         for cell in {cell.method.name: cell for cell in cells}.values():
             check_passes(cell)
-        for line in [*_remarks(cells), *warnings]:
-            say(line)
         to_run = [] if engine.remote else unfinished(cells, out, overwrite)
         for cell in {cell.method.name: cell for cell in to_run}.values():
             check_program(cell)
@@ -273,6 +271,8 @@ def bench(
         for cell in {cell.scene_id: cell for cell in to_run}.values():
             try_own(cell.scene)
         check_output(out / "run")  # before half a minute of compiling
+        for line in [*_remarks(cells), *warnings]:
+            say(line)
         if used_device == "cpu" and not engine.remote and any(cell.method.program is None for cell in cells):
             prepare_cpu(threads, say)
             if to_train and iterations is None and not budgets_s:

@@ -25,16 +25,18 @@ from ambiguous_wild.simulate.spec_file import plain_spec
 FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing", "sfm")
 
 
-def setting(config: RunConfig) -> str:
+def setting(config: RunConfig, planned: bool = False) -> str:
     """Return length, effects, protocol and limits as text: "2000 iterations, effects exposure".
+
+    Where each scene's plan chose the effects (`planned`), they differ by scene and are called "auto".
 
     The text identifies a cell of the board. So it depends on the run alone, not on defaults of methods, which
     later versions may change. The options have their own hash.
     """
     train = config["train"]
     words = [_length(train)]
-    if config.get("effects"):
-        words.append("effects " + "+".join(map(str, config["effects"])))
+    if planned or config.get("effects"):
+        words.append("effects " + ("auto" if planned else "+".join(map(str, config["effects"]))))
     if config.get("protocol", "full") != "full":
         words.append(f"{config['protocol']} images")
     if isinstance(start := config.get("start"), dict):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import math
 import re
 from collections.abc import Mapping
@@ -28,6 +30,7 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
+from ambiguous_wild.harness.run import EFFECTS
 from ambiguous_wild.harness.store import impossible_values, read_config
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io.files import sha256_file
@@ -156,11 +159,18 @@ def _config(run: Path) -> RunConfig:
 def _words(run: Path, config: RunConfig, before: list[str]) -> tuple[str, str]:
     """Return (setting, commands) of a configuration, which a stranger may have written."""
     try:
-        return check_text(f"setting of {run}", setting(config)), command(config, before)
+        return check_text(f"setting of {run}", setting(config, _planned(run))), command(config, before)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:
         raise AwError(f"{run / 'config.yaml'} was not written by 'aw bench' ({error}): {RESTORE}") from None
+
+
+def _planned(run: Path) -> bool:
+    """Return whether the plan of the scene chose the run's effects."""
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        return bool(json.loads((run / EFFECTS).read_text(encoding="utf-8"))["asked"] == "auto")
+    return False
 
 
 def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:

@@ -247,9 +247,12 @@ def test_settings_and_options_are_cells_of_their_own(one: Path, tmp_path: Path) 
     write_run(tmp_path / "a", scene, effects=["exposure", "poses"])
     write_run(tmp_path / "b", scene, "mine", options={"x": 1})
     write_run(tmp_path / "c", scene, "mine", options={"x": 2})
-    add(tmp_path / "board", one, tmp_path / "a", tmp_path / "b", tmp_path / "c")
+    planned = write_run(tmp_path / "d", scene, effects=["dense"])
+    (planned / "effects.json").write_text('{"asked": "auto"}')
+    add(tmp_path / "board", one, tmp_path / "a", tmp_path / "b", tmp_path / "c", planned)
     entries = read_board(tmp_path / "board")
-    assert len(entries) == 4 and len({e.options for e in entries if e.method == "mine"}) == 2
+    assert "100 iterations, effects auto" in {e.setting for e in entries}
+    assert len(entries) == 5 and len({e.options for e in entries if e.method == "mine"}) == 2
     assert "100 iterations, effects exposure+poses" in {e.setting for e in entries}
 
 

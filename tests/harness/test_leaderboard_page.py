@@ -191,7 +191,8 @@ def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> 
     done = subprocess.run(["node", "-"], input=code, capture_output=True, text=True, check=True)
     rows = {method: (value, rank, cells) for method, value, rank, cells in json.loads(done.stdout)}
     value, rank, cells = rows["robustsplat"]
-    assert 20 < value < 40 and rank != 1 and cells["finite"] == cells["all"] - 1 == len(covered) - 1
+    assert value is None and rank is None  # its scene has no other seed
+    assert cells["finite"] == cells["all"] - 1 == len(covered) - 1
     assert rows["refinesplat"][1] == 1
 
 

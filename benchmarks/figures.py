@@ -23,10 +23,10 @@ METHODS = (*RANKED, "3dgs+truth")
 GROUPS = {
     "seven simulated courtyards": ("courtyard-",),
     "simulated room and yard": ("room-", "yard-"),
-    "drone photos, 40": ("seneca-",),
-    "tree by phone, 23": ("monstree-",),
-    "facade, 11": ("sceaux-",),
-    "drone photos, 12": ("tiny_aerial-",),
+    "composites on 40 drone photos": ("seneca-",),
+    "composites on 23 phone photos of a tree": ("monstree-",),
+    "composites on 11 photos of a facade": ("sceaux-",),
+    "composites on 12 drone photos": ("tiny_aerial-",),
 }
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 

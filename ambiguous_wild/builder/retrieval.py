@@ -151,12 +151,12 @@ def retrieval_pairs(
         for s in range(1, neighbours + 1)
         if i + s < len(walk) and (only is None or {names[walk[i]], names[walk[i + s]]} & set(only))
     }
+    spread = 0.0
     if len(names) <= ALL_PAIRS:
         listed = [(a, b) for a in asking for b in everyone if a != b]
     else:
-        near = (SHORTLIST - 1) * similar
+        spread, near = FAR, (SHORTLIST - 1) * similar
         listed = most_similar(embed(read, names, seed), asking, everyone, near, similar)
-    spread = FAR if len(names) > ALL_PAIRS else 0.0
     pairs |= best_partners(shared_features(read, names, listed, jobs), dict.fromkeys(asking, similar), spread)
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 

@@ -19,6 +19,8 @@ from pathlib import Path
 
 from job_queue import Run, aw, count, exit_code, run_all, seed
 
+from ambiguous_wild.core import AwError
+
 ROOT = Path(__file__).parents[1]
 PRESETS = (
     *(f"courtyard-{kind}" for kind in ("plain", "colour", "twin", "thin", "sparse", "crowd", "clean")),
@@ -84,7 +86,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--board", type=Path, default=ROOT / "leaderboard")
     args = parser.parse_args(words)
-    chosen = [c for c in captures(args.data) if args.only is None or c.name in args.only]
+    known = {capture.name: capture for capture in captures(args.data)}
+    if unknown := set(args.only or ()) - known.keys():
+        raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
+    chosen = [known[name] for name in args.only or known]
     scenes = {capture: capture.build(args.work) for capture in chosen}
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
     for capture in scenes:

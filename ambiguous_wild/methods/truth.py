@@ -18,9 +18,9 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.io.images import load_image_float, read_gray
+from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.splat.data import on_device, shrink_keep
+from ambiguous_wild.splat.data import read_photos, shrink_keep
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
 from ambiguous_wild.splat.step import Step, TrainData
 
@@ -55,7 +55,7 @@ class TruthMask(MaskPolicy):
 
     def setup(self, data: TrainData) -> None:
         masks = [read_gray(path) >= 128 for path in truth_files(data.scene, "distractor")]
-        _check_sizes(data.scene, masks, "distractor")
+        _check_sizes(data.scene, masks)
         self.keeps = [keep_outside(mask, self.config.dilation).to(data.device) for mask in masks]
 
     def keep(self, step: Step) -> Tensor | None:
@@ -80,10 +80,8 @@ def clean_data(data: TrainData) -> TrainData:
     Raises:
         AwError: the scene lacks clean photos of some views, or they have another size.
     """
-    photos = [load_image_float(path) for path in truth_files(data.scene, "clean")]
-    _check_sizes(data.scene, photos, "clean")
-    tensors = [torch.from_numpy(photo) for photo in photos]
-    return dataclasses.replace(data, photos=on_device(tensors, data.device), user_keep=[None] * len(photos))
+    photos = read_photos(truth_files(data.scene, "clean"), data.cameras, data.device)
+    return dataclasses.replace(data, photos=photos, user_keep=[None] * len(photos))
 
 
 def truth_files(scene: Scene, kind: str) -> list[Path]:
@@ -108,13 +106,13 @@ def truth_files(scene: Scene, kind: str) -> list[Path]:
     return paths
 
 
-def _check_sizes(scene: Scene, images: list[np.ndarray], kind: str) -> None:
-    def fits(view: View, image: np.ndarray) -> bool:
-        return image.shape[:2] == (view.camera.height, view.camera.width)
+def _check_sizes(scene: Scene, masks: list[np.ndarray]) -> None:
+    def fits(view: View, mask: np.ndarray) -> bool:
+        return mask.shape == (view.camera.height, view.camera.width)
 
-    wrong = [view.name for view, image in zip(scene.train, images) if not fits(view, image)]
+    wrong = [view.name for view, mask in zip(scene.train, masks) if not fits(view, mask)]
     if wrong:
         raise AwError(
-            f"the truth in {scene.root / 'truth' / kind} is not of the photos' size: {shortlist(wrong)}; "
-            "load the scene at the factor it was built for"
+            f"the truth in {scene.root / 'truth' / 'distractor'} is not of the photos' size: "
+            f"{shortlist(wrong)}; load the scene at the factor it was built for"
         )

@@ -1,16 +1,18 @@
 """Photos of the training side, at every resolution of the schedule, on the device that trains.
 
-Photos that fit into `RESIDENT` of a GPU's free memory stay there for the whole run. Others stay in pinned
-memory of the host, as 8-bit codes if their files have 8 bits: a quarter of the bytes. The training loop
-announces the next view (`prefetch`); its photo is copied while the GPU computes, and the GPU, not the host,
-waits for it.
+Photos that fit into `RESIDENT` of a GPU's free memory, or of the machine's memory, stay there for the whole
+run. For a GPU, others stay in pinned memory of the host, as 8-bit codes if their files have 8 bits: a quarter
+of the bytes; a CPU reads them from their files again. The training loop announces the next view (`prefetch`);
+its photo is copied or read while the step before computes.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Protocol, overload
 
 import cv2
 import numpy as np
@@ -32,22 +34,15 @@ def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir:
     """
     if not scene.train:
         raise AwError(f"scene {scene.root} has no training views: check train_list.txt")
-    photos, keeps = [], []
-    pixels = sum(view.camera.height * view.camera.width for view in scene.train)
-    copies = None if fit(12 * pixels, device) else CudaCopies(device)  # 3 channels of 4 bytes
+    keeps: list[Tensor | None] = []
     for view in scene.train:
-        codes = _load_photo(view)
-        if copies is None:
-            photos.append(torch.from_numpy(as_float(codes)).to(device))
-        else:
-            small = codes if codes.dtype == np.uint8 else as_float(codes)
-            photos.append(copies.hold(torch.from_numpy(small)))
         keep = load_keep(view, with_alpha="files" not in scene.info)
         keeps.append(None if keep is None else torch.from_numpy(keep).to(device))
+    cameras = [view.camera for view in scene.train]
     return TrainData(
         scene=scene,
-        photos=photos if copies is None else Photos(photos, device, copies),
-        cameras=[view.camera for view in scene.train],
+        photos=read_photos([view.image_path for view in scene.train], cameras, device),
+        cameras=cameras,
         user_keep=keeps,
         device=device,
         seed=seed,
@@ -55,15 +50,28 @@ def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir:
     )
 
 
-def _load_photo(view: View) -> np.ndarray:
-    codes = load_image_codes(view.image_path)
-    size = (view.camera.height, view.camera.width)
-    if codes.shape[:2] != size:
-        raise AwError(
-            f"{view.image_path} is {codes.shape[1]}x{codes.shape[0]} px, its camera says "
-            f"{size[1]}x{size[0]}; build the scene again with 'aw build-scene'"
-        )
-    return codes
+def read_photos(files: Sequence[Path], cameras: Sequence[Camera], device: torch.device) -> Sequence[Tensor]:
+    """Photos [H, W, 3] float32 in [0, 1] on the device: a list, or `Photos` if they would fill its memory.
+
+    Raises:
+        AwError: a photo differs in size from its camera.
+    """
+    copies: Copies | None = None
+    if not fit(12 * sum(camera.height * camera.width for camera in cameras), device):  # 3 channels of 4 bytes
+        copies = CudaCopies(device) if device.type == "cuda" else FileReads()
+    held: list[Any] = []
+    for file, camera in zip(files, cameras, strict=True):
+        codes = load_image_codes(file)
+        if codes.shape[:2] != (camera.height, camera.width):
+            raise AwError(
+                f"{file} is {codes.shape[1]}x{codes.shape[0]} px, its camera says "
+                f"{camera.width}x{camera.height}; build the scene again with 'aw build-scene'"
+            )
+        if copies is None:
+            held.append(torch.from_numpy(as_float(codes)).to(device))
+        else:
+            held.append(copies.hold(file, codes))
+    return held if copies is None else Photos(held, device, copies)
 
 
 def load_keep(
@@ -149,8 +157,37 @@ class Pyramid:
         return self._cameras[view, divisor]
 
 
-RESIDENT = 0.25  # share of a GPU's free memory; Gaussians, their moments and gsplat's lists need the rest
+RESIDENT = 0.25  # share of the memory; Gaussians, their moments, masks and gsplat's lists need the rest
 READY = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
+
+
+class Copies(Protocol):
+    """Brings photos to the device while a step runs."""
+
+    def hold(self, file: Path, codes: np.ndarray) -> Any:
+        """Return what `begin` needs of a photo, given its file and its codes."""
+
+    def begin(self, held: Any) -> Any:
+        """Start to bring a photo; returns what `finish` needs."""
+
+    def finish(self, coming: Any) -> Tensor:
+        """Return the photo on the device, uint8 codes or float32; work launched later waits for it."""
+
+
+class FileReads:
+    """Reads photos from their files on another thread."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1)
+
+    def hold(self, file: Path, codes: np.ndarray) -> Path:
+        return file
+
+    def begin(self, held: Path) -> Future[np.ndarray]:
+        return self._pool.submit(load_image_codes, held)
+
+    def finish(self, coming: Future[np.ndarray]) -> Tensor:
+        return torch.from_numpy(as_float(coming.result()))
 
 
 class CudaCopies:
@@ -159,22 +196,21 @@ class CudaCopies:
     def __init__(self, device: torch.device) -> None:
         self.device, self.stream = device, torch.cuda.Stream(device)
 
-    def hold(self, tensor: Tensor) -> Tensor:
-        """Return the tensor in pinned memory, from which it can be sent."""
+    def hold(self, file: Path, codes: np.ndarray) -> Tensor:
+        """Return the photo in pinned memory, from which it can be sent."""
+        tensor = torch.from_numpy(codes if codes.dtype == np.uint8 else as_float(codes))
         try:
             return tensor.pin_memory()
         except RuntimeError:  # no more memory can be pinned: the host will wait for this copy
             return tensor
 
-    def begin(self, tensor: Tensor) -> tuple[Tensor, Any]:
-        """Start to send the tensor; returns what `finish` needs."""
+    def begin(self, held: Tensor) -> tuple[Tensor, Any]:
         with torch.cuda.stream(self.stream):
-            on_gpu = tensor.to(self.device, non_blocking=True)
+            on_gpu = held.to(self.device, non_blocking=True)
         return on_gpu, self.stream.record_event()
 
-    def finish(self, sent: tuple[Tensor, Any]) -> Tensor:
-        """Return the tensor on the device; work launched from now on waits for it."""
-        on_gpu, arrived = sent
+    def finish(self, coming: tuple[Tensor, Any]) -> Tensor:
+        on_gpu, arrived = coming
         current = torch.cuda.current_stream(self.device)
         current.wait_event(arrived)
         on_gpu.record_stream(current)  # its memory is not given away before `current` has read it
@@ -182,14 +218,14 @@ class CudaCopies:
 
 
 class Photos(Sequence[Tensor]):
-    """Photos [H, W, 3] float32 in [0, 1], of which only a few lie on the device at a time."""
+    """Photos [H, W, 3] float32 in [0, 1], of which only a few lie in the device's memory at a time."""
 
-    def __init__(self, held: Sequence[Tensor], device: torch.device, copies: CudaCopies) -> None:
+    def __init__(self, held: Sequence[Any], device: torch.device, copies: Copies) -> None:
         """
         Args:
-            held: photos [H, W, 3] in the host's memory, uint8 codes or float32.
+            held: what `copies` holds of each photo.
             device: where photos are read.
-            copies: sends them to the device.
+            copies: brings them to the device.
         """
         self._held, self._device, self._copies = held, device, copies
         # A tensor on the device: a division by a Python number would multiply by its rounded reciprocal.
@@ -219,7 +255,7 @@ class Photos(Sequence[Tensor]):
         return photo
 
     def prefetch(self, index: int) -> None:
-        """Start to send this photo, unless it is on the device or on its way."""
+        """Start to bring this photo, unless it is on the device or on its way."""
         if index not in self._ready and index not in self._coming:
             while len(self._coming) >= READY:  # announced and never read
                 del self._coming[next(iter(self._coming))]
@@ -227,13 +263,9 @@ class Photos(Sequence[Tensor]):
 
 
 def fit(needed: int, device: torch.device) -> bool:
-    """Whether this many bytes of photos may stay on the device for the whole run."""
-    return device.type != "cuda" or needed <= RESIDENT * torch.cuda.mem_get_info(device)[0]
-
-
-def on_device(photos: Sequence[Tensor], device: torch.device) -> Sequence[Tensor]:
-    """Put photos [H, W, 3] float32 of the host on the device, all or a few at a time."""
-    if fit(sum(4 * photo.numel() for photo in photos), device):
-        return [photo.to(device) for photo in photos]
-    copies = CudaCopies(device)
-    return Photos([copies.hold(photo) for photo in photos], device, copies)
+    """Whether this many bytes of photos may stay in the device's memory for the whole run."""
+    if device.type == "cuda":
+        return needed <= RESIDENT * torch.cuda.mem_get_info(device)[0]
+    if not hasattr(os, "sysconf"):  # Windows
+        return True
+    return needed <= RESIDENT * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

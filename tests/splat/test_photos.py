@@ -1,13 +1,16 @@
 """Photos read as a list are read: wherever they lie, and whenever they were sent."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import load_image_float, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import data as data_module
-from ambiguous_wild.splat.data import READY, Photos, fit, load_train_data
+from ambiguous_wild.splat.data import READY, CudaCopies, FileReads, Photos, fit, load_train_data
 from tests.tiny_scene import write_tiny_scene
 
 CPU = torch.device("cpu")
@@ -17,11 +20,10 @@ class SlowCopies:
     """What was sent is nonsense until somebody waits for it."""
 
     def __init__(self, *_):
-        self.begun, self.finished, self.held = [], 0, 0
+        self.begun, self.finished = [], 0
 
-    def hold(self, tensor):
-        self.held += 1
-        return tensor
+    def hold(self, file, codes):
+        return torch.from_numpy(codes)
 
     def begin(self, tensor):
         self.begun.append(tensor)
@@ -107,21 +109,37 @@ def test_on_the_cpu_photos_are_a_plain_list(scene, tmp_path):
     assert [k is not None for k in data.user_keep] == [v.name == "train_1.png" for v in scene.train]
 
 
-def test_photos_that_do_not_fit_stay_with_the_host_as_their_files_have_them(scene, tmp_path, monkeypatch):
-    asked = []
+@pytest.mark.parametrize("copies", [FileReads, SlowCopies])
+def test_photos_that_do_not_fit_are_brought_when_they_are_read(scene, tmp_path, monkeypatch, copies):
+    resident, asked = load(scene, tmp_path).photos, []
     monkeypatch.setattr(data_module, "fit", lambda needed, device: asked.append(needed))
-    monkeypatch.setattr(data_module, "CudaCopies", SlowCopies)
-    resident, sent = None, load(scene, tmp_path)
-    monkeypatch.undo()
-    resident = load(scene, tmp_path)
-    assert asked == [6 * 48 * 64 * 3 * 4] == [sum(p.nbytes for p in resident.photos)]
-    assert isinstance(sent.photos, Photos) and sent.photos._copies.held == 6
-    assert {p.dtype for p in sent.photos._held} == {torch.uint8}
-    for a, b in zip(sent.photos, resident.photos, strict=True):
+    monkeypatch.setattr(data_module, "FileReads", copies)
+    photos = load(scene, tmp_path).photos
+    assert asked == [6 * 48 * 64 * 3 * 4] == [sum(p.nbytes for p in resident)]
+    assert isinstance(photos._copies, copies)
+    for k, (a, b) in enumerate(zip(photos, resident, strict=True)):
+        photos.prefetch((k + 1) % 6)
         assert torch.equal(a, b)
 
 
-def test_a_share_of_the_free_memory_decides(monkeypatch):
+def test_what_is_held_for_a_gpu_are_the_codes_of_the_file(codes, tmp_path):
+    held = CudaCopies.hold(None, tmp_path, codes[0].numpy())
+    assert held.dtype == torch.uint8 and torch.equal(held, codes[0])
+    deep = CudaCopies.hold(None, tmp_path, np.full((2, 2, 3), 65535, np.uint16))
+    assert torch.equal(deep, torch.ones(2, 2, 3))
+
+
+def test_a_photo_that_has_gone_is_named_when_it_is_read(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(data_module, "RESIDENT", 0.0)
+    photos = load(scene, tmp_path).photos
+    scene.train[2].image_path.unlink()
+    assert photos[1].shape == (48, 64, 3)
+    with pytest.raises(AwError, match=scene.train[2].name):
+        photos[2]
+
+
+def test_a_share_of_the_memory_decides(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 8000))
     assert fit(250, torch.device("cuda")) and not fit(251, torch.device("cuda"))
-    assert fit(10**15, CPU)
+    monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 10, "SC_PHYS_PAGES": 100}.__getitem__)
+    assert fit(250, CPU) and not fit(251, CPU)

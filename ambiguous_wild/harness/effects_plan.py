@@ -41,7 +41,7 @@ class Evidence:
     outward: float = math.nan  # spread of the places that train cameras look at, over that of the cameras
 
 
-def measure(scene: Scene, photos: Sequence[np.ndarray]) -> Evidence:
+def measure(scene: Scene, photos: Iterable[np.ndarray]) -> Evidence:
     """Measure all evidence.
 
     Args:
@@ -378,7 +378,7 @@ def plan_effects(scene: Scene) -> Plan:
         return decide(scene.name, nothing)
     from ambiguous_wild.io.images import load_image_float
 
-    return decide(scene.name, measure(scene, [load_image_float(v.image_path) for v in scene.train]))
+    return decide(scene.name, measure(scene, (load_image_float(v.image_path) for v in scene.train)))
 
 
 def read_plan(path: Path) -> Plan:

@@ -69,7 +69,7 @@ def on_meta(step, divisor=1):
 
 def moved(policy: RefineSplatMask) -> RefineSplatMask:
     """The policy with its masks made where no value can be read."""
-    photos = [photo.numpy() for photo in policy.data.photos]
+    photos = policy.data.photos
     surfaces = static_surfaces(policy.data.cameras, policy.data.scene.points.xyz)
     policy.data = dataclasses.replace(
         policy.data, device=META, photos=[photo.to(META) for photo in policy.data.photos]
@@ -79,6 +79,7 @@ def moved(policy: RefineSplatMask) -> RefineSplatMask:
         policy.config, photos, policy.data.cameras, surfaces, policy.looks, inputs.labels, inputs.static,
         META, policy.compare,
     )  # fmt: skip
+    policy.masks.pixels.photos = policy.data.photos
     policy.first = {view: first.to(META) for view, first in policy.first.items()}
     return policy
 

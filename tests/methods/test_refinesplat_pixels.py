@@ -52,7 +52,13 @@ def asked(others: OtherViews, view: int) -> MultiViewEvidence:
 
 def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
     config = dataclasses.replace(MaskConfig(memory=0.0), **changes)
-    return PixelEvidence(photos, cameras, surfaces or [None] * len(photos), config, "cpu")
+    return PixelEvidence(
+        [torch.from_numpy(photo) for photo in photos],
+        cameras,
+        surfaces or [None] * len(photos),
+        config,
+        "cpu",
+    )
 
 
 def masks_of(values, labels, config, ceiling=None, unseen=None) -> Masks:

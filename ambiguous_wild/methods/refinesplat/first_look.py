@@ -19,7 +19,7 @@ because it does not depend on what the model has learnt.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -107,7 +107,7 @@ class FirstLook:
 
 def first_look(
     cameras: Sequence[Camera],
-    photos: Sequence[np.ndarray],
+    photos: Iterable[np.ndarray],
     surfaces: Sequence[np.ndarray | None],
     config: FirstLookConfig,
     moving: Sequence[np.ndarray | None] | None = None,

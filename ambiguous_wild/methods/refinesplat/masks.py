@@ -213,7 +213,7 @@ class MaskStore:
     def __init__(
         self,
         config: RefineSplatConfig,
-        photos: Sequence[np.ndarray],  # [H, W, 3] float32 in [0, 1]
+        photos: Sequence[Tensor],  # [H, W, 3] float32 in [0, 1] on `device`
         cameras: Sequence[Camera],
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points
         looks: Mapping[int, FirstLook],
@@ -221,25 +221,23 @@ class MaskStore:
         static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
         device: torch.device | str,
         compare: Callable[[Step], Maps],  # on the feature grid; called only if the statistic needs it
-        tensors: Sequence[Tensor] | None = None,  # the photos, if they are on the device already
     ) -> None:
         self.config, self.compare = config, compare
-        self.pixels = PixelEvidence(photos, cameras, surfaces, config.mask, device, tensors)
+        self.pixels = PixelEvidence(photos, cameras, surfaces, config.mask, device)
         structure = config.mask.statistic == "structure"
         # features are judged on their whole grid
         unseen = self.pixels.unseen_on_host if structure else [None] * len(photos)
         self.labels = Labels(labels, static, unseen, device)
+        sizes = [(camera.height, camera.width) for camera in cameras]
         # view -> factor of its evidence, [H, W]; absent if it is 1
         self.factors = {
-            view: sized(look.factor(photos[view].shape[:2]), device)
-            for view, look in looks.items()
-            if look.weight != 1
+            view: sized(look.factor(sizes[view]), device) for view, look in looks.items() if look.weight != 1
         }
         # view -> pixels outside of which nothing is masked, [H, W] bool; absent if there is no such limit
         self.within = {
             view: torch.from_numpy(~keep).to(device)
             for view, look in looks.items()
-            if look.within and (keep := look.keep(photos[view].shape[:2])) is not None
+            if look.within and (keep := look.keep(sizes[view])) is not None
         }
         self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
         self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] float32, if it has one

@@ -23,7 +23,7 @@ depths of 0, so it matches no surface.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -127,7 +127,7 @@ class OtherViews:
     def __init__(
         self,
         cameras: Sequence[Camera],
-        photos: Sequence[np.ndarray],  # [H, W, 3] float32 in [0, 1]
+        photos: Iterable[np.ndarray],  # [H, W, 3] float32 in [0, 1]
         config: MultiViewConfig,
         surfaces: Sequence[np.ndarray | None],
         device: torch.device | str,

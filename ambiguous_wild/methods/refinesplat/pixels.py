@@ -24,7 +24,7 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
-from ambiguous_wild.methods.refinesplat.maps import low_quantile, median, sized
+from ambiguous_wild.methods.refinesplat.maps import low_quantile, median
 from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
 from ambiguous_wild.methods.refinesplat.structure import resized, structure_residual, unrelated_residual
 from ambiguous_wild.splat.backend import backend_of
@@ -144,28 +144,27 @@ class PixelEvidence:
 
     def __init__(
         self,
-        photos: Sequence[np.ndarray],  # [H, W, 3] float32 in [0, 1]
+        photos: Sequence[Tensor],  # [H, W, 3] float32 in [0, 1] on `device`
         cameras: Sequence[Camera],
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points, or none at all
         config: MaskConfig,
         device: torch.device | str,
-        tensors: Sequence[Tensor] | None = None,  # the photos, if they are on the device already
     ) -> None:
         self.config = config
-        # not copied: photos that do not fit on the device are sent one at a time
-        self.photos = tensors or [sized(photo, device) for photo in photos]
-        self.other_views = OtherViews(cameras, photos, config.multiview, surfaces, device)
+        self.photos = photos
+        on_host = (photo.cpu().numpy() for photo in photos)  # one at a time: all may not fit
+        self.other_views = OtherViews(cameras, on_host, config.multiview, surfaces, device)
         self.unseen_on_host = [
-            None if few is None or not few.any() else _at_size(few, photo.shape)
-            for few, photo in zip(
-                seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(photos), photos
+            None if few is None or not few.any() else _at_size(few, (camera.height, camera.width))
+            for few, camera in zip(
+                seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(cameras), cameras
             )
         ]
         # [H, W] bool of each view: pixels that may be masked; None: all
         self.seen = [
             None if unseen is None else torch.from_numpy(~unseen).to(device) for unseen in self.unseen_on_host
         ]
-        self.unrelated = unrelated_residual([torch.from_numpy(photo) for photo in photos], config.base)
+        self.unrelated = unrelated_residual(photos, config.base)
         # normal residual of each view's static pixels; NaN before the first `look`
         self.normal = torch.full((len(photos),), torch.nan, dtype=torch.float64, device=device)
         # view -> its residual, averaged over its visits, [H, W] float16
@@ -249,6 +248,6 @@ class PixelEvidence:
         )
 
 
-def _at_size(few: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Enlarge a coarse bool map to the size of a photo of this shape."""
-    return cv2.resize(few.astype(np.uint8), shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
+def _at_size(few: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Enlarge a coarse bool map to the size of a photo of this size (height, width)."""
+    return cv2.resize(few.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0

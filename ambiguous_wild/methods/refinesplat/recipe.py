@@ -132,21 +132,21 @@ class RefineSplatMask(PausingMask):
         config = self.config
         if self._reads_identities:
             _ = self.inputs.semantics  # computed now, as a cost of the method before its first step
-        photos = [photo.cpu().numpy() for photo in data.photos]
         surfaces = static_surfaces(data.cameras, data.scene.points.sure_xyz)
         if config.first_look.on:
             moving = self._moving(surfaces) if config.first_look.motion > 0 else None
+            photos = (photo.cpu().numpy() for photo in data.photos)  # one at a time: all may not fit
             looks = first_look(data.cameras, photos, surfaces, config.first_look, moving)
             self.looks = {view: look for view, look in enumerate(looks) if look is not None}
         self.masks = MaskStore(
-            config, photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
-            data.device, self.compare, data.photos,
+            config, data.photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
+            data.device, self.compare,
         )  # fmt: skip
         # view -> its keep map before masks begin, [H, W] float32; absent if everything is kept
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
             for view, look in self.looks.items()
-            if (keep := look.keep(photos[view].shape[:2])) is not None
+            if (keep := look.keep((data.cameras[view].height, data.cameras[view].width))) is not None
         }
 
     def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:

@@ -56,8 +56,9 @@ def unrelated_residual(photos: Sequence[Tensor], base: float = 0.3) -> float:
         base: argument of `structure_residual`.
     """
     values = []
-    for index, photo in enumerate(photos):
-        other = photos[(index + len(photos) // 2) % len(photos)].flip(1)
+    for index in range(len(photos)):
+        photo, other = (photos[k % len(photos)].cpu() for k in (index, index + len(photos) // 2))
+        other = other.flip(1)
         if other.shape != photo.shape:
             other = resized(other, (photo.shape[0], photo.shape[1]))
         values.append(float(np.median(structure_residual(photo, other, base).numpy())))

@@ -40,7 +40,7 @@ class AffineExposure(Effect):
     def setup(self, data: TrainData) -> None:
         self.views = len(data.photos)
         table = torch.zeros(self.views + 1, 3, 4, device=data.device)  # the last row is a test photo's
-        gains = photo_gains(data.scene, [p.cpu().numpy() for p in data.photos])
+        gains = photo_gains(data.scene, (photo.cpu().numpy() for photo in data.photos))
         table[: self.views, range(3), range(3)] = torch.from_numpy(gains.astype("float32") - 1).to(table)
         self.adam = RowAdam(table)
         self._close()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,7 @@ def tracks_of(scene: Scene) -> list[np.ndarray]:
     return [np.unique(owner[points.track_views == index]) for index in train]
 
 
-def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
+def track_colours(scene: Scene, photos: Iterable[np.ndarray]) -> TrackColours:
     """Read the colours of SfM points in every train photo.
 
     Args:
@@ -42,12 +42,11 @@ def track_colours(scene: Scene, photos: Sequence[np.ndarray]) -> TrackColours:
     of_point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
     train = {index: k for k, index in enumerate(i for i, v in enumerate(scene.views) if v.split == "train")}
     observed = []
-    for index, k in train.items():
+    for (index, k), photo in zip(train.items(), photos, strict=True):
         rows = np.flatnonzero(points.track_views == index)
         if not len(rows):
             continue
-        photo = np.asarray(photos[k], np.float64)
-        smooth = uniform_filter(photo, size=(3, 3, 1), mode="nearest")
+        smooth = uniform_filter(np.asarray(photo, np.float64), size=(3, 3, 1), mode="nearest")
         camera = scene.views[index].camera
         scale = np.array([photo.shape[1] / camera.width, photo.shape[0] / camera.height])
         # rows, columns; pixel centres at +0.5
@@ -103,6 +102,6 @@ def grouped_median(values: np.ndarray, group: np.ndarray) -> np.ndarray:
     return out
 
 
-def photo_gains(scene: Scene, photos: Sequence[np.ndarray]) -> np.ndarray:
+def photo_gains(scene: Scene, photos: Iterable[np.ndarray]) -> np.ndarray:
     """Return factors [V, 3] of the train photos' sRGB codes against the mean photo; 1 where unknown."""
-    return np.exp(log_gains(track_colours(scene, photos), len(photos)))
+    return np.exp(log_gains(track_colours(scene, photos), len(scene.train)))

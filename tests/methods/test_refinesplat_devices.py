@@ -287,12 +287,18 @@ def plain(value):
     return value
 
 
-def test_pictures_are_drawn_of_what_the_device_holds(scene, accelerated, tmp_path):
-    policy = made(scene, dataclasses.replace(PLAIN, psi=FAST.psi))
+@pytest.mark.parametrize(("statistic", "shown"), [("structure", "evidence"), ("entropy", "entropy")])
+def test_pictures_are_drawn_of_what_the_device_holds(scene, accelerated, tmp_path, statistic, shown):
+    policy = made(
+        scene,
+        dataclasses.replace(PLAIN, psi=FAST.psi, mask=dataclasses.replace(PLAIN.mask, statistic=statistic)),
+    )
     for number in range(VIEWS):
         policy.keep(visit(scene, number))
     panels = policy.panels(visit(scene, 0))
     assert all(p.shape == (HEIGHT, WIDTH, 3) for p in panels.values())
+    assert shown in {name.partition(",")[0] for name in panels}
+    assert policy.inputs.has_semantics == (statistic == "entropy")  # what decides nothing is not computed
     assert [path.exists() for path in policy.draw(tmp_path)] == [True]
 
 

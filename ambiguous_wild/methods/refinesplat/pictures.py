@@ -39,11 +39,11 @@ class Policy(Protocol):
 
     def examine(self, step: Step) -> tuple[Maps, Masks]: ...
 
-    def compare(self, step: Step) -> Maps: ...
-
 
 def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.ndarray]:
-    """Return pictures of entropy, instances by their statistic, and all masks; [H, W, 3] uint8 each.
+    """Return pictures of the evidence, instances by their statistic, and all masks; [H, W, 3] uint8 each.
+
+    The evidence is the statistic of pixels, or the entropy where the method computes it.
 
     Args:
         policy: the policy, which learns nothing here.
@@ -51,12 +51,9 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
         begun: whether masks are used at this step.
     """
     maps, masks = policy.examine(step)
-    entropy = maps.entropy if maps.entropy is not None else policy.compare(step).entropy
-    assert entropy is not None  # `compare` fills it
     labels = policy.inputs.labels[step.view]
     photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
     grey = faded(photo)
-    on_pixels = enlarge(entropy, labels.shape[0], labels.shape[1]).cpu().numpy()
     local, global_, final, means = (
         t.cpu().numpy() for t in (masks.local, masks.global_, masks.keep < 0.5, masks.means)
     )
@@ -64,11 +61,14 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
     top = 2 * threshold if math.isfinite(threshold) else 1.5 * float(np.nanmax(means, initial=1e-9))
     cut = f"T {threshold:.2f}" if math.isfinite(threshold) else "nothing stands apart"
     of_pixel = np.r_[np.nan, means][np.clip(labels, 0, len(means))]
+    shown = maps.statistic if maps.entropy is None else maps.entropy
+    evidence = enlarge(shown, labels.shape[0], labels.shape[1]).cpu().numpy()
+    name, most = ("evidence", top) if maps.entropy is None else ("entropy", 1.0)
     used = "" if begun else ", not used yet"
     points = policy.points.get(policy.data.scene.train[step.view].name)
     return {
         **({} if points is None else {POINTS: draw_points(photo, points)}),
-        f"entropy, mean {entropy.mean():.2f}": ramp(on_pixels, 0.0, 1.0),
+        f"{name}, mean {evidence.mean():.2f}": ramp(evidence, 0.0, most),
         f"instances, {cut}": _outlined(ramp(of_pixel, 0.0, top), labels),
         f"local {100 * local.mean():.0f} %": tint(grey, local, LOCAL),
         f"global {100 * global_.mean():.0f} %": tint(grey, global_, GLOBAL),

@@ -105,7 +105,7 @@ def command(
     if as_json:
         click.echo(json.dumps({**facts, "report": str(folder)}, indent=2))
         return
-    click.echo(f"{loaded.name}: {facts['class']}")
+    click.echo(f"{loaded.name}: {facts['class']}{ambiguity_summary.doubts(facts)}")
     for line in ambiguity_summary.describe(facts):
         click.echo(line)
     saved = ", scores saved in scene.json" if info is not None else ""

@@ -24,6 +24,7 @@ from ambiguous_wild.report.ambiguity_summary import (
     Summary,
     cosine_column,
     describe,
+    doubts,
     row,
 )
 from ambiguous_wild.report.plain_formats import to_csv
@@ -270,7 +271,7 @@ def page(
 ) -> str:
     """Return the page, with every text of the scene escaped and every picture included."""
     title = html.escape(f"Ambiguity of {summary['scene']}")
-    verdict = _CLASSES.get(summary["class"], f"class: {summary['class']}")
+    verdict = _CLASSES.get(summary["class"], f"class: {summary['class']}") + doubts(summary)
     lines = "".join(f"<li>{html.escape(line)}</li>" for line in describe(summary))
     sources = (
         f"{summary['photos']} train photos; masks: {summary['masks']}; background: {summary['background']}; "

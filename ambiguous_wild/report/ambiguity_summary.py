@@ -124,11 +124,28 @@ def summarise(
         "features": features,
         "seed": seed,
         "class": classify(colour["ambiguous"], semantic["ambiguous"]) if covered.mean else NO_DISTRACTORS,
+        "doubts": _doubts(masks, colour, semantic),
         "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
         am.COLOUR_METRIC: colour,
         semantic_metric(features): semantic,
         "told": _count_evidence(measured),
     }
+
+
+def _doubts(masks: str, colour: ColourScore, semantic: SemanticScore) -> list[str]:
+    """Return why the class may be wrong."""
+    found = ["the masks are a run's guesses"] if masks == "run" else []
+    if _crosses(colour) or _crosses(semantic):
+        found.append("an interval crosses its limit")
+    if 2 * colour["unknown_px"] > colour["distractor_px"]:
+        found.append("most of the background is unknown")
+    return found
+
+
+def doubts(summary: Summary) -> str:
+    """Return what to write behind the class: why it may be wrong, in brackets, or nothing."""
+    found = summary.get("doubts")  # absent from older reports
+    return f" (uncertain: {'; '.join(found)})" if found else ""
 
 
 def classify(colour: bool | None, semantic: bool | None) -> str:
@@ -306,9 +323,12 @@ def _value(score: Scored) -> str:
 
 def _word(score: ColourScore | SemanticScore) -> str:
     word = {None: "no verdict", True: "AMBIGUOUS", False: "not ambiguous"}[score["ambiguous"]]
+    return f"{word}, but the interval crosses the limit" if _crosses(score) else word
+
+
+def _crosses(score: ColourScore | SemanticScore) -> bool:
     low, high = score["low"], score["high"]
-    close = low is not None and high is not None and low <= score["ambiguous_above"] <= high
-    return f"{word}, but the interval crosses the limit" if close else word
+    return low is not None and high is not None and low <= score["ambiguous_above"] <= high
 
 
 def _interval(interval: Interval) -> Scored:

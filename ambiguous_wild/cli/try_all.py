@@ -128,6 +128,6 @@ def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
     one = IN_3DGS * expected_s(1, pixels, pixels) * slowness()
     most = round(TRAINING * seconds / one, -2)
     iterations = int(min(max(most, SHORTEST), LONGEST))
-    more = "; too little is left, so it takes longer" if most < SHORTEST else ""
+    more = "; that is too few to compare methods: give more --budget" if most < SHORTEST else ""
     say(f"\n{iterations} iterations a method: about {_minutes(iterations * one)} of training here{more}")
     return iterations

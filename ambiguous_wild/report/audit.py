@@ -170,8 +170,13 @@ def digits(numbers: list[Number]) -> list[Finding]:
     return [f for column in columns.values() for f in _odd_digits(column)]
 
 
+FULL = 12  # digits of a number that was never rounded, whose last ones may be zeros
+
+
 def _odd_digits(column: list[Number]) -> Iterator[Finding]:
     usual, count = Counter(n.digits for n in column).most_common(1)[0]
+    if usual >= FULL:
+        return
     odd = [n for n in column if n.digits != usual]
     if odd and count >= 0.8 * len(column):
         words = ", ".join(f"{n.method} on {place_name(n)} {n.text}" for n in odd)

@@ -108,6 +108,9 @@ def config_identity(config: RunConfig | Mapping[str, Any]) -> str:
     return config_hash(settings)
 
 
+MEASURED_WITH = ("truth/clean", "truth/distractor", "masks/test")  # folders that scores and references read
+
+
 def scene_identity(scene: Scene) -> str:
     """Return the sha256 of a scene: over its files' hashes, its split and the size it is loaded at."""
     listed = scene.info.get("files")
@@ -119,14 +122,13 @@ def scene_identity(scene: Scene) -> str:
     split = [(v.name, v.split, v.camera.width, v.camera.height) for v in scene.views]
     if not hashes:
         hashes = _contents(scene)
-    # masks that were put into the folder later are in no list
-    for view in scene.views:
-        if view.keep_path is not None:
-            name = view.keep_path.relative_to(scene.root).as_posix()
-            if name not in hashes:
-                hashes[name] = _digest(view.keep_path)
-    if MOTION not in hashes and (scene.root / MOTION).is_file():
-        hashes[MOTION] = _digest(scene.root / MOTION)
+    # what was put into the folder later is in no list
+    later = [view.keep_path for view in scene.views if view.keep_path is not None]
+    later += [scene.root / MOTION, *(p for f in MEASURED_WITH for p in sorted((scene.root / f).rglob("*")))]
+    for path in later:
+        name = path.relative_to(scene.root).as_posix()
+        if name not in hashes and path.is_file():
+            hashes[name] = _digest(path)
     moved = {} if scene.place == UNMOVED else {"place": [*scene.place.centre, scene.place.scale]}
     return config_hash({"files": hashes, "split": split, **moved})
 

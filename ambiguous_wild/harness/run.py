@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,6 +27,7 @@ from ambiguous_wild.harness.cell import (
     provenance,
 )
 from ambiguous_wild.harness.external import run_program
+from ambiguous_wild.harness.pictures import ROWS
 from ambiguous_wild.harness.result_file import (
     FAILED,
     RESULT,
@@ -37,17 +37,24 @@ from ambiguous_wild.harness.result_file import (
     write_result,
 )
 from ambiguous_wild.harness.store import read_config
-from ambiguous_wild.harness.training import Tick, train_and_measure
+from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
+from ambiguous_wild.harness.training import STOPPED, Tick, train_and_measure
 from ambiguous_wild.io import plain_yaml
-from ambiguous_wild.io.files import folder_lock, sweep, write_json, write_text
+from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
 from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
 from ambiguous_wild.methods.references import place_of
+from ambiguous_wild.splat.watchdog import FOLDER as NONFINITE
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "env.json"
 TRACEBACK = "traceback.txt"
 LOG_FILE = "log.txt"
 EFFECTS = "effects.json"
+# all that a run writes into its folder
+OURS = (
+    RESULT, FAILED, TRACEBACK, CONFIG, ENVIRONMENT, LOG_FILE, EFFECTS, FIRST_PASS, STOPPED, ROWS, WORK, LOGS,
+    NONFINITE, "checkpoint", "export", "masks", "pictures", "point_cloud.ply", "renders", "timeline.csv",
+)  # fmt: skip
 # Files that a run writes before there is anything worth keeping in its folder.
 _WORTHLESS = {CONFIG, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK, LOG_FILE}
 LOG = logging.getLogger(__name__)
@@ -217,7 +224,8 @@ def _prepare_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
     if folder.exists():
         refuse_strange_folder(folder)
         if made_anew(folder, overwrite, cell.config):
-            shutil.rmtree(folder)
+            for name in OURS:  # what a user put beside them stays
+                remove(folder / name)
         else:
             refuse_other_config(folder, cell)
             if is_finished(folder):

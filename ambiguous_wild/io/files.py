@@ -275,13 +275,23 @@ def refuse_file(path: Path | str) -> None:
         raise AwError(f"cannot make the folder {path}: a file lies there; move it, or choose another -o")
 
 
+# names of `atomic_path` and `atomic_dir` while they write
+_TEMPORARY = re.compile(r"\..+\.(\d+-[a-z0-9_]{8}\.tmp(\..*)?|(tmp|old)-[a-z0-9_]{8})", re.DOTALL)
+
+
 def sweep(folder: Path | str) -> None:
     """Remove temporary files of killed processes; call it only with the folder locked."""
-    for left in sorted(Path(folder).rglob(".*.tmp*")) + sorted(Path(folder).rglob(".*.old-*")):
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
-            left.unlink(missing_ok=True)
+    for left in sorted(Path(folder).rglob(".*")):
+        if _TEMPORARY.fullmatch(left.name):
+            remove(left)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link or a folder, if there is one."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def sweep_killed(path: Path | str) -> None:

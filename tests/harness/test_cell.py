@@ -69,6 +69,10 @@ def test_a_plain_scene_is_known_by_its_photos_masks_and_model(tmp_path):
     assert another()
     shutil.copy(root / "truth/distractor/train_1.png", root / "masks/train/train_0.png")
     assert another()
+    shutil.copytree(root / "masks/train", root / "masks/test")
+    assert another()
+    shutil.copy(root / "truth/distractor/train_1.png", root / "truth/distractor/train_0.png")
+    assert another()
     for file, old, new in (
         ("cameras.txt", "60.0 60.0", "61.0 61.0"),
         ("points3D.txt", " 0.5\n", " 0.5\n9999 0.1 0.1 4 1 2 3 0.5\n"),

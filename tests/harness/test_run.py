@@ -326,6 +326,21 @@ def test_settings_of_somebody_elses_program_do_not_make_a_folder_ours(scene, tmp
     assert (folder / "config.yaml").read_text() == "a: 1\n"
 
 
+def test_what_a_user_put_into_a_run_folder_outlives_the_run(scene, tmp_path):
+    folder = bench(scene, tmp_path, "3dgs")[1][0].folder
+    mine = [folder / name for name in ("notes.txt", "mine/a.md", ".todo.tmpl", ".my.old-stuff/b")]
+    for path in mine:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    left = [folder / ".metrics.12-abcd_123.tmp.json", folder / "renders/.test.old-abcd_123"]
+    for path in left:
+        path.write_text("of a killed process")
+    (folder / "metrics.json").write_text("{}")
+    assert bench(scene, tmp_path, "3dgs", overwrite="always")[1][0].outcome == "trained"
+    assert [path.read_text() for path in mine] == ["mine"] * 4
+    assert not any(path.exists() for path in left)
+
+
 def test_a_run_folder_that_is_a_link_is_trained_where_it_leads(scene, tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "runs/scene/3dgs").mkdir(parents=True)

@@ -167,6 +167,8 @@ def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
     c2w = np.asarray(matrix, dtype=np.float64)
     if c2w.shape not in ((4, 4), (3, 4)) or not np.isfinite(c2w).all():
         raise AwError(f"a transform_matrix of shape {list(c2w.shape)} is not [4, 4] finite numbers")
+    if c2w.shape == (4, 4) and not np.allclose(c2w[3], (0.0, 0.0, 0.0, 1.0)):
+        raise AwError(f"a transform_matrix has the last row {c2w[3].tolist()}, not 0, 0, 0, 1 (transposed?)")
     rotation = c2w[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise AwError("a transform_matrix has no rotation in its left 3x3 part (scaled or mirrored)")

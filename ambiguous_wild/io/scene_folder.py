@@ -13,7 +13,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.core.scene import SceneInfo, Split, centred, far_cameras
+from ambiguous_wild.core.scene import SceneInfo, Split, centred, unlikely
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model, ModelImage
 from ambiguous_wild.io.files import sha256_file
@@ -96,7 +96,7 @@ def load_scene(
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
     scene = Scene(root, name, views, _points(model, views), info)
-    info["warnings"] += far_cameras(scene)
+    info["warnings"] += unlikely(scene)
     return scene if raw else centred(scene)
 
 

@@ -306,6 +306,14 @@ def _far(root):
     (root / "transforms.json").write_text(json.dumps(data))
 
 
+def _transposed(root):
+    layouts.instant_ngp(root)
+    data = json.loads((root / "transforms.json").read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = [list(column) for column in zip(*frame["transform_matrix"])]
+    (root / "transforms.json").write_text(json.dumps(data))
+
+
 def _protocol(root):
     layouts.nerfbaselines(root)
     (root / "nb-info.json").write_text(json.dumps({"loader": ["colmap"], "evaluation_protocol": {}}))
@@ -323,6 +331,7 @@ def _protocol(root):
         (_transforms(frames=[{"file_path": 3}]), "frame 0 has no file_path"),
         (_transforms(ply_file_path="../p.ply"), "leads out of"),
         (_far, "too far away"),
+        (_transposed, "transposed"),
         (_protocol, "unknown loader"),
         (_no_list, "test_list.txt"),
         (_other_table, "table of another scene"),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import gzip
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera, Place
+from ambiguous_wild.core.scene import unlikely
 from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.datasets.points import random_points
 from ambiguous_wild.io.colmap_model import read_model
@@ -130,6 +132,18 @@ def test_the_page_says_what_sizes_cost_that_its_format_does_not_hold(tmp_path: P
     write_splat_ply(tmp_path / "large.ply", wall)
     (note,) = page_text(scene, [Model("m", tmp_path / "large.ply")], title="t")[2]
     assert "dB to the model" in note and "gltf" in note
+
+
+def test_cameras_and_points_that_are_probably_wrong_are_said(tmp_path: Path) -> None:
+    usual = load_scene(write_tiny_scene(tmp_path / "scene"))
+    assert unlikely(usual) == []
+    first = usual.train[0].camera
+    views = tuple(replace(v, camera=replace(first, cx=1e9)) for v in usual.views)
+    points = replace(usual.points, xyz=np.ones_like(usual.points.xyz))
+    said = " ".join(unlikely(replace(usual, views=views, points=points)))
+    assert (
+        "cameras stand at one place" in said and "principal points" in said and "points of the sparse" in said
+    )
 
 
 @pytest.mark.parametrize("side", ["train", "test"])

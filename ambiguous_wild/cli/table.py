@@ -86,6 +86,8 @@ def table_command(
     aw table runs --layout means --reported -o means.html
     aw table runs --format tidy -o results.csv    one row per method, scene, seed, image and metric
     """
+    if output is not None and output.suffix.lower() not in SUFFIXES and output.exists():
+        raise AwError(f"{output} exists, and by its name it is no table: choose another -o")
     style = style or _style_of(output)
     if sheet is not None and sheet.suffix.lower() not in SHEETS:
         raise AwError(f"--sheet {sheet}: it is a picture, give a name that ends in .png or .jpg")

@@ -75,6 +75,9 @@ def package_scenes(
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise AwError(f"two scenes are called {twice[0]}: their archives would be one file; rename one")
+    for root, name, _ in opened:
+        if output.resolve().is_relative_to(root.resolve()):
+            raise AwError(f"{output} lies inside the scene {name} and would change it; choose another -o")
     check_output(output)
     if output.is_dir() and any(output.iterdir()):
         ours = {*FIXED, *(n for n in list_names(output) if n.endswith(".zip"))}

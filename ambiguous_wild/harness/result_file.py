@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, MetricRecord, measure, remember
-from ambiguous_wild.io.files import sha256_file, write_json
+from ambiguous_wild.io.files import sha256_file, unique_keys, write_json
 from ambiguous_wild.metrics import stats
 
 Status = Literal["ok", "failed"]
@@ -233,7 +233,8 @@ def read_result(path: Path | str) -> RunResult:
     """
     path = Path(path)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
+        text = path.read_text(encoding="utf-8")
+        data = json.loads(text, parse_constant=_no_constant, object_pairs_hook=unique_keys)
     except FileNotFoundError:
         raise AwError(f"no result file {path}") from None
     except (OSError, ValueError, RecursionError) as error:

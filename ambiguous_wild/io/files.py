@@ -371,6 +371,16 @@ def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> No
             raise AwError(f"{folder / name} exists, and this command would replace it{how}")
 
 
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a JSON object; a key that stands in it twice is a ValueError (for `object_pairs_hook`)."""
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"the key {key!r} stands in it twice")
+        found[key] = value
+    return found
+
+
 def own_json(path: Path) -> dict[str, Any]:
     """Return the JSON object in a file that this program wrote; empty if it is absent or damaged."""
     try:

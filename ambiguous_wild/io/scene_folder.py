@@ -16,7 +16,7 @@ from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split, centred, unlikely
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import Model, ModelImage
-from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.files import sha256_file, unique_keys
 from ambiguous_wild.io.images import image_size
 
 SCENE_SCHEMA = 1  # version of scene.json, raised when an older reader would misread it
@@ -110,7 +110,7 @@ def read_scene_json(root: Path | str) -> SceneInfo | None:
     if not path.is_file():
         return None
     try:
-        info = json.loads(path.read_text(encoding="utf-8"))
+        info = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique_keys)
     except (ValueError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error}); build the scene again with 'aw build-scene'") from error
     version = info.get("schema_version") if isinstance(info, dict) else None

@@ -50,6 +50,10 @@ def test_the_suffix_of_the_output_is_its_format(name: str, style: str, tmp_path:
     assert (tmp_path / name).read_text() == aw_table(runs, "--format", style)[0]
     error = CliRunner().invoke(command, [str(runs), "-o", str(tmp_path / "t.pdf")]).exception
     assert isinstance(error, AwError) and "end the name in .txt, .md" in str(error)
+    result = next(runs.rglob("metrics.json"))
+    before = result.read_bytes()
+    error = CliRunner().invoke(command, [str(runs), "--format", "csv", "-o", str(result)]).exception
+    assert isinstance(error, AwError) and "no table" in str(error) and result.read_bytes() == before
 
 
 def test_several_folders_make_one_table(tmp_path: Path) -> None:

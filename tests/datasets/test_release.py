@@ -222,6 +222,8 @@ def test_nothing_of_the_users_is_replaced(scene, package, tmp_path):
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(AwError, match="is no package"):
         package_scenes([scene], tmp_path / "mine", INFO, look_for_people=False)
+    with pytest.raises(AwError, match="lies inside the scene"):
+        package_scenes([scene], scene / "package", INFO, look_for_people=False)
     copy = tmp_path / "package"
     shutil.copytree(package, copy)
     (copy / "notes.txt").write_text("mine")

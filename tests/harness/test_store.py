@@ -115,10 +115,13 @@ def test_an_absent_field_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "3", '{"schema": NaN}', "[" * 100_000, '{"a": "\ud800"}', "\x00"]
+    "text", ["", "{", "[]", "3", '{"schema": NaN}', "[" * 100_000, '{"a": "\ud800"}', "\x00", "twice"]
 )
 def test_a_damaged_file_is_named(text: str, tmp_path: Path) -> None:
     path = tmp_path / "metrics.json"
+    if text == "twice":
+        write_result(path, fake_result("3dgs"))
+        text = path.read_text().replace("{", '{"seed": 7,', 1)
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(AwError, match=r"metrics\.json"):
         read_result(path)

@@ -133,7 +133,9 @@ def test_a_path_that_leaves_the_scene_is_refused(tmp_path):
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"schema_version": 99}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"schema_version": 99}', '{"schema_version": 1, "schema_version": 1}']
+)
 def test_scene_json_that_cannot_be_read(tmp_path, text):
     write_scene(tmp_path, NAMES)
     (tmp_path / "scene.json").write_text(text)

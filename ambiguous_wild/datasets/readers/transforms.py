@@ -14,6 +14,7 @@ from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, find_photo, ins
 from ambiguous_wild.datasets.readers.colmap import sides
 from ambiguous_wild.datasets.readers.posed import brown_camera, model_of_poses
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, points_without_tracks
+from ambiguous_wild.io.files import unique_keys
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
 
@@ -29,7 +30,7 @@ def read_json(path: Path) -> dict[str, object]:
         AwError: unreadable, too large, or no mapping.
     """
     try:
-        data = json.loads(read_text(path))
+        data = json.loads(read_text(path), object_pairs_hook=unique_keys)
     except (ValueError, RecursionError) as error:
         raise AwError(f"{path} is no JSON ({error}); copy it again") from error
     if not isinstance(data, dict):

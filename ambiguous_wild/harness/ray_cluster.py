@@ -62,7 +62,8 @@ class RayCluster:
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             text = " ".join(str(error).split())[:300]
             raise AwError(
-                f"no Ray cluster at {address or 'this machine'}: {text}; run 'ray status' on its head node"
+                f"no Ray cluster at {address or 'this machine'}: {text}; run 'ray status' on its head node; "
+                "a cluster with tokens needs RAY_AUTH_MODE=token here too"
             ) from error
 
     def close(self) -> None:

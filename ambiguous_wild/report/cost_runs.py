@@ -69,6 +69,7 @@ class CostRun:
     samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
     kernel_reference_s: float = math.nan
     scene_hash: str = ""
+    protocol: str = "full"
     reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
     unprobed: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
@@ -120,6 +121,12 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
         )
     _refuse_twice(runs)
     notes += [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in runs if r.error]
+    for scene in sorted({run.scene for run in runs}):
+        of = [run for run in runs if run.scene == scene and not run.error]
+        if len({(run.scene_hash, run.protocol, *sorted(run.images)) for run in of}) > 1:
+            notes.append(
+                f"not comparable: runs on {scene} differ in the scene's version, protocol or test images"
+            )
     reference = _all_calibrated(runs)
     if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
         notes.append(
@@ -189,6 +196,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         options=tuple(sorted((_options(result["options"]) | _settings(train)).items())),
         length=_length(train, cost),
         rest=config_hash(rest),
+        protocol=str(rest["protocol"]),
         psnr=psnr,
         images=images,
         train_s=train_s,

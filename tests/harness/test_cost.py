@@ -121,6 +121,19 @@ def test_failed_and_absent_cells_make_means_missing_and_are_named(tmp_path: Path
     assert "failed: b on two" in notes and "no run: c" in notes and "on two" in notes
 
 
+def test_runs_that_were_measured_differently_are_said(tmp_path: Path) -> None:
+    for method, scene, fields in (
+        ("a", "one", {}), ("b", "one", {"scene_hash": "1" * 64}),
+        ("a", "two", {}), ("b", "two", {"psnr": (20.0, 21.0, 22.0)}),
+        ("a", "same", {}), ("b", "same", {}),
+    ):  # fmt: skip
+        cost_run(tmp_path, method, scene, **fields)
+    notes = "\n".join(read(tmp_path).notes)
+    assert (
+        notes.count("not comparable") == 2 and "runs on one differ" in notes and "runs on two differ" in notes
+    )
+
+
 def test_an_effect_is_measured_on_pairs_that_differ_in_it_alone(tmp_path: Path) -> None:
     for seed in (0, 1):
         for name, effects, gain, extra in (("n", (), 0.0, 0.0), ("e", ("exposure",), 1.5, 30.0),

@@ -307,7 +307,7 @@ class Stages:
             test,
             [p for p in truth_files if p.is_file()],
             motion.folder / FILE,
-            [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts.get("alpha", ())],
+            [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts["kept_share"]],
         )
         return self._package(work, small_key, parts, record)
 

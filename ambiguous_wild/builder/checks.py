@@ -310,9 +310,8 @@ def check_capture(
 
 def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:
     """Return the failed check of a capture with photos that are left out."""
-    first = f"{skipped[0]['source']} ({skipped[0]['skipped']})"
-    finding = f"{len(skipped)} of {total} photos are left out: {first}"
-    finding += f" and {len(skipped) - 1} more" if len(skipped) > 1 else ""
+    reasons = shortlist((f"{s['source']} ({s['skipped']})" for s in skipped), 3)
+    finding = f"{len(skipped)} of {total} photos are left out: {reasons}"
     names = tuple(s["source"] for s in skipped)
     return Check("files", "warning", "files", finding, "repair or remove them", names)
 

@@ -18,7 +18,7 @@ from PIL import Image
 
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import DownsampleResult
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.photos import MIN_SIDE
 
@@ -54,13 +54,13 @@ def downsampled_size(width: int, height: int, factor: int) -> tuple[int, int]:
     return max(1, round(width / factor)), max(1, round(height / factor))
 
 
-def check_factor(factor: int, sizes: Iterable[tuple[int, int]]) -> None:
-    """Raise AwError where a factor leaves a photo of these sizes in px too small to train on."""
-    side = min(min(size) for size in sizes) / factor
-    if factor > 1 and side < MIN_SIDE:
+def check_factor(factor: int, photos: Iterable[tuple[int, str]]) -> None:
+    """Raise AwError where a factor leaves a photo (shorter side in px, name) too small to train on."""
+    small = [f"{name} ({side / factor:.0f})" for side, name in photos if side / factor < MIN_SIDE]
+    if factor > 1 and small:
         raise AwError(
-            f"--factor {factor} leaves photos of {side:.0f} px a side, too small to train on (at least "
-            f"{MIN_SIDE}); choose a smaller factor"
+            f"--factor {factor} leaves less than {MIN_SIDE} px a side, too small to train on, of "
+            f"{shortlist(small, 3)}; choose a smaller factor, or take these photos away"
         )
 
 

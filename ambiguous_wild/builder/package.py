@@ -26,7 +26,7 @@ class SceneParts:
     test: list[str]
     truth_files: list[Path]  # cameras.json and capture.json of a simulated capture
     motion: Path  # file of the motion points
-    hidden: list[str]  # test photos whose alpha hides pixels
+    masked: list[str]  # test photos with a mask or alpha of their own
 
 
 def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool, jobs: int) -> PackageResult:
@@ -47,10 +47,9 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
         _place(small / "images", folder / f"images_{parts.factor}", link)
     _place(parts.full / "sparse" / "0", folder / "sparse" / "0", link)
     if (small / "masks").is_dir():
-        # Masks of test photos are left out: NerfBaselines would not score the masked pixels.
+        # Two folders, not masks/NAME.png: from there NerfBaselines would leave pixels out of its scores.
         _place(small / "masks", folder / "masks" / "train", link, set(parts.train))
-        # Pixels that alpha hides were never seen: psnr_valid leaves them out.
-        _place(small / "masks", folder / "masks" / "test", link, set(parts.hidden))
+        _place(small / "masks", folder / "masks" / "test", link, set(parts.masked))  # for psnr_valid alone
     for part in ("distractor", "clean"):
         if (small / "truth" / part).is_dir():
             _place(small / "truth" / part, folder / "truth" / part, link)

@@ -66,7 +66,7 @@ def build_scene(
             folders, which become one scene. They are not changed.
         output: the scene folder.
         settings: see `BuildSettings`.
-        masks: folder of keep masks (white = keep), used for features and copied to masks/train.
+        masks: folder of keep masks (white = keep), used for features and copied to masks/.
         test_list: file with the names of the test photos, one a line.
         overwrite: replace a scene built from other photos or settings.
         keep_work: leave the hidden work folder with every stage and COLMAP's log.

@@ -1,4 +1,4 @@
-"""A progress bar on standard error that threads may advance; it is hidden where that is no terminal."""
+"""A progress bar on standard error that threads may advance; a line where that is no terminal."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ class Bar:
         self.finish()
         if self.enabled:
             self._bar = tqdm(total=total, desc=what, file=sys.stderr, leave=False, disable=None)
+            if self._bar.disable:
+                click.echo(what, err=True)
 
     def step(self, count: int = 1) -> None:
         """Advance by `count`."""

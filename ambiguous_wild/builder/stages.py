@@ -244,8 +244,9 @@ class Stages:
             lambda f: screen(capture, f, strict=settings.strict, jobs=self.jobs, bar=bar),
         )
         facts = screened.facts["photos"]
-        if settings.factor is not None:
-            check_factor(settings.factor, [(f["width"], f["height"]) for f in facts])
+        sides = sorted((min(f["width"], f["height"]), f["work_name"]) for f in facts)
+        # Before the slow part the larger half of the photos; after it those that are placed.
+        check_factor(settings.factor or 1, sides[len(sides) // 2 :])
         tests = read_test_list(self.test_list, facts) if self.test_list else None
         mask_stage = self._masks(work, screened)
         sfm = self._sfm(work, screened, mask_stage)
@@ -253,6 +254,7 @@ class Stages:
         model = read_model(mapping.folder / "0")
         stems = {f["work_name"]: f["stem"] for f in facts}
         registered = {stems[i.name] for i in model.images.values()}
+        check_factor(settings.factor or 1, [s for s in sides if stems[s[1]] in registered])
         train, test, how, split_warnings = split_photos(facts, registered, tests)
         flat = self._undistort(work, screened, mask_stage, mapping, model)
         motion = work.run(
@@ -307,7 +309,7 @@ class Stages:
             test,
             [p for p in truth_files if p.is_file()],
             motion.folder / FILE,
-            [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts.get("alpha", ())],
+            [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts["kept_share"]],
         )
         return self._package(work, small_key, parts, record)
 

@@ -201,7 +201,10 @@ def _printed() -> logging.Handler:
     """Return a handler that prints records above a progress bar."""
     from tqdm import tqdm
 
+    from ambiguous_wild.cli.progress import VERBOSE
+
     handler = logging.Handler()
+    handler.set_name(VERBOSE)
     handler.emit = lambda record: tqdm.write(f"  {record.getMessage()}", file=sys.stderr)  # type: ignore[method-assign]
     return handler
 

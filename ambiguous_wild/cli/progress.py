@@ -22,8 +22,14 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.trainer import Trainer
 
 
+VERBOSE = "verbose"  # name of the handler of --verbose, which prints what bars do not
+
+
 class ProgressBar(Callbacks):
-    """A bar for each run, if runs are made one by one; it also names work between the steps."""
+    """A bar for each run, if runs are made one by one; it also names work between the steps.
+
+    Warnings stay above the bar; where standard error is no terminal the names of work are lines as well.
+    """
 
     def __init__(self, cells: int) -> None:
         self.cells, self.index = cells, 0
@@ -57,8 +63,12 @@ class ProgressBar(Callbacks):
         logging.getLogger("ambiguous_wild").addHandler(self.phases)
 
     def _phase(self, record: logging.LogRecord) -> None:
-        if self.bar is not None:
-            self.bar.set_description(record.getMessage())
+        if self.bar is None:
+            return
+        self.bar.set_description(text := record.getMessage())
+        printed = any(h.name == VERBOSE for h in logging.getLogger("ambiguous_wild").handlers)
+        if not printed and (self.bar.disable or record.levelno > logging.INFO):
+            self.bar.write(f"    {text}", file=sys.stderr)
 
     def _close(self) -> None:
         logging.getLogger("ambiguous_wild").removeHandler(self.phases)

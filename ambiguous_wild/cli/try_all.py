@@ -19,6 +19,7 @@ IN_3DGS = 1 + 1.2  # an iteration of 3dgs and one of refinesplat, in iterations 
 # Share of the time after the scene is built; the plan, measuring and the page take the rest.
 TRAINING = 0.7
 SHORTEST, LONGEST = 300, 30_000  # iterations; shorter runs show no difference of methods
+PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
 FRAMES = 60  # taken from a video
 # 'aw build-scene' on two idle cores with photos of about 1 MP: 11 take 9 to 11 s, 23 take 15 s, 40 take 43 s.
 SCENE_S = (3.0, 1.0)  # for any scene; for each photo
@@ -64,7 +65,10 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
     if compiling:
         step("screen", photos, *cores)
-    step("build-scene", photos, "-o", scene, "--name", source.resolve().stem, *cores)
+    named = source.resolve()
+    if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
+        named = named.parent
+    step("build-scene", photos, "-o", scene, "--name", named.stem, *cores)
     if compiling:
         compiling.wait()
     iterations = known_iterations(runs) or _iterations(scene, seconds - (time.monotonic() - begin), threads)

@@ -39,6 +39,12 @@ def is_text(value: str) -> bool:
     return not any("\ud800" <= c <= "\udfff" for c in value)
 
 
+def ascii_text(text: str) -> str:
+    """Return the text as OpenCV's fonts can draw it: without accents, other characters as escapes."""
+    letters = (c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
+    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in letters)
+
+
 def _unprintable(char: str) -> bool:
     """Whether it is a control, format or surrogate character, or a line or paragraph separator."""
     return unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")

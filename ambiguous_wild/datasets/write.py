@@ -183,7 +183,9 @@ def _at_photo_size(foreign: ForeignScene, settings: ImportSettings) -> ForeignSc
     if settings.factor is None:
         return foreign
     if not alone:
-        check_factor(settings.factor, [(c.width, c.height) for c in foreign.model.cameras.values()])
+        cameras, images = foreign.model.cameras, foreign.model.images.values()
+        sizes = ((cameras[i.camera_id], i.name) for i in images)
+        check_factor(settings.factor, [(min(c.width, c.height), name) for c, name in sizes])
     return dataclasses.replace(foreign, factor=settings.factor)
 
 

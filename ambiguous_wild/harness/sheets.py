@@ -12,6 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.harness.regions import true_distractor
 from ambiguous_wild.harness.store import Runs
 from ambiguous_wild.harness.trained_models import open_scene
@@ -41,8 +42,7 @@ def cell(caption: str, image: np.ndarray, width: int | None = None) -> np.ndarra
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
     frame = np.full((image.shape[0] + BAR + GAP, image.shape[1] + GAP, 3), 255, np.uint8)
     frame[BAR : BAR + image.shape[0], : image.shape[1]] = image
-    # OpenCV's fonts are ASCII; anything else would be drawn as question marks
-    text = caption.encode("ascii", "replace").decode()
+    text = ascii_text(caption)
     scale = min(SCALE, SCALE * (image.shape[1] - 4) / max(_width(text, SCALE), 1))
     scale = max(scale, 0.3)
     while len(text) > 1 and _width(text, scale) > image.shape[1] - 2:

@@ -192,6 +192,8 @@ def video_runs(
         say(note)
     cameras = _cameras(shown.scene, path, frames, width)
     prepare_cpu(threads, say)
+    labels = tuple(model.label for model in shown.models)
+    say(f"drawing {frames} frames of {', '.join(labels)}")
     kept: list[Frame] = []
     chosen = {
         round(k * (frames - 1) / max(1, round(gif_seconds * GIF_FPS) - 1))
@@ -207,7 +209,7 @@ def video_runs(
     written = write_mp4(output, watched(), fps)
     if gif is not None:
         write_gif(gif, kept, len(kept) / gif_seconds)
-    return Video(output, gif, written, written / fps, tuple(model.label for model in shown.models))
+    return Video(output, gif, written, written / fps, labels)
 
 
 def _cameras(scene: Scene, path: str | Path, frames: int, width: int | None) -> list[Camera]:

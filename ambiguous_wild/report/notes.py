@@ -16,6 +16,7 @@ from ambiguous_wild.harness.result_file import Options
 from ambiguous_wild.harness.store import Runs, read_config
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
+from ambiguous_wild.report.plain_formats import UNFITTED
 
 LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps
 REFERENCE = "reference_s"  # comparable between machines; other times are not
@@ -34,6 +35,7 @@ def notes(
         *_not_ranked(runs),
         *_references(methods),
         *_fitted(runs),
+        *_unfitted(runs),
         *_missing(runs, columns),
         *_infinite(runs, columns),
         *_not_comparable(runs, columns),
@@ -143,6 +145,17 @@ def _fitted(runs: Runs) -> list[str]:
         if names:
             lines.append(f"test photos: {shortlist(names, limit=30)}: {text}")
     return lines
+
+
+def _unfitted(runs: Runs) -> list[str]:
+    """Return a line where colour effects were learnt and whole test photos are measured without any fit."""
+    ok = runs.runs[runs.runs["status"] == "ok"]
+    if "fit" not in ok or "effects" not in ok:
+        return []
+    concerned = ok[(ok["fit"] == "full") & ok["effects"].str.contains("appearance|exposure")]
+    scenes = shortlist(sorted(set(concerned["scene"])))
+    why = "renders have the mean look of the train photos; PSNR affine or --protocol half compares without"
+    return [f"{UNFITTED} ({scenes}): {why} this difference"] if len(concerned) else []
 
 
 def _about(runs: Runs, methods: Sequence[str]) -> list[str]:

@@ -302,6 +302,7 @@ FIRST = (
     "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
     "flip", "fps", "model_mb",
 )  # fmt: skip
+UNFITTED = "colours of test photos are not fitted"  # begins a note, with which PSNR affine comes second
 
 
 def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
@@ -312,7 +313,9 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
     columns = tables[0].columns
     names = [tables[0].head, *(row_name(row) for table in tables for row in table.rows)]  # with their head
     left = width - max(map(display_width, names))
-    order = sorted(range(len(columns)), key=lambda i: (_importance(columns[i].measure), i))
+    unfitted = any(note.startswith(UNFITTED) for note in tables[-1].notes)
+    first = (FIRST[0], "psnr_affine", *FIRST[1:]) if unfitted else FIRST
+    order = sorted(range(len(columns)), key=lambda i: (_importance(columns[i].measure, first), i))
     kept: list[int] = []
     for i in order:
         need = max(_column_width(table, i) for table in tables)
@@ -328,10 +331,10 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
     return [*shown[:-1], shown[-1].with_notes(note)]
 
 
-def _importance(column: Measure) -> int:
+def _importance(column: Measure, first: Sequence[str]) -> int:
     if column.per_image and column.key not in MEASURES:
         return 0  # a user's own metric comes first
-    return FIRST.index(column.key) if column.key in FIRST else len(FIRST)
+    return first.index(column.key) if column.key in first else len(first)
 
 
 def divided(table: Table, width: int = WIDTH) -> list[Table]:

@@ -51,7 +51,7 @@ def deferred() -> Iterator[Callable[[], bool]]:
         noted.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         with suppress(RuntimeError):  # the signal may interrupt a write to the same stream
-            LOG.info("stopping: the model is measured and saved, Ctrl-C again to quit")
+            LOG.warning("stopping: the model is measured and saved, Ctrl-C again to quit")
 
     signal.signal(signal.SIGINT, note)
     try:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.core.scene import centred, together
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.viewing.model import NO_PHOTO, Model, Renderer, space_of
@@ -265,11 +266,11 @@ def draw_frames(
 
 
 def labelled(picture: Frame, label: str) -> Frame:
-    """Draw a label in the upper left corner of a picture; characters that the font lacks become '?'."""
+    """Draw a label in the upper left corner of a picture, see `ascii_text`."""
     import cv2
 
     out = picture.copy()
-    text = "".join(c if " " <= c <= "~" else "?" for c in label)
+    text = ascii_text(label)
     scale = max(0.4, picture.shape[0] / 560)
     thick = max(1, round(scale * 1.6))
     (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)

@@ -192,8 +192,8 @@ def test_a_damaged_scene_is_noticed_and_mended(scene, raw, tmp_path):
 
 
 @pytest.mark.parametrize("alpha", [False, True])
-def test_masks_are_used_and_carried_to_training_photos_only(raw, tmp_path, alpha):
-    """And similar photos are matched, not all. Alpha is a mask, of test photos too."""
+def test_masks_are_used_and_carried_to_their_photos(raw, tmp_path, alpha):
+    """And similar photos are matched, not all. Alpha is a mask."""
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, :100] = 0
     masks, noise = (
@@ -215,7 +215,7 @@ def test_masks_are_used_and_carried_to_training_photos_only(raw, tmp_path, alpha
     settings = replace(SETTINGS, matcher="retrieval")
     result = build_scene(raw, tmp_path / "scene", settings, masks=masks, keep_work=True)
     tests = [p.name for p in (result.scene / "masks").glob("test/*")]
-    assert sorted(tests) == (["p01.png", "p04.png"] if alpha else [])
+    assert sorted(tests) == ["p01.png", "p04.png"]
     assert any("alpha of 6 photos" in w for w in result.info["warnings"]) == alpha
     assert result.info["chosen"]["matcher"] == "retrieval" and 0 < result.info["counts"]["pairs"] <= 15
     carried = sorted(p.name for p in (result.scene / "masks" / "train").iterdir())

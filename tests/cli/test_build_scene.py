@@ -79,20 +79,24 @@ def test_cut_jpeg_among_good_ones_with_strict(aw, tmp_path):
 def test_cut_jpeg_among_good_ones_is_skipped_and_counted(aw, tmp_path):
     paths = write_capture(tmp_path / "raw", 6)
     paths[2].write_bytes(paths[2].read_bytes()[:5000])
-    code, out, _ = aw("raw", "-o", "scene", "--max-features", 500, "--json")
-    assert code == 0
+    # a photo that is too small after --factor, and is left out by structure from motion
+    cv2.imwrite(str(tmp_path / "raw" / "tiny.jpg"), cv2.resize(cv2.imread(str(paths[0])), (40, 30)))
+    code, out, err = aw("raw", "-o", "scene", "--max-features", 500, "--factor", 2, "--json")
+    assert code == 0, err
+    stages = ["reading photos", "features", "matching pairs", "placing photos", "undistorting"]
+    assert list(dict.fromkeys(line for line in err.splitlines() if line in stages)) == stages  # no bars here
     facts = json.loads(out)
-    assert facts["counts"]["photos"] == 6
+    assert facts["counts"]["photos"] == 7
     assert facts["counts"]["registered"] == 5
     assert facts["skipped"] == [{"source": "p02.jpg", "skipped": "cut JPEG (its end is missing)"}]
-    assert "registered 5 of 6" in facts["verdict"]
-    code, out, _ = aw("raw", "-o", "scene", "--max-features", 500)
+    assert "registered 5 of 7" in facts["verdict"]
+    code, out, _ = aw("raw", "-o", "scene", "--max-features", 500, "--factor", 2)
     assert code == 0
     assert out.startswith("scene is up to date")
-    assert "1 of 6 photos skipped: p02.jpg" in out
+    assert "1 of 7 photos skipped: p02.jpg" in out
     assert out.splitlines()[-1].endswith("next: aw bench --method refinesplat --scene scene -o runs")
     # Other features now: refused with the setting's name.
-    assert "max_features 500 -> 900" in fails(aw, "raw", "-o", "scene", "--max-features", 900)
+    assert "max_features 500 -> 900" in fails(aw, "raw", "-o", "scene", "--max-features", 900, "--factor", 2)
 
 
 def test_masks_missing_and_of_the_wrong_size(aw, tmp_path):
@@ -110,7 +114,8 @@ def test_masks_missing_and_of_the_wrong_size(aw, tmp_path):
 def test_options_that_cannot_be(aw, tmp_path):
     write_capture(tmp_path / "raw", 3)
     assert "does not exist" in fails(aw, "nowhere", "-o", "scene")
-    assert "px a side, too small to train on" in fails(aw, "raw", "-o", "scene", "--factor", 64)
+    small = fails(aw, "raw", "-o", "scene", "--factor", 64)
+    assert "px a side, too small to train on" in small and "p02.jpg (4)" in small
     assert "--factor must be" in fails(aw, "raw", "-o", "scene", "--factor", 0)
     assert "--max-features" in fails(aw, "raw", "-o", "scene", "--max-features", 3)
     assert "--help" in fails(aw, "raw")

@@ -56,9 +56,14 @@ def test_a_bar_says_what_is_done_and_goes(words: list[str], monkeypatch: pytest.
     assert "|" not in shown.left() and "PSNR" in shown.left()
 
 
+STOPPING = "stopping: the model is measured and saved, Ctrl-C again to quit"
+
+
+@pytest.mark.parametrize("terminal", [True, False])
 def test_ctrl_c_is_answered_at_once_and_leaves_no_bar(
-    words: list[str], monkeypatch: pytest.MonkeyPatch
+    words: list[str], monkeypatch: pytest.MonkeyPatch, terminal: bool
 ) -> None:
+    monkeypatch.setattr(Terminal, "isatty", lambda self: terminal)
     tick = progress.ProgressBar.tick
 
     def pressing(self, trainer):
@@ -73,8 +78,8 @@ def test_ctrl_c_is_answered_at_once_and_leaves_no_bar(
     finally:
         signal.signal(signal.SIGINT, before)
     text = shown.getvalue()
-    told = text.index("stopping: the model is measured and saved, Ctrl-C again to quit")
-    assert told < text.index("stopped after 12 iterations of 30")
+    assert text.index(STOPPING) < text.index("stopped after 12 iterations of 30")
+    assert shown.left().splitlines().count(f"    {STOPPING}") == 1  # a line that stays
     assert "|" not in shown.left() and "measuring" not in text
 
 
@@ -92,7 +97,11 @@ def test_quiet_verbose_and_the_log_of_a_run(words: list[str], tmp_path: Path) ->
     ):
         assert re.search(rf"^\d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d .*{expected}", log, re.MULTILINE), expected
     told = aw(*words, *effects, "--seed", "1", "-v").stderr
-    assert "test PSNR" in told and "measuring" in told
+    assert "test PSNR" in told and told.count("measuring") == 1
+    plain = aw(*words, *effects, "--seed", "2").stderr
+    assert re.search(
+        r"-> .*\n    setting up\n    training\n    measuring \d+ test views\n    drawing ", plain
+    )
     wrong = aw("table", tmp_path / "none", "-q")
     assert wrong.returncode == 2 and wrong.stderr.startswith("error: no folder of runs")
     assert "exclude each other" in aw("-q", "-v", "doctor").stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,16 @@ def test_json_holds_the_same_and_strict_refuses(raw: Path) -> None:
 def test_no_capture_is_one_line(tmp_path: Path) -> None:
     raised = CliRunner().invoke(command, [str(tmp_path / "absent")]).exception
     assert isinstance(raised, AwError) and "does not exist" in str(raised)
+
+
+def test_three_photos_that_are_left_out_are_named(raw: Path, tmp_path: Path) -> None:
+    shutil.copytree(raw, tmp_path / "raw")
+    for name in "abc":
+        (tmp_path / "raw" / f"{name}.jpg").write_bytes(name.encode())
+    said = CliRunner().invoke(command, [str(tmp_path / "raw"), "--json"], catch_exceptions=False).stdout
+    (finding,) = [c["finding"] for c in json.loads(said)["checks"] if c["name"] == "files"]
+    assert finding.startswith("4 of 9 photos are left out: ") and finding.endswith(" and 1 more")
+    assert finding.count("(no image") == 3 and ", a.jpg (" in finding
 
 
 def test_several_folders_are_checked_as_one_capture(raw: Path, tmp_path: Path) -> None:

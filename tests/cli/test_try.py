@@ -48,6 +48,15 @@ def test_a_video_is_captured_once(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["photos"]
 
 
+@pytest.mark.parametrize(("folder", "name"), [("statue/images", "statue"), ("statue/left", "left")])
+def test_a_scene_is_not_called_images(tmp_path: Path, folder: str, name: str) -> None:
+    (tmp_path / folder).mkdir(parents=True)
+    for i in range(3):  # of which no scene can be built
+        cv2.imwrite(str(tmp_path / folder / f"{i}.jpg"), np.full((48, 64, 3), 90 * i, np.uint8))
+    done = aw("try", folder, "-o", "out", cwd=tmp_path)
+    assert f"build-scene {folder} -o out/scene --name {name}\n" in done.stderr
+
+
 def test_what_is_neither_photos_nor_a_video_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for words, message in ((["empty"], "holds no photos"), (["empty", "--budget", "5"], "no duration")):

@@ -160,7 +160,11 @@ def _no_test(root):
     [
         (_one_photo, (), "has no train photo: 1 photo in the split"),
         (_no_test, (), "none of the 0 test photos"),
-        (layouts.native, ("--factor", 5), "--factor 5 leaves photos of 7 px a side"),
+        (
+            layouts.native,
+            ("--factor", 5),
+            "--factor 5 leaves less than 16 px a side, too small to train on, of ",
+        ),
     ],
 )
 def test_a_scene_that_cannot_be_trained_or_measured_is_refused(make, options, message, tmp_path):

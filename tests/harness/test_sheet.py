@@ -7,10 +7,11 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import plan_cells, run_cells
-from ambiguous_wild.harness.sheets import BAR, GAP, write_sheet
+from ambiguous_wild.harness.sheets import BAR, GAP, cell, write_sheet
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.viewing.video import labelled
 from tests.tiny_scene import HEIGHT, WIDTH, write_tiny_scene
 
 
@@ -30,6 +31,13 @@ def test_a_column_for_the_photo_and_each_method_a_row_for_each_view(runs, tmp_pa
     render = read_png_rgb(runs / "scene" / "3dgs" / "seed0" / "renders" / "test" / "test_0.png")
     assert np.array_equal(sheet[BAR : BAR + HEIGHT, :WIDTH], photo)
     assert np.array_equal(sheet[BAR : BAR + HEIGHT, WIDTH + GAP : 2 * WIDTH + GAP], render)
+
+
+@pytest.mark.parametrize("draw", [cell, lambda text, image: labelled(image, text)], ids=["sheet", "video"])
+def test_letters_that_the_font_lacks_are_no_question_marks(draw):
+    image = np.full((90, 320, 3), 200, np.uint8)
+    assert np.array_equal(draw("Tést_0.png ﬁ", image), draw("Test_0.png fi", image))
+    assert np.array_equal(draw("写真\n", image), draw(r"\u5199\u771f\n", image))
 
 
 def test_a_sheet_called_jpg_is_one(runs, tmp_path):

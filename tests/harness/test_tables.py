@@ -121,6 +121,20 @@ def test_unequal_effects_are_a_column_and_a_note_of_every_format(tmp_path: Path)
     assert not any("not comparable" in note for note in equal[-1].notes)
 
 
+def test_colours_that_nobody_fitted_are_a_note_and_psnr_affine_is_shown(tmp_path: Path) -> None:
+    whole: dict[str, object] = {"effects": ["appearance", "skybox"]}
+    half = whole | {"protocol": "half", "fitted": {"effects": ["appearance"], "steps": 128}}
+    more = {"ssim": 0.5, "flip": 0.2, "psnr_affine": 21.1, "psnr_covered": 19.0, "lpips_vgg": 0.3}
+    rows = [{"name": "0.png", "psnr": 16.4, "lpips_alex": 0.2, **more}]
+    for facts, said in ((whole, 1), ({"effects": ["exposure"]}, 1), (half, 0), ({"effects": ["skybox"]}, 0)):
+        runs = [fake_result(m, facts=facts, per_image=rows, missing={}) for m in ("a", "b")]
+        table = table_of(tmp_path / f"{len(list(tmp_path.iterdir()))}", *runs)
+        for render in (to_text, to_markdown, html_of):
+            assert render(table).count("colours of test photos are not fitted (yard)") == said, facts
+        assert ("psnr_affine" in keys(fitted(table, 60))) == bool(said)
+        assert len(to_text(fitted(table, 60)).splitlines()[1]) <= 60
+
+
 def test_unequal_features_and_protocols_are_named(tmp_path: Path) -> None:
     half = {"protocol": "half", "fitted": {"steps": 0}}
     table = table_of(

@@ -28,17 +28,18 @@ GROUPS = {
     "composites on 11 photos of a facade": ("sceaux-",),
     "composites on 12 drone photos": ("tiny_aerial-",),
 }
+BASELINES = ("courtyard-colour", "courtyard-plain", "seneca-patches", "monstree-cutouts")  # of seed 0 alone
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 
 
-def board() -> Board:
-    """The board's metrics of the methods that the tables show."""
+def board(only: str = "") -> Board:
+    """The board's metrics, of one seed or as means over all."""
     seeds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for name in ("simulated", "composites"):
         with (ROOT / "leaderboard" / "measured" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
                 for metric in ("psnr", "mask_iou"):
-                    if row[metric]:
+                    if row[metric] and only in ("", row["seed"]):
                         seeds[row["scene"], row["method"], metric].append(float(row[metric]))
     found: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for (scene, method, metric), values in seeds.items():
@@ -81,9 +82,22 @@ def scenes(found: Board) -> list[str]:
     return lines
 
 
+def baselines(found: Board) -> list[str]:
+    """PSNR of every method on some scenes, the best in the mean first."""
+    found = board("0")
+    psnr = {
+        name: [found[scene][name]["psnr"] for scene in BASELINES]
+        for name in found[BASELINES[0]]
+        if all(name in found[scene] for scene in BASELINES)
+    }
+    ordered = sorted(psnr, key=lambda name: -mean(psnr[name]))
+    return [line([f"`{name}`", *(f"{x:.2f}" for x in psnr[name])]) for name in ordered]
+
+
 TABLES: dict[str, dict[str, Callable[[Board], list[str]]]] = {
     "README.md": {"means": means},
     "docs/refinesplat.md": {"scenes": scenes},
+    "docs/baselines.md": {"baselines": baselines},
 }
 
 

@@ -61,8 +61,9 @@ class Runs:
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
         version, source (hash of the method's own file, or empty), fit (what was done with test photos, see
         report/notes.py), effects, length and features of the training (words; features are empty if the
-        method has none), test_photos (a warning about them, or empty), device, the numbers of
-        "cost", timing ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
+        method has none), test_photos (a warning about them, or empty), device, the numbers of "cost", timing
+        ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
+        mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 

@@ -56,6 +56,10 @@ def test_a_plugin_that_registers_nothing_is_refused(tmp_path):
             r"fails when it is loaded: ModuleNotFoundError: .* \(bad.py, line 1\)",
         ),
         ("import sys\nsys.exit(0)\n", r"fails when it is loaded: SystemExit: 0 \(bad.py, line 2\)"),
+        (
+            "from ambiguous_wild import methods\nmethods.register(methods.MethodEntry('3DGS', '', 'm:f'))\n",
+            r"plugin .*bad\.py: the method '3DGS' is built in: register yours under another name",
+        ),
     ],
 )
 def test_a_plugin_that_does_not_load_is_one_line_that_names_the_place(tmp_path, code, message):

@@ -22,7 +22,7 @@ from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.methods.entry import MethodEntry
+from ambiguous_wild.methods.entry import MethodEntry, required
 
 _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
 _helpers: dict[str, Path] = {}  # files of the modules that loaded files imported from beside them, by name
@@ -203,13 +203,13 @@ def _recipes(module: ModuleType) -> list[str]:
 
 def _config_of(recipe: typing.Callable[..., object], name: str) -> type | None:
     """Return the frozen dataclass that the function takes; None if it takes nothing."""
-    required = [p for p in inspect.signature(recipe).parameters.values() if p.default is p.empty]
-    if not required:
+    needed = required(recipe)
+    if not needed:
         return None
     try:
-        config = typing.get_type_hints(recipe).get(required[0].name)
+        config = typing.get_type_hints(recipe).get(needed[0].name)
     except NameError as error:
         raise AwError(f"{name}: {error} in the types of its arguments") from None
-    if len(required) > 1 or not (isinstance(config, type) and dataclasses.is_dataclass(config)):
+    if len(needed) > 1 or not (isinstance(config, type) and dataclasses.is_dataclass(config)):
         raise AwError(f"{name} must take nothing, or one argument whose type is a dataclass of options")
     return config

@@ -28,6 +28,7 @@ from ambiguous_wild.harness.effects_plan import Plan, plan_effects
 from ambiguous_wild.harness.run import (
     left_alone,
     made_anew,
+    refuse_other_code,
     refuse_other_config,
     refuse_strange_folder,
     run_cell,
@@ -229,7 +230,8 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
     """Return the run folder of every cell, after a check of all of them.
 
     Raises:
-        AwError: a folder holds another configuration or foreign files, or cannot be written.
+        AwError: a folder holds another configuration or foreign files, or cannot be written; or another seed
+            was trained with another version of the method's file.
     """
     folders = [cell_folder(output, cell) for cell in cells]
     for cell, folder in zip(cells, folders):
@@ -237,6 +239,10 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
             refuse_strange_folder(folder)
             if not made_anew(folder, options.overwrite, cell.config):
                 refuse_other_config(folder, cell)
+        if options.overwrite != "never" or not folder.exists():
+            left = {*folder.parent.glob("seed*/")} - ({*folders} if options.overwrite != "never" else set())
+            for other in sorted(left):
+                refuse_other_code(other, cell)
     for needed in (output, options.cache_dir):
         check_output(needed / "run")  # a folder that cannot be written is found before the training
     return folders

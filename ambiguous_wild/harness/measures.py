@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING, Any, Literal, Required, TypedDict, cast, get_a
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods.entry import resolve
-from ambiguous_wild.methods.references import import_file, place_of
+from ambiguous_wild.methods.references import import_file, place_of, source_hash
 
 if TYPE_CHECKING:
     from ambiguous_wild.core import Scene, View
@@ -194,7 +193,7 @@ def load_metrics(path: Path) -> None:
     if not in_file:
         raise AwError(f"{path} holds no Metric: see 'Your own metric' in docs/metrics.md")
     for metric in in_file:
-        register(replace(metric, source=sha256_file(path)))
+        register(replace(metric, source=source_hash(path)))
 
 
 def own() -> dict[str, Metric]:

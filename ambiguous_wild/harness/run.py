@@ -135,9 +135,13 @@ def _is_our_config(path: Path) -> bool:
 def _describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
     """Return one difference in words of the command line."""
     if key == "source":
-        return f"{getattr(file_of(cell.method), 'name', cell.method.name)} has changed since this run"
+        return f"{_file_name(cell)} has changed since this run"
     default = "full" if key == "protocol" else None  # a config leaves out the full protocol
     return f"{key} was {before.get(key, default)}, is {now.get(key, default)}"
+
+
+def _file_name(cell: Cell) -> str:
+    return getattr(file_of(cell.method), "name", cell.method.name)
 
 
 def _hint_for_weights(cell: Cell, keys: Sequence[str], before: Flat) -> str:
@@ -149,14 +153,28 @@ def _hint_for_weights(cell: Cell, keys: Sequence[str], before: Flat) -> str:
     return ""
 
 
-def refuse_other_config(folder: Path, cell: Cell) -> None:
-    """Raise AwError if the folder was made by another configuration; the error names what differs."""
-    path = folder / CONFIG
+def _is_begun(folder: Path) -> bool:
+    """Return whether a run in the folder came to its first checkpoint; before, there is nothing to lose."""
     present = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
     if not (folder / WORK / DONE).exists():
         present -= {WORK, LOGS}  # left by an external program that has not finished training
-    if not path.exists() or present <= _WORTHLESS:
-        return  # the run stopped before its first checkpoint: there is nothing to lose
+    return CONFIG in present and not present <= _WORTHLESS
+
+
+def refuse_other_code(folder: Path, cell: Cell) -> None:
+    """Raise AwError if the folder has another seed of the cell's method, trained with another file of it."""
+    if _is_begun(folder) and read_config(folder).get("source", "") != cell.method.source_hash:
+        raise AwError(
+            f"{_file_name(cell)} has changed since the run {folder}, and tables average seeds; choose "
+            "another -o, or give all seeds in one command with --overwrite changed"
+        )
+
+
+def refuse_other_config(folder: Path, cell: Cell) -> None:
+    """Raise AwError if the folder was made by another configuration; the error names what differs."""
+    path = folder / CONFIG
+    if not _is_begun(folder):
+        return
     try:
         before = flatten(plain_yaml.read_mapping(path))
     except AwError as error:

@@ -34,8 +34,8 @@ from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 CONFIG = "config.yaml"
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
-    "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "timing", "timing_reason",
-    "timing_kernel", "hardware", "effects", "length", "features",
+    "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "source", "timing",
+    "timing_reason", "timing_kernel", "hardware", "effects", "length", "features",
     "test_photos", "start",
 )  # fmt: skip
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
@@ -59,10 +59,11 @@ class Runs:
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, fit (what was done with test photos, see report/notes.py), effects, length and features of
-        the training (words; features are empty if the method has none), test_photos (a warning about them,
-        or empty), device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason,
-        timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
+        version, source (hash of the method's own file, or empty), fit (what was done with test photos, see
+        report/notes.py), effects, length and features of the training (words; features are empty if the
+        method has none), test_photos (a warning about them, or empty), device, the numbers of "cost", timing
+        ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
+        mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -278,6 +279,7 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "config_hash": result["config_hash"],
             "scene_hash": result["scene_hash"],
             "version": result["version"],
+            "source": str(read_config(run).get("source", "")),
             "fit": _fit(result["facts"]),
             "effects": effects_of(result["facts"]),
             "length": str(result["facts"].get("length") or _length(read_config(run))),

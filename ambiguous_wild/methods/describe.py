@@ -134,7 +134,7 @@ class Option:
 def recipe_text(entry: MethodEntry) -> str:
     """Return the docstring of the recipe's module, which is not imported."""
     if not isinstance(entry.recipe, str):
-        return inspect.getdoc(inspect.getmodule(entry.recipe)) or ""
+        return ""  # a file may hold many methods: each has its summary
     spec = importlib.util.find_spec(entry.recipe.partition(":")[0])
     if spec is None or spec.origin is None:
         return ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from string import Formatter
@@ -102,11 +103,18 @@ class MethodEntry:
         """Call the recipe; returns the parts that fill the training loop.
 
         Raises:
-            AwError: the recipe returned something else.
+            AwError: the recipe returned something else, or takes more than the options.
         """
         from ambiguous_wild.splat.parts import Parts
 
-        parts = resolve(self.recipe)(options)
+        recipe = resolve(self.recipe)
+        needed = required(recipe)
+        if len(needed) > 1:
+            raise AwError(
+                f"the recipe of {self.name} takes {', '.join(p.name for p in needed)}: it must take nothing, "
+                "or one argument whose type is a dataclass of options"
+            )
+        parts = recipe(options) if needed or self.config else recipe()
         if not isinstance(parts, Parts):
             what = "None" if parts is None else type(parts).__name__
             raise AwError(f"{self.name} returned {what}, it must return Parts (see docs/extend.md)")
@@ -116,6 +124,12 @@ class MethodEntry:
 @dataclass(frozen=True)
 class NoOptions:
     """The options of a method that has none."""
+
+
+def required(recipe: Callable[..., object]) -> list[inspect.Parameter]:
+    """Return the arguments without a default."""
+    every = inspect.signature(recipe).parameters.values()
+    return [p for p in every if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
 
 
 def resolve(target: Any) -> Any:

@@ -26,7 +26,7 @@ from ambiguous_wild.core.config import Facts, config_hash, from_plain, to_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io import plain_yaml
-from ambiguous_wild.io.files import own_json, write_json
+from ambiguous_wild.io.files import own_json, sha256_file, write_json
 from ambiguous_wild.methods.entry import MethodEntry, NoOptions
 from ambiguous_wild.methods.external_process import (
     DONE,
@@ -357,7 +357,7 @@ def load_description(path: Path) -> MethodEntry:
         paper=description.paper,
         needs=description.needs or "its own environment",
         # keys without influence on the result may change without a new training
-        source_hash=config_hash(_decisive(description)),
+        source_hash=config_hash(_decisive(description) | _named_files(program, path.resolve().parent)),
         program=program,
     )
 
@@ -375,6 +375,18 @@ def _decisive(description: Description) -> Facts:
     versions keep their identity."""
     plain = {k: v for k, v in to_plain(description).items() if k not in _WITHOUT_INFLUENCE}
     return {k: v for k, v in plain.items() if k not in _ADDED or v != _ADDED[k]}
+
+
+def _named_files(program: CommandProgram, folder: Path) -> Facts:
+    """Return {"files": sha256 by word}: words of commands that are files below `folder` or `cwd`; or {}."""
+    words = {*program.prefix, *program.train, *program.render, *program.resume}
+    paths = {word: (program.cwd / word).resolve() for word in words if word and "{" not in word}
+    files = {
+        word: sha256_file(path)
+        for word, path in paths.items()
+        if path.is_file() and any(path.is_relative_to(root) for root in (program.cwd, folder))
+    }
+    return {"files": files} if files else {}
 
 
 def _parse(path: Path, content: bytes) -> Facts:

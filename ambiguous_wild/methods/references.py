@@ -8,9 +8,9 @@ nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see ne
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import importlib.util
 import inspect
+import os
 import re
 import sys
 import traceback
@@ -18,11 +18,15 @@ import typing
 from pathlib import Path
 from types import ModuleType
 
+from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.methods.entry import MethodEntry
+from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.methods.entry import MethodEntry, required
 
 _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
+_helpers: dict[str, Path] = {}  # files of the modules that loaded files imported from beside them, by name
+_NO_HELPERS = (Path(os.__file__).resolve().parent, Path(__file__).resolve().parents[1])  # Python's and ours
 
 
 def import_file(path: Path) -> ModuleType:
@@ -40,16 +44,46 @@ def import_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     _loaded.add(str(spec.origin))
+    folder = path.resolve().parent
+    # helpers are imported anew: they may have been edited, and `source_hash` needs those of this file
+    for helper in [name for name, file in _helpers.items() if file.is_relative_to(folder)]:
+        del _helpers[helper]
+        sys.modules.pop(helper, None)
+    before = set(sys.modules)
     try:
         spec.loader.exec_module(module)
-    except AwError:
-        raise
+    except AwError as error:
+        raise AwError(f"plugin {path}: {error}") from error
     except SyntaxError as error:
         raise AwError(f"plugin {path}, line {error.lineno}: {error.msg}") from None
     except (Exception, SystemExit) as error:
         why = f"{type(error).__name__}: {error}{place_of(error)}"
         raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
+    finally:
+        files = {new: _file_of(new) for new in sys.modules.keys() - before}
+        _helpers.update({new: file for new, file in files.items() if file and file.is_relative_to(folder)})
     return module
+
+
+def _file_of(name: str) -> Path | None:
+    """Return the file of an imported module; None if it has none, or is Python's, ours or installed."""
+    text = str(getattr(sys.modules.get(name), "__file__", None) or "")
+    if name.startswith("aw_plugin_") or "site-packages" in text or "dist-packages" in text:
+        return None
+    file = Path(text).resolve()
+    foreign = any(file.is_relative_to(folder) for folder in _NO_HELPERS)
+    return file if file.is_file() and not foreign else None
+
+
+def source_hash(path: Path) -> str:
+    """Return the sha256 of the file loaded last, with the modules below its folder that it imported.
+
+    Without such modules it is the sha256 of the file.
+    """
+    folder = path.resolve().parent
+    own, helpers = sha256_file(path), {f for f in _helpers.values() if f.is_relative_to(folder)}
+    each = {file.relative_to(folder).as_posix(): sha256_file(file) for file in helpers}
+    return config_hash({**each, "": own}) if each else own
 
 
 def place_of(error: BaseException) -> str:
@@ -124,7 +158,7 @@ def _recipe(name: str) -> MethodEntry:
     target = getattr(module, attribute, None)
     if target is None:
         raise unknown(f"recipe in {path}", attribute, _recipes(module))
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = source_hash(path)
     if isinstance(target, MethodEntry):
         return dataclasses.replace(target, source_hash=digest)
     if not inspect.isfunction(target):
@@ -169,13 +203,13 @@ def _recipes(module: ModuleType) -> list[str]:
 
 def _config_of(recipe: typing.Callable[..., object], name: str) -> type | None:
     """Return the frozen dataclass that the function takes; None if it takes nothing."""
-    required = [p for p in inspect.signature(recipe).parameters.values() if p.default is p.empty]
-    if not required:
+    needed = required(recipe)
+    if not needed:
         return None
     try:
-        config = typing.get_type_hints(recipe).get(required[0].name)
+        config = typing.get_type_hints(recipe).get(needed[0].name)
     except NameError as error:
         raise AwError(f"{name}: {error} in the types of its arguments") from None
-    if len(required) > 1 or not (isinstance(config, type) and dataclasses.is_dataclass(config)):
+    if len(needed) > 1 or not (isinstance(config, type) and dataclasses.is_dataclass(config)):
         raise AwError(f"{name} must take nothing, or one argument whose type is a dataclass of options")
     return config

@@ -12,11 +12,16 @@ import importlib.metadata
 from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry, second_pass, trained_once
 from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
-from ambiguous_wild.methods.references import import_file, is_reference, read_reference, without_recipe
+from ambiguous_wild.methods.references import (
+    import_file,
+    is_reference,
+    read_reference,
+    source_hash,
+    without_recipe,
+)
 
 __all__ = [
     "BUILTIN",
@@ -35,9 +40,15 @@ registered: dict[str, MethodEntry] = {}  # in this process, by name
 
 
 def register(entry: MethodEntry) -> MethodEntry:
-    """Add a method; a later one of the same name replaces the earlier."""
+    """Add a method; a later one of the same name replaces the earlier, unless that is built in.
+
+    Raises:
+        AwError: the name cannot name a folder, or is that of a built-in method.
+    """
     if not entry.name or any(c in entry.name for c in "/\\\0") or entry.name.startswith("."):
         raise AwError(f"method name {entry.name!r} cannot name a folder: leave out '/' and a leading '.'")
+    if entry.name.casefold() in {known.name.casefold() for known in BUILTIN}:
+        raise AwError(f"the method {entry.name!r} is built in: register yours under another name")
     registered[entry.name] = entry
     return entry
 
@@ -107,7 +118,7 @@ def load_plugin(path: Path | str) -> list[str]:
     """
     path, before = Path(path), dict(registered)
     import_file(path)
-    digest = sha256_file(path)
+    digest = source_hash(path)
     added = [key for key, entry in registered.items() if before.get(key) is not entry]
     if not added:
         raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")

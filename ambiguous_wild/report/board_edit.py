@@ -117,7 +117,8 @@ def _merge(
 ) -> list[Entry]:
     """Return the runs of the board with those that passed, and add their reports."""
     entries = {e.key: e for e in on_board}
-    for reason, bad in _conflicts(on_board, passed):
+    kept = set(entries) - ({v.entry.key for v in passed} if replace_other else set())
+    for reason, bad in _conflicts(on_board, passed, kept):
         reports[bad.run] = AddReport(bad.run, "refused", reason)
     for v in passed:
         if v.run in reports:
@@ -155,11 +156,15 @@ def _other_numbers(new: Verified, old: Entry) -> str:
     )
 
 
-def _conflicts(on_board: list[Entry], passed: list[Verified]) -> list[tuple[str, Verified]]:
-    """Return (reason, run) of runs that contradict others; the result does not depend on their order."""
+def _conflicts(on_board: list[Entry], passed: list[Verified], kept: set[Key]) -> list[tuple[str, Verified]]:
+    """Return (reason, run) of runs that contradict others; the result does not depend on their order.
+
+    `kept` are the cells of the board that the new runs may not replace.
+    """
     cells: dict[Key, list[Verified]] = defaultdict(list)
     hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
     configs: dict[str, list[Entry]] = defaultdict(list)
+    fixed = [e for e in on_board if e.key in kept]
     for v in passed:
         cells[v.entry.key].append(v)
     for e in (*on_board, *(v.entry for v in passed)):
@@ -172,6 +177,10 @@ def _conflicts(on_board: list[Entry], passed: list[Verified]) -> list[tuple[str,
         scenes = hashes[e.dataset, e.scene]
         twins = [o for o in configs[e.config_hash] if o.key != e.key]
         others = [o for o in cells[e.key] if o.entry.result_hash != e.result_hash]
+        of_method = [o for o in fixed if o.method == e.method] or [
+            o.entry for o in passed if o.entry.method == e.method
+        ]
+        edited = [o for o in of_method if o.source != e.source]
         if len(scenes) > 1 and e.scene_hash != board_hashes.get((e.dataset, e.scene)):
             reason = (
                 f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, in another run it has "
@@ -185,6 +194,11 @@ def _conflicts(on_board: list[Entry], passed: list[Verified]) -> list[tuple[str,
             reason = (
                 f"{v.run}: its configuration is on the board as {twin.name} of dataset {twin.dataset!a}; "
                 "give it the same --dataset, or 'aw leaderboard remove' the other"
+            )
+        elif edited:
+            reason = (
+                f"{v.run}: the file of {e.method!a} differs from that of {edited[0].name}, so they cannot be "
+                "averaged or compared; give its version another name, or 'aw leaderboard remove' the other"
             )
         else:
             continue

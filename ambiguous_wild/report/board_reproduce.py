@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -60,32 +62,23 @@ def options_hash(config: RunConfig) -> str:
     return config_hash(config["options"])[:8] if config["options"] else ""
 
 
-def command(config: RunConfig, before: Sequence[str] = ()) -> str:
+def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -> str:
     """Return the command that makes the run again, with the scene by its name.
 
-    It is made from the hashed configuration alone. The command in a result file may be a stranger's text, and
-    readers of a board paste this one into a shell.
+    It is made from the hashed configuration, and the names of an own method's files. The command in a result
+    file may be a stranger's text, and readers of a board paste this one into a shell.
 
     Args:
         config: configuration of the run.
         before: commands that make its scene, see `preparation`.
+        recorded: the command in the result file.
 
     Raises:
         AwError: it would hold invisible characters: control characters, line breaks, text-direction marks.
     """
-    train, method = config["train"], config["method"]
-    words: list[object] = [
-        "aw",
-        "bench",
-        "--method",
-        method,
-        "--scene",
-        config["scene"].get("name"),
-        "--seed",
-        train["seed"],
-    ]
-    if config["source"]:
-        words += ["--plugin", "METHOD.py"]
+    train = config["train"]
+    words: list[object] = ["aw", "bench", *_method(config, recorded)]
+    words += ["--scene", config["scene"].get("name"), "--seed", train["seed"]]
     if train.get("budget_s") is None:
         words += ["--iterations", train.get("iterations")]
     else:
@@ -108,6 +101,27 @@ def command(config: RunConfig, before: Sequence[str] = ()) -> str:
     if hidden is not None:
         raise AwError(f"config.yaml holds the invisible character {hidden!a}: run again without it")
     return text
+
+
+_PLUGIN = re.compile(r"[\w.-]+\.py")
+_REFERENCE = re.compile(rf"({_PLUGIN.pattern}:\w+|external:[\w.-]+|nerfbaselines:[\w.-]+)([@+][\w@+=,.-]+)?")
+
+
+def _method(config: RunConfig, recorded: str) -> list[str]:
+    """Return --method, of an own method as it was given, and --plugin; files are named without folders."""
+    method = config["method"]
+    if not config["source"]:
+        return ["--method", method]
+    try:
+        words = shlex.split(recorded)
+    except ValueError:
+        words = []
+    given = {flag: re.sub(r"^(external:)?.*/", r"\1", word) for flag, word in pairwise(words)}
+    reference, plugin = given.get("--method", ""), given.get("--plugin", "")
+    # the name of an ablation's variant says more than the reference
+    if _REFERENCE.fullmatch(reference) and ("@" in reference) == ("@" in method):
+        return ["--method", reference]
+    return ["--method", method, "--plugin", plugin if _PLUGIN.fullmatch(plugin) else "METHOD.py"]
 
 
 def _changed(config: RunConfig) -> dict[str, str]:

@@ -96,7 +96,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
     verdict = timing_of(result["cost"]).verdict
     if verdict != "unknown":
         cost[ALONE] = float(verdict == "alone")
-    setting_text, reproduce = _words(run, config, preparation(scene))
+    setting_text, reproduce = _words(run, config, preparation(scene), str(result.get("reproduce", "")))
     entry = Entry(
         dataset=check_text("dataset", dataset),
         scene=check_text(f"scene name of {run}", result["scene"]),
@@ -156,10 +156,12 @@ def _config(run: Path) -> RunConfig:
     return cast(RunConfig, config)
 
 
-def _words(run: Path, config: RunConfig, before: list[str]) -> tuple[str, str]:
+def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tuple[str, str]:
     """Return (setting, commands) of a configuration, which a stranger may have written."""
     try:
-        return check_text(f"setting of {run}", setting(config, _planned(run))), command(config, before)
+        return check_text(f"setting of {run}", setting(config, _planned(run))), command(
+            config, before, recorded
+        )
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:

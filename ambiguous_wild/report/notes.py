@@ -237,6 +237,12 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
+    for method, group in ok.groupby("method"):
+        if "source" in ok and group["source"].nunique() > 1:
+            lines.append(
+                f"{UNEQUAL}: results of {method} come from {group['source'].nunique()} versions of its file "
+                "(source in config.yaml differs); run them again with one"
+            )
     if "iterations" in ok and not any("lengths differ" in line for line in unequal(ok)):
         lengths = ok["iterations"].astype(float)
         longest = lengths[np.isfinite(lengths)].groupby(ok["method"]).max()

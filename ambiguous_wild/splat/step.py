@@ -21,7 +21,7 @@ NOMINAL_ITERATIONS = 30_000  # schedules are written for this length and scale w
 
 @dataclass(frozen=True)
 class TrainData:
-    """The training side of the scene; parts of a method never get the test side."""
+    """The training side of the scene. Parts of a method must not read `scene.test`, the test side."""
 
     scene: Scene
     photos: Sequence[Tensor]  # one for each train view: [H, W, 3] float32 in [0, 1], sRGB, on `device`

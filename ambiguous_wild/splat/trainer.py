@@ -224,6 +224,7 @@ class Trainer(Run):
             self.iteration = iteration
             return math.nan
         step = self.make_step(iteration, view)
+        changes = step.photo._version  # torch counts changes in place
         with part("mask"):
             keep = self.combine_user_keep(step, self.parts.mask.keep(step))
         with part("loss"):
@@ -233,6 +234,11 @@ class Trainer(Run):
         with part("mask loss"):
             method_cotangents = self.parts.mask.cotangent(step, keep)
             _refuse_a_loss(method_cotangents, step)
+            if step.photo._version != changes:
+                raise AwError(
+                    f"keep or cotangent of {type(self.parts.mask).__name__} changed step.photo in place, on "
+                    "which later steps train: change a copy, step.photo.clone()"
+                )
         if self.sentinel is None and keep is not None and not bool(keep.any()):
             # Nothing to learn: steps by Adam's momentum alone would drift away from the scene.
             self._skipped.add(step.view)
@@ -344,9 +350,18 @@ class Trainer(Run):
 
 def _refuse_a_loss(value: object, step: Step) -> None:
     """Raise AwError if `cotangent` of a mask policy returned a loss, or a gradient of another shape."""
-    if value is None or isinstance(value, Cotangents):
+    if value is None:
         return
     shape = list(step.rendered.image.shape)
+    if isinstance(value, Cotangents):
+        for name, size in {"image": shape, "extra": shape, "alpha": shape[:2], "depth": shape[:2]}.items():
+            tensor = getattr(value, name)
+            if tensor is not None and list(tensor.shape) != size:
+                raise AwError(
+                    f"cotangent(step, keep) of the method's mask policy gave {name} {list(tensor.shape)}; it "
+                    f"must be {size}"
+                )
+        return
     if not isinstance(value, Tensor) or list(value.shape) != shape:
         what = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
         raise AwError(

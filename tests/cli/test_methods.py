@@ -39,11 +39,14 @@ def test_json_holds_the_same_facts() -> None:
 def test_a_plugin_is_listed(tmp_path: Path) -> None:
     plugin = tmp_path / "mine.py"
     plugin.write_text(
-        "from ambiguous_wild.methods import MethodEntry, register\n"
+        "'About the file.'\nfrom ambiguous_wild.methods import MethodEntry, register\n"
         "register(MethodEntry(name='mine', summary='my own', recipe='x:y', needs='a GPU'))\n"
     )
     out = CliRunner().invoke(command, ["--plugin", str(plugin)], catch_exceptions=False).output
     assert "mine" in out and "needs: a GPU" in out
+    plugin.write_text(plugin.read_text().replace("'x:y'", "lambda options: None"))
+    full = shown("--plugin", str(plugin), "mine")
+    assert "my own" in full and "About the file" not in full
     error = CliRunner().invoke(command, ["--plugin", str(tmp_path / "no.py")]).exception
     assert isinstance(error, AwError)
 

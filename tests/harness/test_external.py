@@ -129,6 +129,11 @@ def test_what_changes_the_result_changes_the_identity_and_nothing_else_does(scen
 
     assert identity() == identity(summary="words", timeout_h=3.0)
     assert identity() != identity(render=[*BASE["render"], "--half-size"])
+    by_script = [identity(prefix=["python", "own.py"])]  # no such file yet: as in earlier versions
+    for code in ("first", "second", "second"):
+        (tmp_path / "own.py").write_text(code)
+        by_script.append(identity(prefix=["python", "own.py"]))
+    assert len(set(by_script)) == 3 and by_script[2] == by_script[3]
 
 
 def test_a_failure_is_the_result_and_says_the_last_lines_of_its_log(scene, tmp_path):

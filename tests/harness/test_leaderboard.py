@@ -227,6 +227,20 @@ def test_another_scene_of_the_same_name_is_refused(one: Path, tmp_path: Path) ->
     assert done.exit_code == 2 and "their numbers cannot be compared" in done.stdout
 
 
+def test_an_edited_method_is_refused(tmp_path: Path) -> None:
+    scene, board = write_scene(tmp_path / "wall"), tmp_path / "board"
+    old = write_run(tmp_path / "runs", scene, "mine", 0)
+    new = [write_run(tmp_path / "new", scene, "mine", seed, source="ab" * 32, noise=5.0) for seed in (0, 1)]
+    both = add(board, old, new[1])  # neither wins by standing first
+    assert both.stdout.count("the file of 'mine' differs") == 2 and not board.exists()
+    add(board, old)
+    for words in ((new[1],), (new[1], "--overwrite")):
+        done = add(board, *words)
+        assert done.exit_code == 2 and "differs from that of mine on wall with seed 0" in done.stdout
+    assert add(board, *new, "--overwrite").exit_code == 0  # no run of the old file is left
+    assert {e.source for e in read_board(board)} == {"ab" * 32} and check(board).problems == ()
+
+
 def test_without_its_scene_a_run_is_marked_and_needs_a_dataset(one: Path, tmp_path: Path) -> None:
     board, moved = tmp_path / "board", tmp_path / "scenes" / "wall"
     moved.parent.mkdir()

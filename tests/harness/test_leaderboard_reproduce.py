@@ -14,12 +14,16 @@ import pytest
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.harness.cell import reproduce
+from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.report.board import read_board
 from ambiguous_wild.report.board_reproduce import command, preparation
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec_file import parse_spec, plain_spec
+from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 SETTINGS = {"factor": 2, "camera": "auto", "matcher": "auto", "seed": 0, "strict": False, "sfm": "auto"}
@@ -76,6 +80,36 @@ def test_a_default_that_depends_on_the_machine_is_named(method: str, named: set[
     }
     words = shlex.split(command(config))
     assert {words[i + 1] for i, word in enumerate(words) if word == "--set"} == named
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("own.py:b", ["--method", "own.py:b"]),
+        ("own.py:b@density=uad", ["--method", "own.py:b@density=uad"]),
+        ("external:own.yaml", ["--method", "external:own.yaml"]),
+        ("plugged", ["--method", "plugged", "--plugin", "own.py"]),
+    ],
+)
+def test_an_own_method_is_named_as_it_was_given(
+    given: str, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(
+        "from ambiguous_wild.methods import MethodEntry, register\n"
+        "from ambiguous_wild.splat.parts import Parts\n\n"
+        "def b(): return Parts()\n\nregister(MethodEntry('plugged', '', lambda options: Parts()))\n"
+    )
+    Path("own.yaml").write_text("{name: other, train: aw, render: aw, renders: '{output}/{stem}.png'}")
+    monkeypatch.setattr(registry, "registered", {})
+    registry.load_plugin(Path("own.py"))
+    (cell,) = plan_cells([given], [write_tiny_scene(tmp_path / "scene")], [0], TrainConfig(iterations=5))
+    line = command(cell.config, (), reproduce(cell))
+    assert line.startswith(shlex.join(["aw", "bench", *words, "--scene"])), line
+    assert registry.get_method(words[1]).source_hash == cell.config["source"]
+    # a stranger's text gives no more than names
+    hostile = command(cell.config, (), "aw --method 'x/$(rm).py:b;' --plugin '../a b.py' \"")
+    assert "rm" not in hostile and f"--method {cell.method.name} --plugin METHOD.py" in hostile
 
 
 def test_another_spec_is_written_out(tmp_path: Path) -> None:

@@ -246,8 +246,12 @@ def test_a_changed_file_is_named_and_trained_again_alone(scene, tmp_path):
         bench(scene, tmp_path / "runs", *methods)
     assert "(my.py has changed since this run)" in str(refused.value)
     assert "--overwrite changed" in str(refused.value)
+    for overwrite in ("missing", "never", "always"):  # a table would average the two versions
+        with pytest.raises(AwError, match=r"my\.py has changed since the run .*seed0"):
+            bench(scene, tmp_path / "runs", methods[0], seeds=[1], overwrite=overwrite)
     outcomes = [r.outcome for r in bench(scene, tmp_path / "runs", *methods, overwrite="changed")[1]]
     assert outcomes == ["trained", "kept"]
+    assert bench(scene, tmp_path / "runs", methods[0], seeds=[1])[1][0].outcome == "trained"
     longer = dataclasses.replace(SHORT, iterations=61)
     with pytest.raises(AwError, match=r"train\.iterations was 60, is 61"):
         bench(scene, tmp_path / "runs", "3dgs", train=longer, overwrite="changed")

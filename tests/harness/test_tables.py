@@ -148,6 +148,19 @@ def test_unequal_features_and_protocols_are_named(tmp_path: Path) -> None:
     assert "not comparable: protocols differ on yard" in notes
 
 
+def test_versions_of_a_methods_file_are_not_comparable(tmp_path: Path) -> None:
+    results = [fake_result(method, seed=seed) for method in "ab" for seed in (0, 1)]
+    save(tmp_path, *results)
+    for result in results:  # b was edited between its seeds
+        source = f"{result['method']}{result['seed'] * (result['method'] == 'b')}"
+        folder = tmp_path / "yard" / result["method"] / f"seed{result['seed']}"
+        (folder / "config.yaml").write_text(f"source: {source}\n")
+    table = comparison(read_runs(tmp_path))
+    named = [note for note in table[-1].notes if note.startswith("not comparable")]
+    assert len(named) == 1 and "results of b come from 2 versions of its file" in named[0]
+    assert named[0] in to_text(table)
+
+
 def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_path: Path) -> None:
     mixed = {"test_photos": "test photos may hold distractors: every 8th photo tests"}
     table = table_of(tmp_path, fake_result("a", facts=mixed), fake_result("b", facts=mixed))

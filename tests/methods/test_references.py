@@ -1,5 +1,8 @@
 """A method named by where it lies: `recipe.py:my_recipe`."""
 
+import hashlib
+import sys
+
 import pytest
 
 from ambiguous_wild.core import AwError
@@ -75,6 +78,34 @@ def test_a_changed_file_is_another_method(recipe):
     with pytest.raises(AwError, match="so is another method"):
         registry.get_method(f"{other}:plain")
     assert registry.get_method(f"{recipe}:plain").source_hash != before  # of the same file, as in a notebook
+
+
+def test_a_changed_helper_is_another_method(recipe, tmp_path, monkeypatch):
+    """Its hash depends on neither what was loaded before nor packages installed below the folder."""
+    alone = registry.get_method(f"{recipe}:plain").source_hash
+    assert alone == hashlib.sha256(recipe.read_bytes()).hexdigest()
+    monkeypatch.syspath_prepend(tmp_path / "lib" / "site-packages")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in (
+        "bench_helpers/inner.py",
+        "bench_helpers/__init__.py",
+        "lib/site-packages/bench_installed.py",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("degree = 1\n")
+    recipe.write_text("import bench_installed\nfrom bench_helpers.inner import degree\n" + CODE)
+    (tmp_path / "sibling.py").write_text("import bench_helpers.inner\n" + CODE)
+    hashes = []
+    for degree in (1, 10):
+        (tmp_path / "bench_helpers" / "inner.py").write_text(f"degree = {degree}\n")
+        assert len({registry.get_method(f"{recipe}:{name}").source_hash for name in ("plain", "tuned")}) == 1
+        hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
+        registry.import_file(tmp_path / "sibling.py")
+        hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
+        assert sys.modules["aw_plugin_recipe"].degree == degree
+    (tmp_path / "lib/site-packages/bench_installed.py").write_text("degree = 1000\n")
+    hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
+    assert hashes[0] == hashes[1] != hashes[2] == hashes[3] == hashes[4] and alone not in hashes
 
 
 def test_it_is_a_host_of_grafts(recipe):

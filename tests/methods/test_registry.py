@@ -5,6 +5,8 @@ import pytest
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods import MethodEntry, all_methods, get_method, load_plugin, register, registry
+from ambiguous_wild.methods.entry import NoOptions
+from ambiguous_wild.splat.parts import Parts
 
 
 @pytest.fixture(autouse=True)
@@ -56,12 +58,23 @@ def test_a_plugin_that_registers_nothing_is_refused(tmp_path):
             r"fails when it is loaded: ModuleNotFoundError: .* \(bad.py, line 1\)",
         ),
         ("import sys\nsys.exit(0)\n", r"fails when it is loaded: SystemExit: 0 \(bad.py, line 2\)"),
+        (
+            "from ambiguous_wild import methods\nmethods.register(methods.MethodEntry('3DGS', '', 'm:f'))\n",
+            r"plugin .*bad\.py: the method '3DGS' is built in: register yours under another name",
+        ),
     ],
 )
 def test_a_plugin_that_does_not_load_is_one_line_that_names_the_place(tmp_path, code, message):
     (tmp_path / "bad.py").write_text(code)
     with pytest.raises(AwError, match=message):
         load_plugin(tmp_path / "bad.py")
+
+
+def test_a_recipe_without_options_may_take_nothing():
+    for recipe in (lambda: Parts(sh_degree=2), lambda *any: Parts(sh_degree=2 + len(any))):
+        assert MethodEntry("none", "", recipe).build(NoOptions()).sh_degree == 2
+    with pytest.raises(AwError, match="the recipe of two takes a, b: it must take nothing, or one"):
+        MethodEntry("two", "", lambda a, b: Parts()).build(None)
 
 
 def test_a_changed_plugin_is_another_configuration(tmp_path):

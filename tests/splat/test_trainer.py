@@ -22,6 +22,7 @@ from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, divisor_at
 from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.rendered import Cotangents
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
 
@@ -203,6 +204,34 @@ def test_keep_maps_of_absurd_values_are_refused(scene, tmp_path, value):
 
     with pytest.raises(AwError, match="gave values from"):
         trainer_for(scene, tmp_path, parts=Parts(mask=Absurd())).step()
+
+
+class _Darkens(MaskPolicy):
+    def keep(self, step):
+        step.photo.mul_(0.99)
+
+
+class _OneChannel(MaskPolicy):
+    def cotangent(self, step, keep):
+        return Cotangents(image=torch.zeros(*step.photo.shape[:2], 1))
+
+
+class _AlphaWithChannel(MaskPolicy):
+    def cotangent(self, step, keep):
+        return Cotangents(alpha=torch.zeros(*step.photo.shape[:2], 1))
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (_Darkens(), "keep or cotangent of _Darkens changed step.photo in place"),
+        (_OneChannel(), r"gave image \[\d+, \d+, 1\]; it must be \[\d+, \d+, 3\]"),
+        (_AlphaWithChannel(), r"gave alpha \[\d+, \d+, 1\]; it must be \[\d+, \d+\]"),
+    ],
+)
+def test_what_a_policy_must_not_do_is_refused(scene, tmp_path, mask, message):
+    with pytest.raises(AwError, match=message):
+        trainer_for(scene, tmp_path, parts=Parts(mask=mask)).step()
 
 
 def test_a_length_that_nobody_trains_is_refused():

@@ -26,7 +26,7 @@ function commands(run) {
 function needs(run) {
   const lacking = [];
   if (!run.reproduce.startsWith("aw simulate ") && !run.reproduce.startsWith("printf %s ")) lacking.push(`the scene with hash ${run.scene_hash.slice(0, 12)} as folder ${run.scene}`);
-  if (run.source) lacking.push(`the method's file with sha256 ${run.source.slice(0, 12)} as METHOD.py`);
+  if (run.source) lacking.push(`the method's file, whose hash (source) is ${run.source.slice(0, 12)}`);
   return lacking.length ? h("p", { class: "small" }, `Before the command: ${lacking.join("; ")}.`) : null;
 }
 

@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import flatten
+from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, own
 from ambiguous_wild.harness.result_file import (
@@ -34,9 +34,9 @@ from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 CONFIG = "config.yaml"
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
-    "status", "error", "folder", "device", "version", "config_hash", "scene_hash", "source", "timing",
-    "timing_reason", "timing_kernel", "hardware", "effects", "length", "features",
-    "test_photos", "start",
+    "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",
+    "options_hash", "training", "timing", "timing_reason", "timing_kernel", "hardware", "effects", "length",
+    "features", "test_photos", "start",
 )  # fmt: skip
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
@@ -59,11 +59,11 @@ class Runs:
 
     images: one row per run, image and metric: scene, method, seed, image, metric, value (NaN = missing).
     runs: one row per run: scene, method, seed, status, error, folder, images, config_hash, scene_hash,
-        version, source (hash of the method's own file, or empty), fit (what was done with test photos, see
-        report/notes.py), effects, length and features of the training (words; features are empty if the
-        method has none), test_photos (a warning about them, or empty), device, the numbers of "cost", timing
-        ("alone", "contended", "unknown"), timing_reason, timing_kernel, hardware, and mask_iou,
-        mask_precision, mask_recall.
+        version, code_hash, source (hash of the method's own file, or empty), options_hash, fit (what was done
+        with test photos, see report/notes.py), effects, length, features and other settings of the training
+        (words; features are empty if the method has none), test_photos (a warning about them, or empty),
+        device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason, timing_kernel,
+        hardware, and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -279,7 +279,10 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "config_hash": result["config_hash"],
             "scene_hash": result["scene_hash"],
             "version": result["version"],
+            "code_hash": str(result.get("code_hash", "")),
             "source": str(read_config(run).get("source", "")),
+            "options_hash": config_hash(result["options"]),
+            "training": _training(read_config(run)),
             "fit": _fit(result["facts"]),
             "effects": effects_of(result["facts"]),
             "length": str(result["facts"].get("length") or _length(read_config(run))),
@@ -310,6 +313,17 @@ def _length(config: ReadConfig) -> str:
     if settings.get("budget_s") is not None:
         return f"{settings['budget_s']:g} s"
     return f"{settings['iterations']} iterations" if "iterations" in settings else ""
+
+
+# settings of training that have a column of their own or decide nothing
+_OTHER = ("iterations", "budget_s", "seed", "torch_threads", "checkpoint_every_s", "probes", "on_nonfinite")
+
+
+def _training(config: ReadConfig) -> str:
+    """Return the other settings of training that config.yaml holds, as text."""
+    train = config.get("train")
+    settings = {k: v for k, v in train.items() if k not in _OTHER} if isinstance(train, dict) else {}
+    return ", ".join(f"{key} {'auto' if value is None else value}" for key, value in sorted(settings.items()))
 
 
 def _features(options: Options) -> str:

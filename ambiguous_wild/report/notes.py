@@ -51,6 +51,7 @@ CONDITIONS = {
     "fit": "protocols",
     "features": "features",
     "start": "starts",
+    "training": "settings of training",
 }
 
 
@@ -237,11 +238,15 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
+    for _, group in ok.groupby(["method", "scene"]) if "options_hash" in ok else ():
+        if group["options_hash"].nunique() > 1:
+            method, scene = group["method"].iloc[0], group["scene"].iloc[0]
+            lines.append(f"{UNEQUAL}: runs of {method} on {scene} have different options")
     for method, group in ok.groupby("method"):
         if "source" in ok and group["source"].nunique() > 1:
             lines.append(
-                f"{UNEQUAL}: results of {method} come from {group['source'].nunique()} versions of its file "
-                "(source in config.yaml differs); run them again with one"
+                f"{UNEQUAL}: results of {method!s} come from {group['source'].nunique()} versions of its "
+                "file (source in config.yaml differs); run them again with one"
             )
     if "iterations" in ok and not any("lengths differ" in line for line in unequal(ok)):
         lengths = ok["iterations"].astype(float)
@@ -257,6 +262,12 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         lines.append(
             "results of different versions of ambiguous_wild: " + ", ".join(sorted(set(ok["version"])))
         )
+    elif "code_hash" in ok and ok["code_hash"].nunique() > 1:
+        lines.append(f"results of {ok['code_hash'].nunique()} states of ambiguous_wild's code")
+    seeds = ok.groupby("method")["seed"].nunique()
+    if seeds.nunique() > 1:
+        each = shortlist((f"{method} {count}" for method, count in seeds.items()), limit=12)
+        lines.append(f"methods have different numbers of seeds: {each}")
     return lines
 
 

@@ -148,6 +148,20 @@ def test_unequal_features_and_protocols_are_named(tmp_path: Path) -> None:
     assert "not comparable: protocols differ on yard" in notes
 
 
+def test_settings_code_and_seeds_that_differ_are_said(tmp_path: Path) -> None:
+    other = {"options": {"every": 2}, "code_hash": "1" * 64}
+    save(tmp_path, fake_result("a"), fake_result("a", seed=1, **other), fake_result("b"))
+    (tmp_path / "yard/b/seed0/config.yaml").write_text("train: {max_gaussians: 50, iterations: 7, probes: 0}")
+    notes = "\n".join(comparison(read_runs(tmp_path))[-1].notes)
+    assert "not comparable: runs of a on yard have different options" in notes
+    assert "not comparable: settings of training differ on yard" not in notes  # a has none on record
+    assert "2 states of ambiguous_wild's code" in notes and "numbers of seeds: a 2, b 1" in notes
+    for seed in (0, 1):
+        (tmp_path / f"yard/a/seed{seed}/config.yaml").write_text("train: {max_gaussians: null, seed: 1}")
+    notes = "\n".join(comparison(read_runs(tmp_path))[-1].notes)
+    assert "settings of training differ on yard: a: max_gaussians auto, b: max_gaussians 50" in notes
+
+
 def test_versions_of_a_methods_file_are_not_comparable(tmp_path: Path) -> None:
     results = [fake_result(method, seed=seed) for method in "ab" for seed in (0, 1)]
     save(tmp_path, *results)

@@ -275,6 +275,7 @@ RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", 
 VIEW = ("stem", "name", "index")
 _WITHOUT_INFLUENCE = ("summary", "paper", "needs", "timeout_h")  # keys that do not change the result
 _ADDED = {"photos": "all", "drawn_by": "program"}  # keys of later versions, with their defaults
+_CODE = (".py", ".sh", ".yaml", ".yml", ".toml", ".json")  # other files may be logs, weights or builds
 LISTS = ("train_names", "test_names", "train_stems", "test_stems")
 
 
@@ -378,9 +379,9 @@ def _decisive(description: Description) -> Facts:
 
 
 def _named_files(program: CommandProgram, folder: Path) -> Facts:
-    """Return {"files": sha256 by word}: words of commands that are files below `folder` or `cwd`; or {}."""
+    """Return {"files": sha256 by word}: words of commands that are code below `folder` or `cwd`; or {}."""
     words = {*program.prefix, *program.train, *program.render, *program.resume}
-    paths = {word: (program.cwd / word).resolve() for word in words if word and "{" not in word}
+    paths = {word: (program.cwd / word).resolve() for word in words if word.endswith(_CODE)}
     files = {
         word: sha256_file(path)
         for word, path in paths.items()

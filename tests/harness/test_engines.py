@@ -121,10 +121,12 @@ def test_ray_one_worker_killed_in_the_middle_gives_what_one_process_gives(scene,
 def cell(scene, frail, tmp_path):
     """A cell that is never trained here, and its job."""
     (cell,) = plan_cells([frail[0]], [scene], [0], SHORT)
-    sources = jobs.read_sources([], [frail[0]])
-    return cell, jobs.make_job(
-        cell, cell_folder(tmp_path / "runs", cell), RunOptions(tmp_path / "c"), sources
-    )
+    return cell, job_of(cell, frail[0], tmp_path)
+
+
+def job_of(cell, method, folder):
+    sources = jobs.read_sources([], [method])
+    return jobs.make_job(cell, cell_folder(folder / "runs", cell), RunOptions(folder / "c"), sources)
 
 
 def test_a_cell_that_kills_every_process_is_a_failure(cell, tmp_path):
@@ -139,11 +141,18 @@ def test_a_cell_that_kills_every_process_is_a_failure(cell, tmp_path):
     assert read_result(folder / "failed.json")["error"] == report.error
 
 
-def test_a_job_makes_the_same_cell_without_the_files_of_its_method(cell, frail):
-    cell, job = cell
-    registry.registered.clear()
-    elsewhere = [replace(s, path=f"/nowhere/{Path(s.path).name}") for s in job.sources]
-    again = jobs.make_cell(replace(job, sources=tuple(elsewhere)))
+def test_a_job_makes_the_same_cell_without_the_files_of_its_method(cell, scene, tmp_path):
+    def elsewhere(job):
+        registry.registered.clear()
+        sources = [replace(s, path=f"/nowhere/{Path(s.path).name}") for s in job.sources]
+        return jobs.make_cell(replace(job, sources=tuple(sources)))
+
+    with pytest.raises(AwError, match="a file of the method differs there"):  # frail.py does not travel
+        elsewhere(cell[1])
+    own = tmp_path / "own.py"
+    own.write_text("from ambiguous_wild.splat.parts import Parts\ndef own(): return Parts()\n")
+    (cell,) = plan_cells([f"{own}:own"], [scene], [0], SHORT)
+    again = elsewhere(job_of(cell, f"{own}:own", tmp_path))
     assert again.identity == cell.identity
     assert again.options == cell.options and again.train == cell.train
 

@@ -129,10 +129,12 @@ def test_what_changes_the_result_changes_the_identity_and_nothing_else_does(scen
 
     assert identity() == identity(summary="words", timeout_h=3.0)
     assert identity() != identity(render=[*BASE["render"], "--half-size"])
-    by_script = [identity(prefix=["python", "own.py"])]  # no such file yet: as in earlier versions
-    for code in ("first", "second", "second"):
+    named = ["python", "own.py", str(tmp_path / "log")]
+    by_script = [identity(prefix=named)]  # no such file yet: as in earlier versions
+    for code, log in (("first", "a"), ("second", "a"), ("second", "b")):
         (tmp_path / "own.py").write_text(code)
-        by_script.append(identity(prefix=["python", "own.py"]))
+        (tmp_path / "log").write_text(log)
+        by_script.append(identity(prefix=named))
     assert len(set(by_script)) == 3 and by_script[2] == by_script[3]
 
 

@@ -270,7 +270,7 @@ def _image_rows(results: list[FolderResult]) -> Iterator[TableRow]:
 def _run_row(run: Path, result: RunResult) -> TableRow:
     masks = mask_scores(result)
     cost = {k: v for k, v in result["cost"].items() if not isinstance(v, (dict, list))}
-    timing = timing_of(result["cost"])
+    timing, config = timing_of(result["cost"]), read_config(run)
     return (
         _key(result)
         | {
@@ -280,12 +280,12 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "scene_hash": result["scene_hash"],
             "version": result["version"],
             "code_hash": str(result.get("code_hash", "")),
-            "source": str(read_config(run).get("source", "")),
+            "source": str(config.get("source", "")),
             "options_hash": config_hash(result["options"]),
-            "training": _training(read_config(run)),
+            "training": _training(config),
             "fit": _fit(result["facts"]),
             "effects": effects_of(result["facts"]),
-            "length": str(result["facts"].get("length") or _length(read_config(run))),
+            "length": str(result["facts"].get("length") or _length(config)),
             "test_photos": str(result["facts"].get("test_photos", "")),
             "features": _features(result["options"]),
             "start": str(result["facts"].get("start", "the scene's points")),

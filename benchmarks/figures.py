@@ -28,7 +28,7 @@ GROUPS = {
     "composites on 11 photos of a facade": ("sceaux-",),
     "composites on 12 drone photos": ("tiny_aerial-",),
 }
-BASELINES = ("courtyard-colour", "courtyard-plain", "seneca-patches", "monstree-cutouts")  # of seed 0 alone
+BASELINES = ("courtyard-colour", "courtyard-plain", "monstree-cutouts")  # of seed 0 alone
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 
 

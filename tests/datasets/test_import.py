@@ -350,8 +350,8 @@ def test_a_wrong_dataset_is_one_line_and_nothing_is_left(spoil, message, tmp_pat
     spoil(tmp_path / "raw")
     done = aw("import", tmp_path / "raw", "-o", tmp_path / "scene")
     assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
+    *stages, error = done.stderr.splitlines()
+    assert message in error and len(stages) <= 1 and "Traceback" not in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
 
 

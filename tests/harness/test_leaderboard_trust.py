@@ -144,8 +144,9 @@ def hide(scene: Path) -> None:
         cv2.imwrite(str(path), truth)
 
 
-def test_every_metric_of_pictures_is_computed_again(one: Path, tmp_path: Path) -> None:
-    hide(tmp_path / "wall")
+def test_every_metric_of_pictures_is_computed_again(tmp_path: Path) -> None:
+    hide(write_scene(tmp_path / "wall"))
+    one = write_run(tmp_path / "runs", tmp_path / "wall")
     names = measure_everything(one, tmp_path / "wall")
     checked = {"flip", "psnr_affine", "psnr_valid", "psnr_covered", "psnr_uncovered"}
     assert checked <= names

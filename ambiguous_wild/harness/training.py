@@ -249,6 +249,7 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
     recorder: pictures.Recorder | None = None
     problem: AwError
     try:
+        torch.set_default_dtype(torch.float32)  # whatever the method before this one left
         reset_peak(cell.device)
         truth = evaluate.load_test_photos(cell.scene)
         first = None

@@ -330,6 +330,16 @@ def test_settings_of_somebody_elses_program_do_not_make_a_folder_ours(scene, tmp
     assert (folder / "config.yaml").read_text() == "a: 1\n"
 
 
+def test_a_default_dtype_that_a_method_left_reaches_no_other(scene, tmp_path):
+    first = bench(scene, tmp_path / "a", "3dgs")[1][0].folder
+    torch.set_default_dtype(torch.float64)
+    try:
+        second = bench(scene, tmp_path / "b", "3dgs")[1][0].folder
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert (first / "point_cloud.ply").read_bytes() == (second / "point_cloud.ply").read_bytes()
+
+
 def test_what_a_user_put_into_a_run_folder_outlives_the_run(scene, tmp_path):
     folder = bench(scene, tmp_path, "3dgs")[1][0].folder
     mine = [folder / name for name in ("notes.txt", "mine/a.md", ".todo.tmpl", ".my.old-stuff/b")]

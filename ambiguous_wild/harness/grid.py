@@ -239,10 +239,13 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
             refuse_strange_folder(folder)
             if not made_anew(folder, options.overwrite, cell.config):
                 refuse_other_config(folder, cell)
-        if options.overwrite != "never" or not folder.exists():
-            left = {*folder.parent.glob("seed*/")} - ({*folders} if options.overwrite != "never" else set())
-            for other in sorted(left):
-                refuse_other_code(other, cell)
+    trained = [k for k, folder in enumerate(folders) if options.overwrite != "never" or not folder.exists()]
+    chosen = {folders[k] for k in trained}
+    for parent, cell in {
+        folders[k].parent: cells[k] for k in trained
+    }.items():  # seeds share the method's file
+        for other in sorted({*parent.glob("seed*/")} - chosen):
+            refuse_other_code(other, cell)
     for needed in (output, options.cache_dir):
         check_output(needed / "run")  # a folder that cannot be written is found before the training
     return folders

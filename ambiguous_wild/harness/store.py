@@ -315,14 +315,16 @@ def _length(config: ReadConfig) -> str:
     return f"{settings['iterations']} iterations" if "iterations" in settings else ""
 
 
-# settings of training that have a column of their own or decide nothing
-_OTHER = ("iterations", "budget_s", "seed", "torch_threads", "checkpoint_every_s", "probes", "on_nonfinite")
+# settings of training that are compared on their own, or decide nothing
+BOOKKEEPING = ("seed", "iterations", "budget_s", "checkpoint_every_s", "probes", "on_nonfinite")
 
 
 def _training(config: ReadConfig) -> str:
     """Return the other settings of training that config.yaml holds, as text."""
     train = config.get("train")
-    settings = {k: v for k, v in train.items() if k not in _OTHER} if isinstance(train, dict) else {}
+    settings = dict(train) if isinstance(train, dict) else {}
+    for key in (*BOOKKEEPING, "torch_threads"):
+        settings.pop(key, None)
     return ", ".join(f"{key} {'auto' if value is None else value}" for key, value in sorted(settings.items()))
 
 

@@ -18,13 +18,11 @@ import numpy as np
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, Options, RunResult, mean_of, read_result
-from ambiguous_wild.harness.store import ReadConfig, check_names, find_runs, read_config
+from ambiguous_wild.harness.store import BOOKKEEPING, ReadConfig, check_names, find_runs, read_config
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.io.files import own_json
 from ambiguous_wild.metrics import stats
 
-# settings of training that are no part of `CostRun.rest`: compared on their own, or without any effect
-BOOKKEEPING = ("seed", "checkpoint_every_s", "probes", "iterations", "budget_s")
 SETTINGS = ("resolution", "max_gaussians")  # settings of training that are compared like options
 NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")
 

@@ -58,9 +58,9 @@ def line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def means(found: Board) -> list[str]:
+def means() -> list[str]:
     """Mean PSNR by group of scenes."""
-    lines = []
+    found, lines = board(), []
     for label, prefixes in GROUPS.items():
         scenes = [methods for scene, methods in found.items() if scene.startswith(prefixes)]
         psnr = [mean(methods[name]["psnr"] for methods in scenes) for name in METHODS]
@@ -68,8 +68,9 @@ def means(found: Board) -> list[str]:
     return lines
 
 
-def scenes(found: Board) -> list[str]:
+def scenes() -> list[str]:
     """PSNR and mask IoU by scene."""
+    found = board()
     prefixes = [prefix for group in GROUPS.values() for prefix in group]
     ordered = sorted(found, key=lambda name: next(k for k, p in enumerate(prefixes) if name.startswith(p)))
     lines = []
@@ -82,7 +83,7 @@ def scenes(found: Board) -> list[str]:
     return lines
 
 
-def baselines(found: Board) -> list[str]:
+def baselines() -> list[str]:
     """PSNR of every method on some scenes, the best in the mean first."""
     found = board("0")
     psnr = {
@@ -94,7 +95,7 @@ def baselines(found: Board) -> list[str]:
     return [line([f"`{name}`", *(f"{x:.2f}" for x in psnr[name])]) for name in ordered]
 
 
-TABLES: dict[str, dict[str, Callable[[Board], list[str]]]] = {
+TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
     "README.md": {"means": means},
     "docs/refinesplat.md": {"scenes": scenes},
     "docs/baselines.md": {"baselines": baselines},
@@ -103,10 +104,9 @@ TABLES: dict[str, dict[str, Callable[[Board], list[str]]]] = {
 
 def written(page: str, text: str) -> str:
     """The page's text with its tables as the board says."""
-    found = board()
     for name, rows in TABLES[page].items():
         pattern = re.compile(rf"(<!-- figures: {name} -->\n\|[^\n]*\n\|[^\n]*\n)(\|[^\n]*\n)+")
-        text, count = pattern.subn(lambda m, rows=rows: m[1] + "\n".join(rows(found)) + "\n", text)
+        text, count = pattern.subn(lambda m, rows=rows: m[1] + "\n".join(rows()) + "\n", text)
         if count != 1:
             raise SystemExit(f"{page} has {count} tables after '<!-- figures: {name} -->', not one")
     return text

@@ -246,8 +246,10 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
             rotations[k, start : start + len(motion.rotations)] = motion.rotations
     exists = ~np.isnan(rotations[:, :, 0, 0])
     edges = _triplets(connected, at)
-    closings = [_closed(rotations, edges[i : i + _CHUNK]) for i in range(0, len(edges), _CHUNK)]
-    rows = np.concatenate(closings) if closings else np.zeros((0, 4), np.int32)
+    rows = np.concatenate(
+        [np.zeros((0, 4), int)]
+        + [_closed(rotations, edges[i : i + _CHUNK]) + [i, 0, 0, 0] for i in range(0, len(edges), _CHUNK)]
+    )
     votes = exists.astype(float)
     for _ in range(ROUNDS):
         votes = _vote(votes, exists, edges, rows)

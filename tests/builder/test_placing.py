@@ -112,12 +112,13 @@ def _motion(rotation: np.ndarray, matches: int = 20) -> Motion:
     return Motion(np.arange(matches), rotation[None], np.array([[1.0, 0.0, 0.0]]))
 
 
-def test_the_motions_that_close_triplets_win_over_more_matches():
-    true = [turned((0.1 * k, 1, 0), 9.0 * k) for k in range(6)]
+@pytest.mark.parametrize("photos", [6, 52])  # 52 have 22 100 triplets: more than are voted on at a time
+def test_the_motions_that_close_triplets_win_over_more_matches(photos):
+    true = [turned((0.1 * k, 1, 0), 9.0 * k) for k in range(photos)]
     rng = np.random.default_rng(2)
     pairs = {}
-    for a in range(6):
-        for b in range(a + 1, 6):
+    for a in range(photos):
+        for b in range(a + 1, photos):
             wrong = _motion(turned(tuple(rng.normal(size=3)), 40), matches=500)
             pairs[a, b] = [wrong, _motion(true[b] @ true[a].T)]
     votes = cycle_votes(pairs)

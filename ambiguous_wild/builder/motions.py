@@ -246,10 +246,8 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
             rotations[k, start : start + len(motion.rotations)] = motion.rotations
     exists = ~np.isnan(rotations[:, :, 0, 0])
     edges = _triplets(connected, at)
-    rows = np.concatenate(
-        [np.zeros((0, 4), int)]
-        + [_closed(rotations, edges[i : i + _CHUNK]) + [i, 0, 0, 0] for i in range(0, len(edges), _CHUNK)]
-    )
+    closings = [_closed(rotations, edges, start) for start in range(0, len(edges), _CHUNK)]
+    rows = np.concatenate([np.zeros((0, 4), int), *closings])
     votes = exists.astype(float)
     for _ in range(ROUNDS):
         votes = _vote(votes, exists, edges, rows)
@@ -265,13 +263,13 @@ def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
     return np.array(edges, np.intp).reshape(-1, 3)
 
 
-def _closed(rotations: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return [R, 4]: the row of a triplet in `edges`, and one motion of each of its pairs that close it."""
-    first, second, direct = (rotations[edges[:, k]] for k in range(3))
+def _closed(rotations: np.ndarray, edges: np.ndarray, start: int) -> np.ndarray:
+    """Return [R, 4]: row of `edges` from `start` on, and one motion of each of its pairs that close it."""
+    first, second, direct = rotations[edges[start : start + _CHUNK].T]
     around = np.einsum("tbxz,tazy->tabxy", second, first)
     trace = np.einsum("tabxy,tcxy->tabc", around, direct)
     # Motions that do not exist are NaN, which is never larger.
-    return np.argwhere(trace > trace_of(CLOSED_DEG))
+    return np.argwhere(trace > trace_of(CLOSED_DEG)) + [start, 0, 0, 0]
 
 
 def _vote(votes: np.ndarray, exists: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:

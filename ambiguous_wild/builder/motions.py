@@ -269,7 +269,7 @@ def _closed(rotations: np.ndarray, edges: np.ndarray, start: int) -> np.ndarray:
     around = np.einsum("tbxz,tazy->tabxy", second, first)
     trace = np.einsum("tabxy,tcxy->tabc", around, direct)
     # Motions that do not exist are NaN, which is never larger.
-    return np.argwhere(trace > trace_of(CLOSED_DEG)) + [start, 0, 0, 0]
+    return np.argwhere(trace > trace_of(CLOSED_DEG)) + np.array((start, 0, 0, 0))
 
 
 def _vote(votes: np.ndarray, exists: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:

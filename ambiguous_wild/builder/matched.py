@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 # A match fits within this distance of its epipolar line: a share of the longer side, between bounds in px.
 FITS_PX, FITS_SHARE = (1.5, 3.0), 0.003
+ALL_MAPPED = 200  # photos up to which COLMAP's mapper gets all: its adjustments grow faster than their number
+MAPPED_PARTNERS = 5  # partners that the mapper gets of every photo, so that each can be placed by them
 
 
 @dataclass
@@ -165,7 +167,10 @@ class Matched:
         return float(np.median(np.abs(after / before - 1.0)))
 
     def write_agreed(self, database: Path, agreed: Mapping[Pair, tuple[int, int]]) -> None:
-        """Write cameras and one motion of every pair that agrees to the database, for COLMAP's mapper."""
+        """Write cameras and one motion of every pair that agrees to the database, for COLMAP's mapper.
+
+        Of more than `ALL_MAPPED` photos it gets some: `Placement` places the others, each in constant time.
+        """
         db = pycolmap.Database.open(str(database))
         try:
             for camera in {camera.camera_id: camera for camera in self.cameras}.values():
@@ -173,7 +178,10 @@ class Matched:
         finally:
             db.close()
         verified = {}
+        mapped = _well_connected(agreed) if len(self.ids) > ALL_MAPPED else set(range(len(self.ids)))
         for pair, (number, way) in agreed.items():
+            if not mapped.issuperset(pair):
+                continue
             motion = self.motions[pair][number]
             pose = np.column_stack([motion.rotations[way], motion.translations[way]])
             verified[pair] = pose, motion.matches
@@ -200,6 +208,23 @@ class Matched:
             self.motions = {pair: [] for pair in self.matches}
             for (a, b), *motion in zip(file["pairs"].tolist(), matches, *ways):
                 self.motions[a, b].append(Motion(*motion))
+
+
+def _well_connected(pairs: Iterable[Pair]) -> set[int]:
+    """Choose photos so that each photo has `MAPPED_PARTNERS` chosen partners, or all that it has."""
+    partners: dict[int, set[int]] = {}
+    for a, b in pairs:
+        partners.setdefault(a, set()).add(b)
+        partners.setdefault(b, set()).add(a)
+    wanted = {photo: min(MAPPED_PARTNERS, len(others)) for photo, others in partners.items()}
+    chosen: set[int] = set()
+    while any(wanted.values()):
+        rest = sorted(partners.keys() - chosen)
+        best = max(rest, key=lambda photo: sum(wanted[other] > 0 for other in partners[photo]))
+        chosen.add(best)
+        for other in partners[best]:
+            wanted[other] = max(wanted[other] - 1, 0)
+    return chosen
 
 
 def relative_pose(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -39,7 +39,8 @@ DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more tha
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 DIRECT = 100  # photos above which adjustments are solved iteratively; 200: in half of the time
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
-ADJUSTMENTS, STILL = 3, 2e-3  # joint adjustments at most; share of changed observations that ends them
+ADJUSTMENTS = 3  # joint adjustments at most
+STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Placement:
         self._use_model(model)
 
     def run(self) -> None:
-        """Place all photos anew, one after another, until none moves."""
+        """Place all photos anew, one after another, until none moves, or hardly any of many."""
         outs = [0] * len(self.matched.ids)
         turn, moved = 0, True
         while moved and turn <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
@@ -121,7 +122,7 @@ class Placement:
         return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
 
     def _place_all(self, outs: list[int], only_out: bool) -> bool:
-        """Place all photos, and tell whether one moved, was added or was taken out."""
+        """Place all photos, and tell whether more than a few moved, were added or were taken out."""
         rays, points = self.matched.rays(), _Points.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
         self.places, self.left_out = {}, {}
@@ -146,7 +147,7 @@ class Placement:
                 del self.poses[photo]
             else:
                 self.poses[photo] = pose
-        return bool(moves)
+        return len(moves) > STILL * len(self.matched.ids)
 
     def _best(
         self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: _Points

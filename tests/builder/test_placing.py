@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder import sfm
-from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.placing import DIRECT, Place, _reason, adjustment_options
@@ -197,17 +197,39 @@ def test_motions_come_back_from_their_file(tmp_path):
         np.testing.assert_array_equal(one.rotations, other.rotations)
 
 
+def set_in_worker(monkeypatch, statement: str) -> None:
+    """Run a statement in COLMAP's process before its task."""
+    worker = "import sys; from ambiguous_wild.builder import matched, placing, sfm_worker; "
+    worker += f"{statement}; sys.argv = ['worker', sys.argv[1]]; sfm_worker.main()"
+    real = sfm.subprocess.Popen
+
+    def changed(command, **options):
+        return real([command[0], "-c", worker, command[-1]], **options)
+
+    monkeypatch.setattr(sfm.subprocess, "Popen", changed)
+
+
+def test_of_many_photos_the_mapper_gets_some_and_all_are_placed(tmp_path, monkeypatch):
+    ring = [(a, (a + step) % 300) for a in range(300) for step in range(1, 9)]
+    chosen = _well_connected(ring)
+    partners = {k: {a + b - k for a, b in ring if k in (a, b)} for k in range(300)}
+    assert all(len(others & chosen) >= MAPPED_PARTNERS for others in partners.values())
+    assert len(chosen) < 150
+    write_capture(tmp_path / "raw", 12)
+    set_in_worker(monkeypatch, "matched.ALL_MAPPED, matched.MAPPED_PARTNERS = 6, 3")
+    settings = BuildSettings(factor=1, max_features=800)
+    build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2)
+    model = read_model(tmp_path / "scene" / "sparse" / "0")
+    found = {int(i.name[1:3]): i.cam_from_world()[:3, :3] for i in model.images.values()}
+    true = {k: looking(eye) for k, eye in enumerate(eyes(12))}
+    off = [angle_deg((found[k] @ found[0].T) @ (true[k] @ true[0].T).T) for k in found]
+    assert len(found) == 12 and max(off) < 1.0
+
+
 def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypatch):
     """Photos are taken out until too few are left: one line, not a crash of COLMAP."""
     write_capture(tmp_path / "raw", 6)
-    worker = "import sys; from ambiguous_wild.builder import placing, sfm_worker; placing.AGREE = 99; "
-    worker += "placing.AGREE_NEW = 99; sys.argv = ['worker', sys.argv[1]]; sfm_worker.main()"
-    real = sfm.subprocess.Popen
-
-    def strict(command, **options):
-        return real([command[0], "-c", worker, command[-1]], **options)
-
-    monkeypatch.setattr(sfm.subprocess, "Popen", strict)
+    set_in_worker(monkeypatch, "placing.AGREE = placing.AGREE_NEW = 99")
     with pytest.raises(AwError, match="placed 0 of 6 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500, sfm="fast"))
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]

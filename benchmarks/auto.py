@@ -21,7 +21,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from job_queue import aw, exit_code, find_scenes, parser_of
+from job_queue import aw, count, exit_code, find_scenes, seed
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.result_file import RESULT, read_result
@@ -143,8 +143,14 @@ def to_markdown(data: dict[str, Any]) -> str:
 
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
-    parser = parser_of(__doc__, RESULTS, iterations=1500)
-    parser.set_defaults(seeds=[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
+    parser.add_argument("--seeds", nargs="+", type=seed, default=[0])
+    parser.add_argument("--iterations", type=count, default=1500)
+    parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="where the table goes")
+    parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     return parser.parse_args(words)
 
 

@@ -38,9 +38,10 @@ def board(only: str = "") -> Board:
     for name in ("simulated", "composites"):
         with (ROOT / "leaderboard" / "measured" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
+                name = ", ".join(filter(None, (row["method"], row["options"])))
                 for metric in ("psnr", "mask_iou"):
                     if row[metric] and only in ("", row["seed"]):
-                        seeds[row["scene"], row["method"], metric].append(float(row[metric]))
+                        seeds[row["scene"], name, metric].append(float(row[metric]))
     found: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for (scene, method, metric), values in seeds.items():
         found[scene][method][metric] = mean(values)

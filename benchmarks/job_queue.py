@@ -94,25 +94,6 @@ class Run:
         return f"{fmean(float(row['psnr']) for row in result['per_image']):.2f} dB"
 
 
-def parser_of(doc: str | None, results: Path, iterations: int) -> argparse.ArgumentParser:
-    """The options that every queue has.
-
-    Args:
-        doc: of the script.
-        results: the file that its table goes to by default.
-        iterations: of a run, by default.
-    """
-    parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
-    parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
-    parser.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2])
-    parser.add_argument("--iterations", type=count, default=iterations)
-    parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
-    parser.add_argument("--results", type=Path, default=results, help="where the table goes")
-    parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
-    return parser
-
-
 def count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is no count from 1 on")

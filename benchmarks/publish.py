@@ -1,7 +1,7 @@
 """The published figures of quality, made anew: captures, scenes, runs, board. Stops and goes on.
 
     python benchmarks/publish.py --work DIR [--data DIR] [--seeds 0 1 2] [--methods ...] [--iterations 1000]
-        [--jobs 2] [--only NAME...]
+        [--jobs 2] [--only NAME...] [--set METHOD.OPTION=VALUE...]
 
 Captures: presets of `aw simulate`, and distractors pasted on the photos of --data before structure from
 motion (`aw composite`). --data holds a folder of photos for each base, and cutouts/; without it no
@@ -67,12 +67,14 @@ def captures(data: Path | None) -> Iterator[Capture]:
 
 def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
     """A run for each method and seed."""
+    options = [option.partition(".")[::2] for option in args.set]
     for number in args.seeds:
         words = ("--scene", str(scene), "--seed", str(number), "--iterations", str(args.iterations))
-        words += ("--device", "cpu", "--threads", "1", "--no-pictures", "-o", str(args.work / "runs"))
+        words += ("--device", "cpu", "--threads", "1", "--no-pictures", "-o", str(args.runs))
         for method in args.methods:
-            folder = args.work / "runs" / scene.name / method / f"seed{number}"
-            yield Run(f"{method} on {scene.name}, seed {number}", folder, method, words)
+            folder = args.runs / scene.name / method / f"seed{number}"
+            own = tuple(option for owner, option in options if owner == method)
+            yield Run(f"{method} on {scene.name}, seed {number}", folder, method, words, own)
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -81,11 +83,13 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, help="real photos, a folder for each base, and cutouts/")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="captures to make; all by default")
     parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--set", nargs="+", default=[], metavar="METHOD.OPTION=VALUE")
     parser.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2])
     parser.add_argument("--iterations", type=count, default=1000)
     parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--board", type=Path, default=ROOT / "leaderboard")
     args = parser.parse_args(words)
+    args.runs = args.work / "-".join(["runs", *args.set])  # runs with other options have their own folder
     known = {capture.name: capture for capture in captures(args.data)}
     if unknown := set(args.only or ()) - known.keys():
         raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
@@ -95,7 +99,7 @@ def main(words: Sequence[str] | None = None) -> int:
     for capture in scenes:
         # the photos of the bases may not be passed on
         images = "1" if capture.dataset == "simulated" else "0"
-        add = ("leaderboard", "add", str(args.work / "runs" / capture.name), "--board", str(args.board))
+        add = ("leaderboard", "add", str(args.runs / capture.name), "--board", str(args.board))
         print(aw(*add, "--dataset", capture.dataset, "--images", images, "--overwrite"), end="", flush=True)
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)

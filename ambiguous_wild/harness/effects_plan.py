@@ -211,8 +211,8 @@ def _point_of_observation(scene: Scene) -> np.ndarray:
 Answer = Literal["on", "off", "unknown"]
 SCHEMA = 1
 
-# Thresholds, set on tracks with and without the injected effect (tests/harness/test_planning.py) and on the
-# captures of docs/notes/effects.md, which lists how near the measured values are.
+# Thresholds, set on tracks with and without the injected effect (tests/harness/test_planning.py), on
+# presets and on real captures.
 EXPOSURE = 0.05
 APPEARANCE = 0.043
 # A highlight is not linear in the direction. Its remainder, up to 1.7 times its linear part in the tests,
@@ -220,9 +220,9 @@ APPEARANCE = 0.043
 OF_SHINE = 1.7
 SAMPLING = 1.5
 # cameras around an object have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1;
-# for the last a dense start of 30 photos was better (docs/notes/effects.md)
+# for the last a dense start of 30 photos was better
 OUTWARD = 2.0
-# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not (docs/notes/effects.md)
+# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not
 LEAST_PHOTOS, FEW_PHOTOS = 3, 24
 
 
@@ -355,7 +355,7 @@ def _dense_start(evidence: Evidence) -> Decision:
 def _skybox(dense: Decision) -> Decision:
     """Decide on a skybox: on without a dense start, because both fill the room for first Gaussians.
 
-    It gains in courtyards and rooms too, where SfM found points nearly everywhere (docs/notes/effects.md).
+    It gains in courtyards and rooms too, where SfM found points nearly everywhere.
     """
     taken = dense.decision == "on"
     why = (

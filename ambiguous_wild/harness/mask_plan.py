@@ -210,7 +210,6 @@ MOST_PHOTOS = 60  # evenly spaced photos of a pair: 300 iterations visit each fi
 SEED = 0  # of the blocks and of the pair
 LEAST_PHOTOS = 4  # fewer give no useful standard error
 # Without growth masks gain little: static captures -0.02 to +0.01 dB, captures with distractors from 0.05 dB
-# (docs/notes/effects.md)
 LEAST_DB = 0.02
 # Share of unexplained pixels: static captures have 0.0 to 0.9 %, captures with distractors 0.6 % or more.
 CERTAIN = 0.03

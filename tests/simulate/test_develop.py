@@ -122,6 +122,6 @@ def test_labels_agree_with_what_the_spec_holds() -> None:
         assert ("appearance" in label.effects) == bool(named & set(appearance)), spec.name
         assert ("sh" in label.effects) == ("specular" in named), spec.name
         assert ("antialiasing" in label.effects) == (spec.zoom != (1.0, 1.0)), spec.name
-        # a shaking hand is in COLMAP's poses: refining them cost 1.8 dB (docs/notes/effects.md)
+        # a shaking hand is in COLMAP's poses: refining them cost 1.8 dB
         assert "pose" not in label.effects, spec.name
         assert label.ambiguity != "unstated" and (spec.distractors or label.ambiguity == "neither"), spec.name

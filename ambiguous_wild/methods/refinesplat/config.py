@@ -22,7 +22,7 @@ _ANY = math.inf
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """How masks are made from photo and render; docs/notes/refinesplat.md holds the figures of defaults.
+    """How masks are made from photo and render.
 
     `structure` judges pixels by colour and structure (structure.py) and needs no features. All other
     statistics are on the feature grid, and are the paper's or closer to it. Fields marked "features only"

@@ -20,6 +20,7 @@ import click
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, logged_to, unknown
+from ambiguous_wild.core.names import plain
 
 POSITIONAL, GONE = "", None  # new names: only the value is kept; neither name nor value is kept
 _OUT = {"--out": "--output"}
@@ -275,8 +276,8 @@ def _click_message(error: click.ClickException) -> str:
 
 
 def _fail(message: str) -> None:
-    shown = message.encode("utf-8", "backslashreplace").decode()  # names of files may not be UTF-8
-    click.secho("error: " + " ".join(shown.split()), fg="red", err=True)
+    # names may hold control characters, those of files need not be UTF-8
+    click.secho("error: " + plain(" ".join(message.split())), fg="red", err=True)
     sys.exit(AwError.exit_code)
 
 

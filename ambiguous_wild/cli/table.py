@@ -201,7 +201,7 @@ def _blocks(
 
 
 def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
-    from ambiguous_wild.report.plain_formats import plain
+    from ambiguous_wild.core.names import plain
 
     for note in dict.fromkeys([note for table in tables for note in table.notes] + [made_by]):
         click.echo(plain(note), err=True)

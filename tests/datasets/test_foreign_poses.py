@@ -308,7 +308,7 @@ def test_a_table_is_read_once_by_its_reader(tmp_path: Path, monkeypatch: pytest.
     written("realityscan", root)
     (root / "other.csv").write_text("a,b\n1,2\n")
     read: list[Path] = []
-    monkeypatch.setattr(reader, "read_text", lambda path: read.append(path) or path.read_text())
+    monkeypatch.setattr(reader, "read_text", lambda path: read.append(path) or path.read_text("utf-8-sig"))
     read_foreign(root, "realityscan")
     assert sorted(read) == sorted(root.glob("*.csv")) and len(read) == 2
 

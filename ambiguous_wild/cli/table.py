@@ -76,8 +76,8 @@ def table_command(
     """Compare the runs below the folders RUNS: quality, cost and masks, method by method.
 
     Means are over images, then seeds, then scenes. Missing, failed and incomparable runs are named below the
-    table (for CSV: on standard error). If several folders hold runs of one method, scene and seed, the rows of
-    this method name their folder.
+    table (for CSV: on standard error; what limits ranks also in the column note). If several folders hold
+    runs of one method, scene and seed, the rows of this method name their folder.
 
     \b
     aw table runs

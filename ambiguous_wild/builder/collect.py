@@ -25,7 +25,7 @@ from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
 Side = Literal["train", "test"] | None
-NO_PHOTOS = ("masks", "truth")  # folders whose images are no photos
+NO_PHOTOS = ("masks", "truth")  # folders whose images are no photos, in upper or lower case
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp")
 _MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the usual 255
 
@@ -157,7 +157,7 @@ def _folders_in(base: Path, masks: Path | None) -> Iterator[Path]:
     if _has_photos(base):
         yield base
         return
-    inner = [p for p in base.iterdir() if p.is_dir() and p.name[0] != "." and p.name not in NO_PHOTOS]
+    inner = [p for p in base.iterdir() if p.is_dir() and p.name[0] != "." and p.name.lower() not in NO_PHOTOS]
     inner = [p for p in inner if p != masks]
     named = [p for p in inner if p.name == "images" and any(_folders_in(p, masks))]
     for folder in named or sorted(inner, key=lambda p: natural_key(p.name)):
@@ -172,7 +172,7 @@ def videos_in(base: Path) -> Iterator[Path]:
         if path.is_file() and path.name[0] != "." and path.suffix.lower() in VIDEO_SUFFIXES:
             yield path
     for path in inner:
-        if path.is_dir() and path.name[0] != "." and path.name not in NO_PHOTOS:
+        if path.is_dir() and path.name[0] != "." and path.name.lower() not in NO_PHOTOS:
             yield from videos_in(path)
 
 
@@ -198,9 +198,14 @@ def _folder_notes(
     if len(counts) > 1:
         yield f"photos of {len(counts)} folders: {shortlist([f'{k} ({v})' for k, v in counts.items()])}"
     for root in roots:
+        beside = [p for p in sorted(root.iterdir()) if p.is_dir() and p.name.lower() == "masks"]
+        for unused in beside if masks is None else ():
+            yield f"{unused} is not used; --keep-masks '{unused}' does (white = keep)"
         if (root, None) in folders:
             inner = (
-                p for p in sorted(root.iterdir()) if p.is_dir() and p.name not in NO_PHOTOS and p != masks
+                p
+                for p in sorted(root.iterdir())
+                if p.is_dir() and p.name.lower() not in NO_PHOTOS and p != masks
             )
             if left := [p.name for p in inner if p.name[0] != "." and any(_folders_in(p, masks))]:
                 yield f"{root} holds photos itself, so its folders {shortlist(left)} are left out"

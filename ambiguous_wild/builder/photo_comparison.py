@@ -22,6 +22,8 @@ MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
 EXTRA_CANDIDATES = 60  # further candidates of a photo that overlaps with none or one of these
+FOCAL = 0.9  # of the longer side, of most phones and cameras
+ALONG = 0.8  # |t_z| / |t| from which on two cameras differ by motion along the line of sight
 _PATCH = 4  # px, half a patch around a feature
 QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue over green
 
@@ -30,6 +32,7 @@ QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue
 class PhotoFeatures:
     """Features and colours of one photo, about 150 kB, from which photos are compared."""
 
+    size: tuple[int, int]  # width and height at which it is compared, px
     xy: np.ndarray  # [F, 2] float32 px
     descriptors: np.ndarray  # [F, 128] uint8
     values: np.ndarray  # [F, 4] float32, `QUANTITIES` around each feature; NaN where clipped or too dark
@@ -58,7 +61,10 @@ def photo_features(
     if descriptors is None:
         points, descriptors = [], np.zeros((0, 128))
     xy = np.array([p.pt for p in points], np.float32).reshape(-1, 2)
-    return PhotoFeatures(xy, descriptors.astype(np.uint8), _values(small, gray, xy), _coarse_colours(small))
+    size = (small.shape[1], small.shape[0])
+    return PhotoFeatures(
+        size, xy, descriptors.astype(np.uint8), _values(small, gray, xy), _coarse_colours(small)
+    )
 
 
 def _values(small: np.ndarray, gray: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -111,7 +117,7 @@ def compare_photos(
         if inliers is None:
             return
         graph[i, j] = graph[j, i] = True
-        forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]]))
+        forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]], features[i].size))
         difference = features[i].values[inliers[0]] - features[j].values[inliers[1]]
         good = np.isfinite(difference).all(axis=1)
         if good.sum() >= MIN_INLIERS // 2:
@@ -137,23 +143,18 @@ def compare_photos(
 def is_forward(
     a: np.ndarray,  # [M, 2] px, matches of one geometry
     b: np.ndarray,  # [M, 2] px
+    size: tuple[int, int],  # width and height of both photos, px
 ) -> bool:
-    """Tell whether the camera moved along the line of sight: the picture grows about a point inside it.
-
-    A similarity is fitted to the matches. It must scale by over 3 %, turn by less than it scales, and have
-    its fixed point among the matches: near that point there is no parallax.
-    """
+    """Tell whether the camera moved along the line of sight, by the direction of motion of a usual lens."""
+    focal = FOCAL * max(size)
+    camera = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     cv2.setRNGSeed(0)
-    fit, _ = cv2.estimateAffinePartial2D(a, b, ransacReprojThreshold=0.02 * SIDE)
-    if fit is None:
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    essential, inlier = cv2.findEssentialMat(a, b, camera, cv2.RANSAC, 0.999, 1.0)
+    if essential is None or essential.shape != (3, 3):
         return False
-    cos, sin = float(fit[0, 0]), float(fit[1, 0])
-    growth = abs(math.log(max(math.hypot(cos, sin), 1e-6)))
-    if growth < math.log(1.03) or abs(math.atan2(sin, cos)) > growth:
-        return False
-    fixed = np.linalg.solve(np.eye(2) - fit[:, :2], fit[:, 2])
-    low, high = np.percentile(a, [5, 95], axis=0)
-    return bool(((fixed > low) & (fixed < high)).all())
+    _, _, direction, _ = cv2.recoverPose(essential, a, b, camera, mask=inlier)
+    return abs(float(direction[2, 0])) > ALONG
 
 
 def candidate_pairs(features: Sequence[PhotoFeatures]) -> list[tuple[int, int]]:

@@ -18,6 +18,7 @@ import numpy as np
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.records import CameraFact
+from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FITS = 0.5  # share of a motion's matches that must fit for a partner to agree
@@ -37,7 +38,6 @@ ROUNDS = 8  # rounds of placing anew, besides those that only add photos
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
-DIRECT = 100  # photos above which adjustments are solved iteratively; 200: in half of the time
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 ADJUSTMENTS = 3  # joint adjustments at most
 STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
@@ -274,7 +274,7 @@ class Placement:
         mapper.complete_and_merge_tracks(options.triangulation)
         for error in (LOOSE_PX, TIGHT_PX) if final else (LOOSE_PX,):
             options.mapper.filter_max_reproj_error = error
-            careful = final and (error == TIGHT_PX or len(self.poses) <= DIRECT)
+            careful = final and (error == TIGHT_PX or len(self.poses) <= FEW)
             mapper.iterative_global_refinement(
                 ADJUSTMENTS if careful else 1,
                 STILL,
@@ -366,7 +366,7 @@ def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
     options.ceres.solver_options.max_num_iterations = 50 if final else 10
     options.ceres.solver_options.function_tolerance = 1e-6 if final else 1e-4
     options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
-    if photos > DIRECT:
+    if photos > FEW:
         options.ceres.auto_select_solver_type = False
         solver: Any = options.ceres.solver_options  # its enumerations take names
         solver.linear_solver_type, solver.preconditioner_type = "ITERATIVE_SCHUR", "SCHUR_JACOBI"

@@ -31,7 +31,9 @@ SAMPLE = 20_000  # descriptors that the words are learnt from
 MOST = 1500  # descriptors of a photo that are used: the largest features come first in COLMAP
 SIMILAR = 16  # photos that each is matched with, unless a plan says otherwise
 NEIGHBOURS = 5  # next photos in the order of capture that each is matched with, likewise
-ALL_PAIRS = 100  # photos up to which every pair is compared; 4950 pairs take about 10 s of a core
+# Up to this number of photos every pair is compared (4950 pairs take about 10 s of a core), and adjustments
+# are solved directly; above, iteratively: for 200 photos in half of the time.
+FEW = 100
 SHORTLIST = 3
 _ROWS = 256  # photos compared at a time
 _ROUNDS = 12  # of k-means
@@ -125,7 +127,7 @@ def retrieval_pairs(
 ) -> list[tuple[str, str]]:
     """Pair each photo with those that share most features and with the next ones in the order of capture.
 
-    Photos of a separate test set get no next ones. Up to `ALL_PAIRS` photos every pair is compared; above,
+    Photos of a separate test set get no next ones. Up to `FEW` photos every pair is compared; above,
     each photo is compared with `SHORTLIST` times `similar` photos, most of them those with the most similar
     vectors, and some of its partners are far.
 
@@ -152,7 +154,7 @@ def retrieval_pairs(
         if i + s < len(walk) and (only is None or {names[walk[i]], names[walk[i + s]]} & set(only))
     }
     spread = 0.0
-    if len(names) <= ALL_PAIRS:
+    if len(names) <= FEW:
         listed = [(a, b) for a in asking for b in everyone if a != b]
     else:
         spread, near = FAR, (SHORTLIST - 1) * similar

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from ambiguous_wild.builder.records import PhotoRecord
-from ambiguous_wild.builder.retrieval import ALL_PAIRS, EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, NEIGHBOURS
+from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, FEW, NEIGHBOURS
 from ambiguous_wild.core.errors import AwError
 
 CameraMode = Literal["auto", "single", "per-device", "per-folder", "per-image"]
@@ -98,7 +98,7 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
         growth=2.0,
         refinements=1,
         # All photos are placed anew afterwards, and of many the last digits cost most of the time.
-        tolerance=1e-4 if len(photos) > ALL_PAIRS else 0.0,
+        tolerance=1e-4 if len(photos) > FEW else 0.0,
         local_refinements=1,
         local_cameras=4,
     )

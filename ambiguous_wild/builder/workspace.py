@@ -6,6 +6,7 @@ keys of the stages it reads. A changed setting changes the keys of later stages 
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -22,9 +23,10 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, installed
 from ambiguous_wild.io.files import Held, atomic_dir, file_lock, lock_path, write_json
 
-BUILDER = 16  # raised when a stage gives another result for the same input
+BUILDER = 17  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 _RESULT = "stage.json"
+_LEAST_FREE = 2**20  # bytes; with less, a stage that fails is taken to fail for lack of space
 Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`
 
 
@@ -70,6 +72,9 @@ class Workspace:
             name: of the stage; part of its folder's name.
             inputs: plain data that determines the result: settings, hashes, keys of earlier stages.
             work: fills the folder and returns a record for stage.json.
+
+        Raises:
+            OSError: the disk is full.
         """
         key = content_key(name, inputs)
         folder = self.root / f"{name}-{key[:16]}"
@@ -77,7 +82,12 @@ class Workspace:
         if not reused:
             started = time.perf_counter()
             with atomic_dir(folder) as temporary:
-                facts = work(temporary)
+                try:
+                    facts = work(temporary)
+                except AwError as error:  # COLMAP does not say why it ended, and its log is on the same disk
+                    if shutil.disk_usage(temporary).free >= _LEAST_FREE:
+                        raise
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)) from error
                 spent = round(time.perf_counter() - started, 3)
                 write_json(temporary / _RESULT, {"facts": facts, "seconds": spent})
         stored = json.loads((folder / _RESULT).read_text(encoding="utf-8"))

@@ -78,7 +78,7 @@ def command(
         return
     made_by = command_line(runs, output, targets, scenes, with_setup)
     report = cost_report(cost_runs, targets=targets, setup=with_setup, made_by=made_by)
-    check_output(output / "cost.json")  # only now, because it makes the folder
+    check_output(output / "cost.json")
     written = write_report(report, output)
     if plots:
         from ambiguous_wild.report.cost_plots import draw_all

@@ -19,7 +19,8 @@ from pathlib import Path
 import click
 
 from ambiguous_wild import __version__
-from ambiguous_wild.core.errors import AwError, logged_to, unknown
+from ambiguous_wild.core.errors import AwError, disk_line, logged_to, unknown
+from ambiguous_wild.core.names import plain
 
 POSITIONAL, GONE = "", None  # new names: only the value is kept; neither name nor value is kept
 _OUT = {"--out": "--output"}
@@ -236,8 +237,7 @@ def main() -> None:
         # Disk full, no permission, a file in place of a folder: the user can fix these.
         if error.errno == errno.ENOMEM:
             _fail(f"{error.filename or 'memory'}: {_LITTLE}")
-        room = "; free space, or choose another folder" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        _fail(f"{error.filename or 'input or output'}: {error.strerror or error}{room}")
+        _fail(disk_line(error))
     except (MemoryError, ImportError) as error:
         if isinstance(error, ImportError) and not re.search("allocate memory|failed to map", str(error)):
             raise
@@ -275,8 +275,8 @@ def _click_message(error: click.ClickException) -> str:
 
 
 def _fail(message: str) -> None:
-    shown = message.encode("utf-8", "backslashreplace").decode()  # names of files may not be UTF-8
-    click.secho("error: " + " ".join(shown.split()), fg="red", err=True)
+    # names may hold control characters, those of files need not be UTF-8
+    click.secho("error: " + plain(" ".join(message.split())), fg="red", err=True)
     sys.exit(AwError.exit_code)
 
 

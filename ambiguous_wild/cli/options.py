@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.callbacks import Engine
 
 
@@ -177,5 +178,5 @@ def prepare_cpu(threads: int | None) -> None:
 
 
 def say(text: str) -> None:
-    """Write a line on stderr, so that stdout stays clean for results."""
-    click.echo(text, err=True)
+    """Write a line on stderr, so that stdout stays clean for results; names of runs cannot break it."""
+    click.echo(plain(text), err=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import math
@@ -58,6 +59,7 @@ def command(
     'aw bench --effects auto' decides the same way. Masks are not its decision, but that of METHOD.
     """
     from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.harness.cell import scene_identity
     from ambiguous_wild.harness.effects_plan import plan_effects
     from ambiguous_wild.io.files import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene
@@ -72,7 +74,7 @@ def command(
         from ambiguous_wild.cli.options import prepare_cpu
 
         prepare_cpu(None)
-    plan = plan_effects(loaded)
+    plan = dataclasses.replace(plan_effects(loaded), scene_hash=scene_identity(loaded))
     if probe:
         plan = _with_masks(plan, loaded, as_json)
     if costs:

@@ -76,8 +76,8 @@ def table_command(
     """Compare the runs below the folders RUNS: quality, cost and masks, method by method.
 
     Means are over images, then seeds, then scenes. Missing, failed and incomparable runs are named below the
-    table (for CSV: on standard error). If several folders hold runs of one method, scene and seed, the rows of
-    this method name their folder.
+    table (for CSV: on standard error; what limits ranks also in the column note). If several folders hold
+    runs of one method, scene and seed, the rows of this method name their folder.
 
     \b
     aw table runs
@@ -201,7 +201,7 @@ def _blocks(
 
 
 def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
-    from ambiguous_wild.report.plain_formats import plain
+    from ambiguous_wild.core.names import plain
 
     for note in dict.fromkeys([note for table in tables for note in table.notes] + [made_by]):
         click.echo(plain(note), err=True)

@@ -133,5 +133,6 @@ def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
     most = round(TRAINING * seconds / one, -2)
     iterations = int(min(max(most, SHORTEST), LONGEST))
     more = "; that is too few to compare methods: give more --budget" if most < SHORTEST else ""
-    say(f"\n{iterations} iterations a method: about {_minutes(iterations * one)} of training here{more}")
+    say("")
+    say(f"{iterations} iterations a method: about {_minutes(iterations * one)} of training here{more}")
     return iterations

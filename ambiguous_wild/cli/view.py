@@ -14,6 +14,7 @@ import click
 from ambiguous_wild.cli import options as shared
 from ambiguous_wild.cli.options import PathName, plugin_option, say, scene_folder_option, threads_option
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.names import plain
 
 if TYPE_CHECKING:
     from ambiguous_wild.viewing.model import Exported
@@ -259,7 +260,7 @@ def export_command(
         click.echo(json.dumps(rows, indent=2, ensure_ascii=False))
         return
     for label, files in reports:
-        click.echo(f"{label}: {files[0].gaussians:,} Gaussians")
+        click.echo(f"{plain(label)}: {files[0].gaussians:,} Gaussians")
         if told := [f"{e.format}: {_place(e)}" for e in files if e.place != type(e.place)()]:
             click.echo(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}")
         for e in files:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import importlib.metadata
 import logging
 import sys
@@ -63,6 +64,12 @@ class AwError(Exception):
         text = str(message)
         # Messages may quote a damaged file, where one word can have a megabyte.
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 300]} ... {text[-290:]}")
+
+
+def disk_line(error: OSError) -> str:
+    """Return the error of a disk as one line: the file, the reason, and what to do where the disk is full."""
+    room = "; free space, or choose another folder" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+    return f"{error.filename or 'input or output'}: {error.strerror or error}{room}"
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwError:

@@ -45,6 +45,11 @@ def ascii_text(text: str) -> str:
     return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in letters)
 
 
+def plain(text: str) -> str:
+    """Return the text on one line, with control and format characters escaped."""
+    return "".join(c.encode("unicode_escape").decode() if _unprintable(c) else c for c in str(text))
+
+
 def _unprintable(char: str) -> bool:
     """Whether it is a control, format or surrogate character, or a line or paragraph separator."""
     return unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")

@@ -255,6 +255,7 @@ class Plan:
     scene: str
     decisions: tuple[Decision, ...]
     probed: bool = False  # a render was made, so the plan has lines on masks
+    scene_hash: str = ""  # `scene_identity`; "": not recorded
 
     def __repr__(self) -> str:
         return f"Plan({self.scene}: --effects {','.join(self.effects()) or 'none'})"
@@ -270,6 +271,7 @@ class Plan:
         return {
             "schema": SCHEMA,
             "scene": self.scene,
+            "scene_hash": self.scene_hash,
             "probed": self.probed,
             "effects": list(self.effects()),
             "decisions": [d.plain() for d in self.decisions],
@@ -395,7 +397,8 @@ def read_plan(path: Path) -> Plan:
             row | {"value": math.nan if row["value"] is None else row["value"]} for row in data["decisions"]
         ]
         decisions = msgspec.convert(rows, tuple[Decision, ...])
-        return Plan(msgspec.convert(data["scene"], str), decisions, bool(data.get("probed")))
+        name, identity = msgspec.convert([data["scene"], data.get("scene_hash", "")], tuple[str, str])
+        return Plan(name, decisions, bool(data.get("probed")), identity)
     except FileNotFoundError:
         raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as error:

@@ -325,6 +325,11 @@ def choose(
     named = check_wanted(wanted)
     if plan is not None and plan.scene != scene.name:
         raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run 'aw plan {scene.root}'")
+    if plan is not None and plan.scene_hash and plan.scene_hash != scene_identity(scene):
+        raise AwError(
+            f"the plan is of another state of scene {scene.name} (its files, its split, or the size of its "
+            f"photos have changed): run 'aw plan {scene.root}'"
+        )
     if wanted != "auto":
         asked = Chosen(ALL if wanted == "all" else named, "" if wanted == "none" else wanted)
         return {m.name: asked if takes_effects(m) else Chosen() for m in methods}

@@ -28,6 +28,7 @@ from scipy.ndimage import label, maximum_filter, uniform_filter
 from torch import Tensor
 
 from ambiguous_wild.core import Points, Scene
+from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.effects_plan import Decision, Plan, answer, plan_effects
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
@@ -361,7 +362,7 @@ def plan(scene: Path | str) -> Plan:
     """Decide which effects a scene needs, and whether masks, as `aw plan` does."""
     prepare_cpu(None)
     loaded = load_scene(scene)
-    return with_masks(plan_effects(loaded), loaded)
+    return with_masks(replace(plan_effects(loaded), scene_hash=scene_identity(loaded)), loaded)
 
 
 def with_masks(plan: Plan, scene: Scene, bar: Bar = no_bar) -> Plan:

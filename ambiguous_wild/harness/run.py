@@ -14,7 +14,7 @@ import yaml
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
-from ambiguous_wild.core.errors import logged_to
+from ambiguous_wild.core.errors import disk_line, logged_to
 from ambiguous_wild.harness.callbacks import outcome_line, run_name
 from ambiguous_wild.harness.cell import (
     IGNORED,
@@ -106,7 +106,7 @@ def error_line(error: BaseException) -> str:
     if isinstance(error, AwError):
         return str(error)
     if isinstance(error, OSError):
-        return f"{error.filename or 'input or output'}: {error.strerror or error}"
+        return disk_line(error)
     return f"{type(error).__name__}: {error}{place_of(error)}"
 
 

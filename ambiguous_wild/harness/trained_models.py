@@ -255,7 +255,7 @@ def view_runs(
         AwError: no run with a model, several scenes, no scene, or another page in the folder.
     """
     shown = read_models(paths, scene=scene, scene_folder=scene_folder)
-    check_page_folder(output)  # after the models: it makes the folder
+    check_page_folder(output)
     return write_page(
         output,
         shown.scene,

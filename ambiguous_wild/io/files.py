@@ -318,7 +318,7 @@ def sweep_siblings(path: Path | str) -> None:
 
 
 def check_output(path: Path | str) -> Path:
-    """Check, before long work, that `path` can be written; its parent folders are made.
+    """Check, before long work, that `path` can be written; nothing is made.
 
     Returns:
         The absolute path that will be written: the target of a link.
@@ -330,11 +330,10 @@ def check_output(path: Path | str) -> Path:
     if into:
         return target
     folder = Path(os.path.abspath(target)).parent
-    for part in (folder, *folder.parents):
-        if part.exists() and not part.is_dir():
-            raise AwError(f"cannot write {path}: {part} is a file, not a folder; choose another -o")
+    folder = next(part for part in (folder, *folder.parents) if os.path.lexists(part))
+    if not folder.is_dir():
+        raise AwError(f"cannot write {path}: {folder} is a file, not a folder; choose another -o")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         os.rmdir(tempfile.mkdtemp(prefix=".aw-probe-", dir=folder))
     except OSError as error:
         raise AwError(

@@ -113,11 +113,6 @@ BUILTIN_TRAITS = {
 }  # fmt: skip
 
 
-def traits_of(name: str) -> Traits | None:
-    """Return the traits of a built-in method; None for others."""
-    return BUILTIN_TRAITS.get(name)
-
-
 COLUMNS = ("method", "masks", "appearance", "density", "extra state", "back ends", "facts from")
 BACK_ENDS = "features", "instances"  # options that name a back end of vision/backends.py
 
@@ -192,7 +187,7 @@ def _short(value: Any) -> str:
 
 def table_row(entry: MethodEntry) -> tuple[str, ...]:
     """Return the cells of a method, in the columns of `COLUMNS`."""
-    traits = traits_of(entry.name)
+    traits = BUILTIN_TRAITS.get(entry.name)
     if entry.program is not None:
         return (entry.name, "", "", "", "", "its own program", "")
     if traits is None:
@@ -205,7 +200,7 @@ def table_row(entry: MethodEntry) -> tuple[str, ...]:
 def details(entry: MethodEntry) -> Facts:
     """Return everything that is known about a method, ready for JSON."""
     options = [] if entry.program is not None else options_of(entry)
-    traits = traits_of(entry.base or entry.name) or Traits()
+    traits = BUILTIN_TRAITS.get(entry.base or entry.name, Traits())
     once = dataclasses.replace(entry, name=entry.base or entry.name)
     runs_with = {o.key: o.default for o in options if o.key.rpartition(".")[2] in BACK_ENDS}
     return {

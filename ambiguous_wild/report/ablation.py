@@ -66,10 +66,8 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
     status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
     reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
     values = {key: _summary([o.value(key) for o in outcomes]) for key in KEYS}
-    differences = {}
-    for key in (m.key for m in DIFFERENCES):
-        pairs = [(o.value(key), d.value(key)) for o, d in zip(outcomes, default, strict=False)]
-        differences[key] = _summary([None if a is None or b is None else a - b for a, b in pairs])
+    pairs = list(zip(outcomes, default, strict=False))
+    differences = {m.key: _summary([_minus(m, o, d) for o, d in pairs]) for m in DIFFERENCES}
     return {
         "group": row.group,
         "variant": row.variant.name,
@@ -82,6 +80,12 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
         "differences": differences,
         "runs": [_run_row(outcome) for outcome in outcomes],
     }
+
+
+def _minus(m: Measure, o: Outcome, default: Outcome) -> float | None:
+    """Return the difference of two runs; None if a value is missing, or a time cannot be compared."""
+    a, b = o.value(m.key), default.value(m.key)
+    return None if a is None or b is None or (m.timed and (o.untimed or default.untimed)) else a - b
 
 
 def _run_row(o: Outcome) -> Facts:

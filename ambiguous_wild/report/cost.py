@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.result_file import encoded
 from ambiguous_wild.harness.timing import seconds_range
 from ambiguous_wild.io.files import is_record, refuse_files_there, write_json, write_text
@@ -16,7 +17,7 @@ from ambiguous_wild.report import plain_formats
 from ambiguous_wild.report.cost_curves import Change, Curve, Point, Summary, changes, curves_of, points
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
 from ambiguous_wild.report.cost_targets import Answer, Reach, answers, times_to_reach
-from ambiguous_wild.report.plain_formats import plain, to_csv
+from ambiguous_wild.report.plain_formats import to_csv
 from ambiguous_wild.report.table import Table, text_table
 
 PLOTS = ("timelines", "budgets", "front", "changes")

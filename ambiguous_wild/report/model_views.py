@@ -187,7 +187,7 @@ def video_runs(
         raise AwError(f"{seconds:g} seconds at {fps:g} frames per second are fewer than two frames")
     shown = read_models(paths, scene=scene, scene_folder=scene_folder)
     for wanted in (output, *([gif] if gif else [])):
-        check_output(wanted)  # after the models: it makes the folder
+        check_output(wanted)
     for note in shown.notes:
         say(note)
     cameras = _cameras(shown.scene, path, frames, width)

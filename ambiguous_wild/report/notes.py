@@ -16,7 +16,7 @@ from ambiguous_wild.harness.result_file import Options
 from ambiguous_wild.harness.store import Runs, read_config
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
-from ambiguous_wild.report.plain_formats import UNFITTED
+from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
 
 LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps
 REFERENCE = "reference_s"  # comparable between machines; other times are not
@@ -44,7 +44,6 @@ def notes(
     )
 
 
-UNEQUAL = "not comparable"  # begins a note that every format with ranks shows
 CONDITIONS = {
     "effects": "effects",
     "length": "lengths",
@@ -260,14 +259,15 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         lines.append(f"costs were measured on different devices: {each}")
     if ok["version"].nunique() > 1:
         lines.append(
-            "results of different versions of ambiguous_wild: " + ", ".join(sorted(set(ok["version"])))
+            f"{UNEQUAL}: results of different versions of ambiguous_wild: "
+            + ", ".join(sorted(set(ok["version"])))
         )
     elif "code_hash" in ok and ok["code_hash"].nunique() > 1:
-        lines.append(f"results of {ok['code_hash'].nunique()} states of ambiguous_wild's code")
+        lines.append(f"{UNEQUAL}: results of {ok['code_hash'].nunique()} states of ambiguous_wild's code")
     seeds = ok.groupby("method")["seed"].nunique()
     if seeds.nunique() > 1:
         each = shortlist((f"{method} {count}" for method, count in seeds.items()), limit=12)
-        lines.append(f"methods have different numbers of seeds: {each}")
+        lines.append(f"{UNEQUAL}: methods have different numbers of seeds: {each}")
     return lines
 
 

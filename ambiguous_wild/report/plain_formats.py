@@ -17,19 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES, Measure
 from ambiguous_wild.report.table import ARROWS, TIE, Cell, Column, Row, Table
 
 RANKS = "(1) (2) (3): first, second and third in the column"
 COLORS = {1: "green", 2: "cyan", 3: "yellow"}  # of the terminal
-
-
-def plain(text: str) -> str:
-    """Return the text on one line, with control and format characters escaped."""
-    hidden = ("Cc", "Cf", "Zl", "Zp", "Cs")
-    return "".join(
-        c.encode("unicode_escape").decode() if unicodedata.category(c) in hidden else c for c in str(text)
-    )
 
 
 def display_width(text: str) -> int:
@@ -247,16 +240,19 @@ def read_csv(
 
 
 LONG_HEAD = ("table", "kind", "method", "dataset", "column", "scene", "metric", "value", "std", "rank",
-             "not_significant", "status", "printed")  # fmt: skip
+             "not_significant", "status", "printed", "note")  # fmt: skip
 
 
 def to_long_csv(tables: Sequence[Table]) -> str:
-    """Return CSV with one number per row; measured numbers have a value, reported ones only `printed`."""
+    """Return CSV with one number per row; measured numbers have a value, reported ones only `printed`.
+
+    `note` says why ranks of the table may not be due to the methods; it is empty if runs differ in nothing.
+    """
     rows = (
         (
             table.title, row.kind, row.name, column.dataset, column.group, column.scene, column.measure.key,
             cell.value, cell.spread, cell.rank, "yes" if cell.tie else "",
-            "" if cell.printed else cell.state, cell.printed,
+            "" if cell.printed else cell.state, cell.printed, _limits(table),
         )
         for table in tables
         for row in table.rows
@@ -266,23 +262,29 @@ def to_long_csv(tables: Sequence[Table]) -> str:
     return to_csv(LONG_HEAD, rows)
 
 
+def _limits(table: Table) -> str:
+    return "; ".join(note for note in table.notes if note.startswith(UNEQUAL))
+
+
 def to_wide_csv(tables: Sequence[Table]) -> str:
     """Return CSV with one row per scene and method, for tables with the same columns; means have no scene.
 
     Every column has the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 % bootstrap
-    interval over the test images of one scene, and `_tied`, "yes" if not significantly below the best.
+    interval over the test images of one scene, and `_tied`, "yes" if not significantly below the best. The
+    last column is `note`, as in `to_long_csv`.
     """
     head = ["scene", "method", "status", "runs"]
     for column in tables[0].columns:
         key = column.measure.key
         head += [key] if column.words else [key, f"{key}_std"]
         head += [f"{key}_low", f"{key}_high", f"{key}_tied"] if column.measure.per_image else []
+    note = _limits(tables[-1])
     rows = (
-        [table.columns[0].scene, row.name, _status(row), row.runs, *_wide_values(table, row)]
+        [table.columns[0].scene, row.name, _status(row), row.runs, *_wide_values(table, row), note]
         for table in tables
         for row in table.rows
     )
-    return to_csv(head, rows, number=shortest)
+    return to_csv([*head, "note"], rows, number=shortest)
 
 
 def _wide_values(table: Table, row: Row) -> Iterator[float | str]:
@@ -296,6 +298,7 @@ def _status(row: Row) -> str:
     return next((s for s in ("failed", "absent", "ok") if s in states), "missing")
 
 
+UNEQUAL = "not comparable"  # begins a note that every format with ranks shows
 WIDTH = 100
 # The most important columns; others follow in the order of the table.
 FIRST = (

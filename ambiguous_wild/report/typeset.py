@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import Measure
-from ambiguous_wild.report.notes import UNEQUAL
-from ambiguous_wild.report.plain_formats import plain
+from ambiguous_wild.report.plain_formats import UNEQUAL
 from ambiguous_wild.report.table import TIE, Cell, Row, Table
 
 NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}"

@@ -73,21 +73,6 @@ class PreparedPhoto:
     drawn: DrawnEffects  # random values of the effects so far
 
 
-def render_photo(
-    spec: CaptureSpec, world: World, planned: PlannedPhoto, random: PhotoRandom
-) -> RenderedPhoto:
-    """Render one photo: `prepare_photo`, `trace_photo` and `finish_photo`.
-
-    Args:
-        spec: gives the effects.
-        world: the static world.
-        planned: the camera and the placed distractors.
-        random: random numbers of the effects.
-    """
-    prepared = prepare_photo(spec, world, planned, random)
-    return finish_photo(planned, random, prepared, trace_photo(world, prepared))
-
-
 def prepare_photo(
     spec: CaptureSpec, world: World, planned: PlannedPhoto, random: PhotoRandom
 ) -> PreparedPhoto:

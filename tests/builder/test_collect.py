@@ -79,7 +79,7 @@ def test_too_few(tmp_path, names, message):
     ("files", "raw", "expected"),
     [
         (["DCIM/a.jpg", "DCIM/b.jpg", "DCIM/c.jpg"], ".", ["a", "b", "c"]),
-        (["front/0.jpg", "front/1.jpg", "back/0.jpg", "masks/back/0.png"], ".",
+        (["front/0.jpg", "front/1.jpg", "back/0.jpg", "masks/back/0.png", "Truth/0.png"], ".",
          ["back_0", "front_0", "front_1"]),
         (["images/l/0.jpg", "images/r/0.jpg", "images/r/1.jpg"], ".", ["l_0", "r_0", "r_1"]),
         (["1/l/0.jpg", "1/r/0.jpg", "2/l/0.jpg"], ".", ["1_l_0", "1_r_0", "2_l_0"]),
@@ -105,6 +105,17 @@ def test_folders_that_are_left_out_are_named_and_none_is_read_twice(tmp_path):
     assert "its folders rejected are left out" in collect(tmp_path).notes[0]
     with pytest.raises(AwError, match="give each once"):
         collect([tmp_path, tmp_path / "rejected"])
+
+
+@pytest.mark.parametrize("name", ["masks", "MASKS"])
+def test_masks_beside_the_photos_are_no_photos_and_their_option_is_named(tmp_path, name):
+    put(tmp_path / "photos", "a.jpg", "b.jpg", "c.jpg")
+    put(tmp_path / name, "a.png", "b.png", "c.png")
+    capture = collect(tmp_path)
+    assert stems(capture) == ["a", "b", "c"]
+    (note,) = capture.notes
+    assert f"--keep-masks '{tmp_path / name}'" in note
+    assert collect(tmp_path, masks=tmp_path / name).notes == ()
 
 
 def test_a_test_list_names_the_folder_where_two_photos_have_one_name(tmp_path):

@@ -12,7 +12,8 @@ from ambiguous_wild.builder import sfm
 from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placing import DIRECT, Place, _reason, adjustment_options
+from ambiguous_wild.builder.placing import Place, _reason, adjustment_options
+from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.colmap_model import read_model
@@ -178,7 +179,7 @@ def test_a_photo_without_a_clear_place_is_named_with_the_reason():
 
 
 def test_only_many_photos_are_adjusted_iteratively():
-    few, many = (adjustment_options(True, photos, final=True).ceres for photos in (DIRECT, DIRECT + 1))
+    few, many = (adjustment_options(True, photos, final=True).ceres for photos in (FEW, FEW + 1))
     assert few.auto_select_solver_type and not many.auto_select_solver_type
     assert many.solver_options.linear_solver_type.name == "ITERATIVE_SCHUR"
 

@@ -1,6 +1,9 @@
+import errno
 import fcntl
 import os
+import shutil
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -35,6 +38,20 @@ def test_time_of_a_result_that_is_used_again_counts_once(tmp_path):
     work = Workspace(tmp_path / "w")
     spent = [work.run("stage", {"a": a}, slow).seconds for a in (1, 1, 2, 1)]
     assert work.seconds() == {"stage": round(spent[0] + spent[2], 3)}
+
+
+def test_a_stage_that_fails_on_a_full_disk_says_so_and_runs_again(tmp_path, monkeypatch):
+    def crash(folder):
+        raise AwError("COLMAP ended with code 1: its log is empty")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=4096))
+        with pytest.raises(OSError, match=r"No space left.*features-") as raised:
+            Workspace(tmp_path).run("features", {}, crash)
+    assert raised.value.errno == errno.ENOSPC and not os.listdir(tmp_path)
+    with pytest.raises(AwError, match="log is empty"):
+        Workspace(tmp_path).run("features", {}, crash)
+    assert not Workspace(tmp_path).run("features", {}, lambda folder: {}).reused
 
 
 def test_a_stage_that_fails_leaves_no_folder(tmp_path):

@@ -14,6 +14,7 @@ import pytest
 
 from ambiguous_wild import __version__
 from ambiguous_wild.cli.main import COMMANDS, SECTIONS
+from ambiguous_wild.cli.options import say
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.weight_files import read_tensors
 from tests.command_line import aw
@@ -126,6 +127,13 @@ def test_too_little_memory_is_said_so(
     monkeypatch.setattr("ambiguous_wild.cli.main.cli.main", fails)
     done = aw("methods")
     assert done.returncode == 2 and "too little memory" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_names_cannot_control_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    done = aw("view", "runs\x1b[2J")
+    assert done.returncode == 2 and "runs\\x1b[2J" in done.stderr and "\x1b[2J" not in done.stderr
+    say("drawing 9 frames of 3dgs\n\x1b[2J")
+    assert capsys.readouterr().err == "drawing 9 frames of 3dgs\\n\\x1b[2J\n"
 
 
 @pytest.mark.parametrize("words", ["--fps nan", "--seconds nan", "--gif-seconds nan", "--seconds inf"])

@@ -301,6 +301,18 @@ def test_known_points_fall_where_the_tool_sees_them(name: str, tmp_path: Path) -
         np.testing.assert_allclose(scene.model.points.xyz, POINTS, atol=1e-5)
 
 
+def test_a_table_is_read_once_by_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from ambiguous_wild.datasets.readers import realityscan as reader
+
+    root = tmp_path / "theirs"
+    written("realityscan", root)
+    (root / "other.csv").write_text("a,b\n1,2\n")
+    read: list[Path] = []
+    monkeypatch.setattr(reader, "read_text", lambda path: read.append(path) or path.read_text("utf-8-sig"))
+    read_foreign(root, "realityscan")
+    assert sorted(read) == sorted(root.glob("*.csv")) and len(read) == 2
+
+
 @pytest.mark.parametrize(
     "name", ["realityscan", "metashape", "metashape fisheye", "colmap reduced", "record3d"]
 )

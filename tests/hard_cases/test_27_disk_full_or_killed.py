@@ -31,7 +31,7 @@ def test_a_bench_on_a_full_disk_says_so_and_with_room_ends_with_the_same_files(s
     with small_disk(tmp_path / "disk", 200) as disk:  # a checkpoint of this scene has over 300 kB
         report, run = bench(scene, disk / "runs")
         assert report.outcome == "failed"
-        assert "No space left on device" in report.error and "\n" not in report.error
+        assert "No space left on device; free space" in report.error and "\n" not in report.error
         assert half_written(disk) == []
         grow(disk, 20_000)
         report, run = bench(scene, disk / "runs")

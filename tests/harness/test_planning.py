@@ -12,6 +12,7 @@ import pytest
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness import effects_plan, mask_plan
 from ambiguous_wild.harness import effects_plan as decide_module
+from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import check_wanted
 from ambiguous_wild.harness.effects_plan import (
     FEW_PHOTOS,
@@ -25,6 +26,7 @@ from ambiguous_wild.harness.effects_plan import (
 from ambiguous_wild.harness.grid import cell_folder, choose, plan_cells, run_cells
 from ambiguous_wild.harness.mask_plan import Occlusion, summarise, unexplained, with_occlusion
 from ambiguous_wild.io.files import write_json
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import write_tiny_scene
@@ -305,6 +307,17 @@ def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
     (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
     assert none.identity == auto.identity != listed.identity
     assert none.config == auto.config
+
+
+def test_a_plan_of_another_state_of_the_scene_is_refused(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    plan = Plan("scene", (), scene_hash=scene_identity(load_scene(scene)))
+    write_json(tmp_path / "plan.json", plan.plain())
+    given = {"effects": "auto", "plan": read_plan(tmp_path / "plan.json")}
+    assert plan_cells(["3dgs"], [scene], [0], SHORT, **given)
+    (photo := next((scene / "images").iterdir())).write_bytes(photo.read_bytes() + b"0")
+    with pytest.raises(AwError, match="of another state of scene scene"):
+        plan_cells(["3dgs"], [scene], [0], SHORT, **given)
 
 
 def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_path):

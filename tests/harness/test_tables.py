@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES, measure
 from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.report import papers
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.report.papers import cost_at_the_end
 from ambiguous_wild.report.plain_formats import (
     display_width,
     fitted,
-    plain,
+    to_long_csv,
     to_markdown,
     to_text,
     to_wide_csv,
@@ -112,7 +114,7 @@ def test_unequal_effects_are_a_column_and_a_note_of_every_format(tmp_path: Path)
     unequal = table_of(tmp_path / "u", fake_result("a", facts=on), fake_result("b"))
     for name, render in RENDERERS.items():
         text = render(unequal)
-        assert "exposure, skybox" in text and ("not comparable: effects" in text or name == "csv"), name
+        assert "exposure, skybox" in text and "not comparable: effects" in text, name
     shown = [line for line in to_latex(unequal).splitlines() if not line.startswith("%")]
     assert any("not comparable: effects" in line for line in shown)
     equal = table_of(tmp_path / "e", fake_result("a", facts=on), fake_result("b", facts=on))
@@ -160,6 +162,10 @@ def test_settings_code_and_seeds_that_differ_are_said(tmp_path: Path) -> None:
         (tmp_path / f"yard/a/seed{seed}/config.yaml").write_text("train: {max_gaussians: null, seed: 1}")
     notes = "\n".join(comparison(read_runs(tmp_path))[-1].notes)
     assert "settings of training differ on yard: a: max_gaussians auto, b: max_gaussians 50" in notes
+    layouts = to_wide_csv(comparison(read_runs(tmp_path))), to_long_csv(papers.paper(read_runs(tmp_path)))
+    for row in (row for text in layouts for row in csv.DictReader(io.StringIO(text))):
+        for what in ("different options", "settings of training", "states of", "numbers of seeds"):
+            assert what in row["note"]
 
 
 def test_versions_of_a_methods_file_are_not_comparable(tmp_path: Path) -> None:

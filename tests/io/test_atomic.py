@@ -202,6 +202,14 @@ def test_what_is_neither_file_nor_pipe_is_refused_and_stays(tmp_path):
     assert {p.name: p.lstat().st_mode for p in tmp_path.iterdir()} == before
 
 
+def test_a_check_before_the_work_makes_nothing(tmp_path):
+    assert check_output(tmp_path / "a" / "b" / "c.txt") == tmp_path / "a" / "b" / "c.txt"
+    (tmp_path / "file").touch()
+    with pytest.raises(AwError, match="file is a file, not a folder"):
+        check_output(tmp_path / "file" / "b" / "c.txt")
+    assert os.listdir(tmp_path) == ["file"]
+
+
 def test_a_full_disk_names_the_file_whoever_found_it_full(tmp_path):
     told = "Error while serializing: IoError(Os { code: 28, kind: StorageFull })"
     for error in (OSError(28, "No space left on device"), ValueError(told)):

@@ -12,7 +12,13 @@ from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate import image_effects as fx
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.presets import PRESETS, preset, resized
-from ambiguous_wild.simulate.render import PlannedPhoto, RenderedPhoto, render_photo
+from ambiguous_wild.simulate.render import (
+    PlannedPhoto,
+    RenderedPhoto,
+    finish_photo,
+    prepare_photo,
+    trace_photo,
+)
 from ambiguous_wild.simulate.spec import KINDS, CaptureSpec, Defocus, Effects
 from ambiguous_wild.simulate.world import World
 
@@ -37,7 +43,9 @@ def planned() -> tuple[World, list[PlannedPhoto]]:
 
 def taken(spec: CaptureSpec, k: int, seed: int = 3) -> RenderedPhoto:
     world, shots = planned()
-    return render_photo(spec, world, shots[k], PhotoRandom(seed, k, k / 3))
+    random = PhotoRandom(seed, k, k / 3)
+    prepared = prepare_photo(spec, world, shots[k], random)
+    return finish_photo(shots[k], random, prepared, trace_photo(world, prepared))
 
 
 @pytest.mark.parametrize("name", [*KINDS, "none", "all"])

@@ -48,10 +48,11 @@ def _table(path: Path) -> list[list[str]]:
 
 def read_realityscan(root: Path) -> ForeignScene:
     """Read poses and lenses of the CSV, and the point cloud of a PLY beside it in the same coordinates."""
-    path = find_table(root)
+    tables: dict[Path, list[list[str]]] = {}  # each is read once
+    path = posed.only_file(root, ".csv", lambda path: bool(tables.setdefault(path, _table(path))))
     if path is None:
         raise AwError(f"{root} has no CSV of RealityScan's export 'Internal/External camera parameters'")
-    columns, *lines = _table(path)
+    columns, *lines = tables[path]
     with posed.tool_errors("RealityScan", path):
         stated = [dict(zip(columns, line, strict=True)) for line in lines]
         numbers = [

@@ -1,8 +1,10 @@
-"""A method in a short training: it repeats and resumes to the same bits, and changes nothing that it is given."""
+"""A short training of a method: it repeats and resumes to the same bits, and leaves its inputs unchanged."""
 
 from __future__ import annotations
 
 import copy
+import inspect
+import operator
 import random
 import tempfile
 from collections import deque
@@ -73,14 +75,14 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
     middle = ITERATIONS // 2
     first = trainer("first")
     before = train(first, middle)
-    for name in ("photos", "cameras", "scene"):
-        if differences(getattr(data, name), getattr(untouched, name)):
+    for name in ("photos", "cameras", "scene.points"):
+        if differ(*map(operator.attrgetter(name), (data, untouched))):
             return [f"it changes data.{name} in place: change a copy"]
     again = trainer("again")
     if changed := differing(before, train(again, middle)):
         return [
-            f"trained twice with one seed, {changed} differ: seed every random generator from data.seed; "
-            "keep nothing in a module or class"
+            f"two trainings of one seed differ in {changed}: seed every random generator from data.seed, and "
+            "keep no state in a module or class"
         ]
     step = again.make_step(middle, 0)
     again.parts.mask.predict(step)
@@ -95,11 +97,11 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
         for name in differing(vars(part), vars(other)).split(", ")
         if name
     ]
+    lost = [name for name in lost if "._" not in name] or lost  # private ones are often caches
     if changed := differing(train(first, ITERATIONS), train(resumed, ITERATIONS)):
-        where = ", ".join(lost) or "something outside of the parts' attributes"
         return [
-            f"stopped and resumed, {changed} differ, because {where} was not restored: return it from "
-            "state_dict(), set it in load_state_dict(state)"
+            f"stopped and resumed, it differs in {changed}; not restored: {', '.join(lost) or 'unknown'}: return "
+            "it from state_dict() and set it in load_state_dict(state)"
         ]
     return []
 
@@ -120,29 +122,28 @@ def _state(trainer: Trainer) -> State:
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """Return the keys whose values differ, separated by commas."""
-    return ", ".join(key for key in {**one, **other} if differences(one.get(key), other.get(key)))
+    return ", ".join(key for key in {**one, **other} if differ(one.get(key), other.get(key)))
 
 
-def differences(one: Any, other: Any, seen: frozenset[int] = frozenset()) -> bool:
-    """Whether two nested values differ in a bit; objects are compared by their attributes."""
-    if one is other or id(one) in seen or (callable(one) and not isinstance(one, torch.nn.Module)):
+def differ(one: Any, other: Any, outer: frozenset[int] = frozenset()) -> bool:
+    """Whether two values differ in a bit; objects are compared by their attributes, `outer` ends circles."""
+    if one is other or inspect.isroutine(one) or isinstance(one, (type, TrainData)):
         return False
-    if type(one) is not type(other):
+    if type(one).__qualname__ != type(other).__qualname__:
         return True
-    if isinstance(one, TrainData):
-        return False
-    if isinstance(one, Tensor):
-        one, other = one.detach().cpu(), other.detach().cpu()
-        return one.dtype != other.dtype or not torch.equal(one, other)
-    if isinstance(one, np.ndarray):
-        return one.dtype != other.dtype or not np.array_equal(one, other)
+    if isinstance(one, (Tensor, np.ndarray)):
+        one, other = torch.as_tensor(one).detach(), torch.as_tensor(other).detach()
+        same = one.dtype == other.dtype and one.shape == other.shape
+        return not (same and torch.equal(*(t.reshape(-1).view(torch.uint8) for t in (one, other))))
     one, other = _inside(one), _inside(other)
-    seen |= {id(one)}
+    if id(one) in outer:
+        return False
+    outer |= {id(one)}
     if isinstance(one, Mapping):
-        return one.keys() != other.keys() or any(differences(one[key], other[key], seen) for key in one)
+        return one.keys() != other.keys() or any(differ(one[key], other[key], outer) for key in one)
     if isinstance(one, (list, tuple, deque)):
-        return len(one) != len(other) or any(differences(a, b, seen) for a, b in zip(one, other))
-    return bool(one != other)
+        return len(one) != len(other) or any(differ(a, b, outer) for a, b in zip(one, other))
+    return bool(one != other) and not bool(one != one)  # NaN
 
 
 def _inside(value: Any) -> Any:

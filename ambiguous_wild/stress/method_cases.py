@@ -100,8 +100,8 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
     lost = [name for name in lost if "._" not in name] or lost  # private ones are often caches
     if changed := differing(train(first, ITERATIONS), train(resumed, ITERATIONS)):
         return [
-            f"stopped and resumed, it differs in {changed}; not restored: {', '.join(lost) or 'unknown'}: return "
-            "it from state_dict() and set it in load_state_dict(state)"
+            f"stopped and resumed, it differs in {changed}; not restored: {', '.join(lost) or 'unknown'}: "
+            "return it from state_dict() and set it in load_state_dict(state)"
         ]
     return []
 
@@ -131,10 +131,6 @@ def differ(one: Any, other: Any, outer: frozenset[int] = frozenset()) -> bool:
         return False
     if type(one).__qualname__ != type(other).__qualname__:
         return True
-    if isinstance(one, (Tensor, np.ndarray)):
-        one, other = torch.as_tensor(one).detach(), torch.as_tensor(other).detach()
-        same = one.dtype == other.dtype and one.shape == other.shape
-        return not (same and torch.equal(*(t.reshape(-1).view(torch.uint8) for t in (one, other))))
     one, other = _inside(one), _inside(other)
     if id(one) in outer:
         return False
@@ -148,6 +144,11 @@ def differ(one: Any, other: Any, outer: frozenset[int] = frozenset()) -> bool:
 
 def _inside(value: Any) -> Any:
     """Return what an object holds: a mapping, a list or a plain value."""
+    if isinstance(value, Tensor):
+        flat = value.detach().cpu().reshape(-1).view(torch.uint8)
+        return [str(value.dtype), tuple(value.shape), flat.numpy().tobytes()]
+    if isinstance(value, np.ndarray):
+        return [str(value.dtype), value.shape, value.tobytes()]
     if isinstance(value, torch.Generator):
         return [value.get_state()]
     if isinstance(value, np.random.Generator):

@@ -109,7 +109,7 @@ def turns(): return Parts(density=Turns)
         ("learns", "predict(step) or panels(step) changes mask"),
         ("unseeded", "two trainings of one seed differ in gaussians"),
         ("brighter", "it changes data.photos in place"),
-        ("breaks", "IndexError: list index out of range (faulty.py, line 37)"),
+        ("breaks", "IndexError: list index out of range (faulty.py, line 35)"),
     ],
 )
 def test_a_faulty_method_is_found_with_its_remedy(tmp_path, recipe, line):

@@ -251,11 +251,10 @@ def test_a_method_gets_no_test_photo(scene, tmp_path):
             given.append(data)
 
     parts = Parts(mask=Curious(), train_data=lambda data: given.append(data) or data)
-    read = load_scene(scene)
-    trainer = trainer_for(read, tmp_path, parts=parts)
-    assert len(given) == 2 and trainer.data.scene.test == read.test
+    trainer = trainer_for(scene, tmp_path, parts=parts)
+    assert len(given) == 2 and trainer.data.scene.test == scene.test
     for data in given:
-        assert data.scene.train == read.train and len(data.scene.test) == len(read.test) > 0
+        assert data.scene.train == scene.train and len(data.scene.test) == len(scene.test) > 0
         assert all((view.image_path, view.keep_path) == (NO_PHOTO, None) for view in data.scene.test)
 
 

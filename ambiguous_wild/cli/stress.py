@@ -9,11 +9,19 @@ from pathlib import Path
 import click
 
 from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.core.errors import AwError
 
 
 @click.command("stress")
 @click.option(
     "--only", multiple=True, metavar="CASE", help="Only this case: number or part of its name; repeatable."
+)
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    metavar="NAME",
+    help="Instead of the cases: check this method, such as FILE.py:RECIPE, in a short training; repeatable.",
 )
 @click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
 @click.option(
@@ -40,6 +48,7 @@ from ambiguous_wild.cli.options import PathName
 )
 def command(
     only: tuple[str, ...],
+    methods: tuple[str, ...],
     listing: bool,
     device: str,
     style: str,
@@ -52,6 +61,7 @@ def command(
     \b
     aw stress                     every case
     aw stress --only 4 --only needle
+    aw stress --method my.py:trimmed    its bits when it is repeated, and when it is stopped and resumed
     aw stress --replay runs/scene/3dgs/seed0
 
     Exits with code 1 if a case fails or a replay differs. docs/numerics.md explains the tolerances.
@@ -61,7 +71,15 @@ def command(
         return
     from ambiguous_wild.stress import table
 
-    cases = table.chosen(only)
+    if methods:
+        from ambiguous_wild.methods.registry import get_method
+        from ambiguous_wild.stress.method_cases import case_of
+
+        if only or device == "cuda":
+            raise AwError("--method is checked on the CPU, alone: leave out --only and --device cuda")
+        cases, device = [case_of(get_method(name)) for name in methods], "cpu"
+    else:
+        cases = table.chosen(only)
     if listing:
         click.echo("\n".join(c.key for c in cases))
         return

@@ -14,6 +14,7 @@ from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 
 Split = Literal["train", "test"]
+NO_PHOTO = Path()  # image path of views without a photo: of a splat file's scene, or hidden from methods
 _FEW_POINTS = 500  # fewer points do not describe a surface
 _FAR_CAMERA = 30.0  # times the cameras' median distance from their middle; farther away a pose is wrong
 _FEW_CAMERAS = 0.1  # share of the cameras; if more lie far away, they are another part of the capture

@@ -21,7 +21,7 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods.entry import resolve
-from ambiguous_wild.methods.references import import_file, place_of, source_hash
+from ambiguous_wild.methods.references import import_file, place_of
 
 if TYPE_CHECKING:
     from ambiguous_wild.core import Scene, View
@@ -189,11 +189,12 @@ def register(metric: Metric) -> Metric:
 
 def load_metrics(path: Path) -> None:
     """Register every `Metric` of a Python file; raise AwError if it has none, or a wrong one."""
-    in_file = [value for value in vars(import_file(path)).values() if isinstance(value, Metric)]
+    module, digest = import_file(path)
+    in_file = [value for value in vars(module).values() if isinstance(value, Metric)]
     if not in_file:
         raise AwError(f"{path} holds no Metric: see 'Your own metric' in docs/metrics.md")
     for metric in in_file:
-        register(replace(metric, source=source_hash(path)))
+        register(replace(metric, source=digest))
 
 
 def own() -> dict[str, Metric]:

@@ -10,9 +10,11 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from string import Formatter
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError
@@ -28,7 +30,8 @@ class MethodEntry:
     """A method: its line in `aw methods`, and where its recipe and options are.
 
     `recipe` is "module:function" or a function; it takes the options and returns `Parts`. `config` is
-    "module:Class" or a frozen dataclass: the options of the method, all with defaults.
+    "module:Class" or a frozen dataclass: the options of the method, all with defaults. Of a function it need
+    not be given: it is the type of the argument.
     """
 
     name: str
@@ -49,6 +52,10 @@ class MethodEntry:
     given_as: str = ""
     # a line below every table of its runs; {features} stands for the option of that name
     note: str = ""
+
+    def __post_init__(self) -> None:
+        if self.config is None and inspect.isfunction(self.recipe):
+            object.__setattr__(self, "config", config_of(self.recipe))
 
     def options(self) -> Any:
         """Return the method's options with their defaults (a frozen dataclass instance).
@@ -130,6 +137,20 @@ def required(recipe: Callable[..., object]) -> list[inspect.Parameter]:
     """Return the arguments without a default."""
     every = inspect.signature(recipe).parameters.values()
     return [p for p in every if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+
+
+def config_of(recipe: FunctionType) -> type | None:
+    """Return the dataclass that annotates the function's one argument; None if there is none.
+
+    Raises:
+        AwError: a type is not defined.
+    """
+    needed = required(recipe)
+    try:
+        config = typing.get_type_hints(recipe).get(needed[0].name) if len(needed) == 1 else None
+    except NameError as error:
+        raise AwError(f"recipe {recipe.__name__}: {error} in the types of its arguments") from None
+    return config if isinstance(config, type) and dataclasses.is_dataclass(config) else None
 
 
 def resolve(target: Any) -> Any:

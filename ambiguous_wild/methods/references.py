@@ -14,7 +14,6 @@ import os
 import re
 import sys
 import traceback
-import typing
 from pathlib import Path
 from types import ModuleType
 
@@ -25,12 +24,14 @@ from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.methods.entry import MethodEntry, required
 
 _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
-_helpers: dict[str, Path] = {}  # files of the modules that loaded files imported from beside them, by name
+_helpers: dict[str, Path] = {}  # files of modules that loaded files imported from beside them, by name
 _NO_HELPERS = (Path(os.__file__).resolve().parent, Path(__file__).resolve().parents[1])  # Python's and ours
 
 
-def import_file(path: Path) -> ModuleType:
-    """Run a Python file; returns its module.
+def import_file(path: Path) -> tuple[ModuleType, str]:
+    """Run a Python file; returns its module and its hash.
+
+    The hash is the sha256 of the file, or one of it and of the modules below its folder that it imported.
 
     Raises:
         AwError: no such file, no Python file, or it fails when it is loaded; the message names the line.
@@ -45,7 +46,7 @@ def import_file(path: Path) -> ModuleType:
     sys.modules[name] = module
     _loaded.add(str(spec.origin))
     folder = path.resolve().parent
-    # helpers are imported anew: they may have been edited, and `source_hash` needs those of this file
+    # helpers are imported anew: they may have been edited, and the hash needs those of this file
     for helper in [name for name, file in _helpers.items() if file.is_relative_to(folder)]:
         del _helpers[helper]
         sys.modules.pop(helper, None)
@@ -61,8 +62,11 @@ def import_file(path: Path) -> ModuleType:
         raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
     finally:
         files = {new: _file_of(new) for new in sys.modules.keys() - before}
-        _helpers.update({new: file for new, file in files.items() if file and file.is_relative_to(folder)})
-    return module
+        own = {new: file for new, file in files.items() if file and file.is_relative_to(folder)}
+        _helpers.update(own)
+    each = {file.relative_to(folder).as_posix(): sha256_file(file) for file in own.values()}
+    digest = sha256_file(path)
+    return module, config_hash({**each, "": digest}) if each else digest
 
 
 def _file_of(name: str) -> Path | None:
@@ -73,17 +77,6 @@ def _file_of(name: str) -> Path | None:
     file = Path(text).resolve()
     foreign = any(file.is_relative_to(folder) for folder in _NO_HELPERS)
     return file if file.is_file() and not foreign else None
-
-
-def source_hash(path: Path) -> str:
-    """Return the sha256 of the file loaded last, with the modules below its folder that it imported.
-
-    Without such modules it is the sha256 of the file.
-    """
-    folder = path.resolve().parent
-    own, helpers = sha256_file(path), {f for f in _helpers.values() if f.is_relative_to(folder)}
-    each = {file.relative_to(folder).as_posix(): sha256_file(file) for file in helpers}
-    return config_hash({**each, "": own}) if each else own
 
 
 def place_of(error: BaseException) -> str:
@@ -154,30 +147,28 @@ def _recipe(name: str) -> MethodEntry:
     """Return a MethodEntry of the file, or make one of a function that returns `Parts`."""
     path_text, _, attribute = name.rpartition(":")
     path = Path(path_text)
-    module = import_file(path)
+    module, digest = import_file(path)
     target = getattr(module, attribute, None)
     if target is None:
         raise unknown(f"recipe in {path}", attribute, _recipes(module))
-    digest = source_hash(path)
     if isinstance(target, MethodEntry):
         return dataclasses.replace(target, source_hash=digest)
     if not inspect.isfunction(target):
         raise AwError(
             f"{name} is a {type(target).__name__}: it must be a function that returns Parts, or a MethodEntry"
         )
-    config = _config_of(target, name)
-    recipe = target if config is not None else lambda options: target()
     summary = (inspect.getdoc(target) or f"{attribute} of {path.name}").splitlines()[0]
-    return MethodEntry(
-        check_name("method name", attribute), summary, recipe, config=config, source_hash=digest
-    )
+    entry = MethodEntry(check_name("method name", attribute), summary, target, source_hash=digest)
+    if required(target) and entry.config is None:
+        raise AwError(f"{name} must take nothing, or one argument whose type is a dataclass of options")
+    return entry
 
 
 def without_recipe(path: Path) -> AwError:
     """Return the error for a file without the name of a recipe; its message lists the names."""
     if not path.is_file():
         return AwError(f"no file {path}: write FILE.py:RECIPE, or a name of 'aw methods'")
-    names = _recipes(import_file(path))
+    names = _recipes(import_file(path)[0])
     if not names:
         return AwError(f"{path} has no recipe: write a function that returns Parts (docs/extend.md)")
     return AwError(
@@ -199,17 +190,3 @@ def _recipes(module: ModuleType) -> list[str]:
         if "Parts" in str(getattr(value, "__annotations__", {}).get("return"))
     ]
     return sure or list(own)
-
-
-def _config_of(recipe: typing.Callable[..., object], name: str) -> type | None:
-    """Return the frozen dataclass that the function takes; None if it takes nothing."""
-    needed = required(recipe)
-    if not needed:
-        return None
-    try:
-        config = typing.get_type_hints(recipe).get(needed[0].name)
-    except NameError as error:
-        raise AwError(f"{name}: {error} in the types of its arguments") from None
-    if len(needed) > 1 or not (isinstance(config, type) and dataclasses.is_dataclass(config)):
-        raise AwError(f"{name} must take nothing, or one argument whose type is a dataclass of options")
-    return config

@@ -19,7 +19,6 @@ from ambiguous_wild.methods.references import (
     import_file,
     is_reference,
     read_reference,
-    source_hash,
     without_recipe,
 )
 
@@ -117,8 +116,7 @@ def load_plugin(path: Path | str) -> list[str]:
         AwError: no such file, or it registers nothing.
     """
     path, before = Path(path), dict(registered)
-    import_file(path)
-    digest = source_hash(path)
+    _, digest = import_file(path)
     added = [key for key, entry in registered.items() if before.get(key) is not entry]
     if not added:
         raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")

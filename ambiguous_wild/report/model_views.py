@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ambiguous_wild.core import AwError, Camera, Scene
+from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.harness.bench import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
 from ambiguous_wild.harness.trained_models import find_models, open_scene, read_files, read_models
@@ -17,7 +18,7 @@ from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import FORMATS, NO_PHOTO, Exported, export, space_of
+from ambiguous_wild.viewing.model import FORMATS, Exported, export, space_of
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Camera, Scene
+from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.splat.backend import Backend, backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Rendered
@@ -21,7 +22,7 @@ NOMINAL_ITERATIONS = 30_000  # schedules are written for this length and scale w
 
 @dataclass(frozen=True)
 class TrainData:
-    """The training side of the scene. Parts of a method must not read `scene.test`, the test side."""
+    """The training side of the scene. A method gets test views without photo and mask, see `for_method`."""
 
     scene: Scene
     photos: Sequence[Tensor]  # one for each train view: [H, W, 3] float32 in [0, 1], sRGB, on `device`
@@ -35,6 +36,14 @@ class TrainData:
     def backend(self) -> Backend:
         """The back end that computes on `device`."""
         return backend_of(self.device)
+
+    def for_method(self) -> TrainData:
+        """Return the data whose test views have cameras alone."""
+        shown = (
+            view if view.split == "train" else replace(view, image_path=NO_PHOTO, keep_path=None)
+            for view in self.scene.views
+        )
+        return replace(self, scene=replace(self.scene, views=tuple(shown)))
 
     @property
     def sfm_points(self) -> Tensor:

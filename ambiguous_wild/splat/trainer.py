@@ -56,8 +56,9 @@ class Trainer(Run):
         """
         data.backend.use_threads(config.torch_threads)
         if parts.train_data is not None:
-            data = parts.train_data(data)
+            data = replace(parts.train_data(data.for_method()), scene=data.scene)
         super().__init__(data, config, folder, probe)
+        data = data.for_method()
         self.parts = parts
         self.pyramid = Pyramid(data)
         self._divisors: dict[int, int] = {}  # divisors of the steps since the sentinel was last read
@@ -222,7 +223,8 @@ class Trainer(Run):
             self.iteration = iteration
             return math.nan
         step = self.make_step(iteration, view)
-        changes = step.photo._version  # torch counts changes in place
+        shown = (step.photo, step.rendered.image)
+        changes = [picture._version for picture in shown]  # torch counts changes in place
         with part("mask"):
             keep = self.combine_user_keep(step, self.parts.mask.keep(step))
         with part("loss"):
@@ -232,10 +234,10 @@ class Trainer(Run):
         with part("mask loss"):
             method_cotangents = self.parts.mask.cotangent(step, keep)
             _refuse_a_loss(method_cotangents, step)
-            if step.photo._version != changes:
+            if changes != [picture._version for picture in shown]:
                 raise AwError(
-                    f"keep or cotangent of {type(self.parts.mask).__name__} changed step.photo in place, on "
-                    "which later steps train: change a copy, step.photo.clone()"
+                    f"keep or cotangent of {type(self.parts.mask).__name__} changed step.photo or "
+                    "step.rendered.image in place, which training reads: change a copy, .clone()"
                 )
         if self.sentinel is None and keep is not None and not bool(keep.any()):
             # Nothing to learn: steps by Adam's momentum alone would drift away from the scene.

@@ -58,7 +58,6 @@ def _median_depth(pose: np.ndarray, points: np.ndarray) -> float:
 
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
-NO_PHOTO = Path()  # image path of views without a photo, in a scene made for a splat file
 
 
 @dataclass(frozen=True)

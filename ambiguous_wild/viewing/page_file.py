@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.io.files import check_output, refuse_file, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
@@ -18,7 +19,7 @@ from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrow
 from ambiguous_wild.io.splat_arrays import finite, sigmoid
 from ambiguous_wild.io.spz import spz_arrays, spz_bytes
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.viewing.model import NO_PHOTO, Model, Renderer, space_of
+from ambiguous_wild.viewing.model import Model, Renderer, space_of
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'

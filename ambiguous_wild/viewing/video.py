@@ -13,9 +13,9 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.core.names import ascii_text
-from ambiguous_wild.core.scene import centred, together
+from ambiguous_wild.core.scene import NO_PHOTO, centred, together
 from ambiguous_wild.io.files import atomic_path
-from ambiguous_wild.viewing.model import NO_PHOTO, Model, Renderer, space_of
+from ambiguous_wild.viewing.model import Model, Renderer, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
 _MOST_BYTES = 64 * 1024 * 1024

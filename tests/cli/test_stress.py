@@ -47,6 +47,84 @@ def test_a_case_that_fails_is_said_and_exits_with_1(monkeypatch, error):
     assert "FAILED" in aw("--device", "cpu", "--format", "markdown").stdout
 
 
+FAULTY = """
+import torch
+from ambiguous_wild.splat.density import DensityControl
+from ambiguous_wild.splat.parts import MaskPolicy, Parts
+
+class Mean(MaskPolicy):
+    mean = None
+
+    def keep(self, step):
+        error = (step.rendered.image - step.photo).abs().mean(dim=2)
+        self.mean = error.mean() if self.mean is None else 0.9 * self.mean + 0.1 * error.mean()
+        return (error < 2 * self.mean).float()
+
+class Lost(Mean):
+    def predict(self, step):
+        return None
+
+class Learns(Mean):
+    def state_dict(self):
+        return {"mean": self.mean}
+
+    def load_state_dict(self, state):
+        self.mean = state["mean"]
+
+class Unseeded(MaskPolicy):
+    def keep(self, step):
+        return torch.rand(step.photo.shape[:2])
+
+class Brighter(MaskPolicy):
+    def setup(self, data):
+        data.photos[3].mul_(1.01)
+
+class Breaks(MaskPolicy):
+    def keep(self, step):
+        return [][step.iteration]
+
+class Turns(DensityControl):
+    turns = 0
+
+    def before_step(self, step, gradients):
+        self.turns += 1
+        if self.turns % 50 == 7:
+            gradients.means.zero_()
+        return gradients
+
+def lost(): return Parts(mask=Lost())
+def learns(): return Parts(mask=Learns())
+def unseeded(): return Parts(mask=Unseeded())
+def brighter(): return Parts(mask=Brighter())
+def breaks(): return Parts(mask=Breaks())
+def turns(): return Parts(density=Turns)
+"""
+
+
+@pytest.mark.parametrize(
+    ("recipe", "line"),
+    [
+        ("lost", "differs in gaussians, optimiser; not restored: Lost.mean: return it from state_dict()"),
+        ("turns", "differs in gaussians, optimiser; not restored: Turns.turns: return it from state_dict()"),
+        ("learns", "predict(step) or panels(step) changes mask"),
+        ("unseeded", "two trainings of one seed differ in gaussians"),
+        ("brighter", "it changes data.photos in place"),
+        ("breaks", "IndexError: list index out of range (faulty.py, line 35)"),
+    ],
+)
+def test_a_faulty_method_is_found_with_its_remedy(tmp_path, recipe, line):
+    (tmp_path / "faulty.py").write_text(FAULTY)
+    done = aw("--method", f"{tmp_path / 'faulty.py'}:{recipe}")
+    assert done.exit_code == 1 and "0 of 1 passed on cpu" in done.output
+    assert line in done.stdout and len(done.stdout.splitlines()) == 3
+
+
+def test_what_is_no_method_of_ours_is_refused(tmp_path):
+    for words in (("nowhere.py:lost",), ("3dgs", "--only", "4"), ("nerfbaselines:wild-gaussians",)):
+        with pytest.raises(AwError):
+            CliRunner().invoke(cli, ["stress", "--method", *words], catch_exceptions=False)
+
+
 def test_a_case_that_raises_fails_with_its_reason():
     def measure(device):
         raise AwError("not today")

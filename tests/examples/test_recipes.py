@@ -18,6 +18,8 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.stress.case import run
+from ambiguous_wild.stress.method_cases import case_of
 from tests.tiny_scene import write_tiny_scene
 
 ROOT = Path(__file__).parents[2]
@@ -47,6 +49,12 @@ def test_the_mask_policy_on_the_page_is_the_example():
 
 def reference(name: str) -> str:
     return f"{ROOT / 'examples' / name}.py:{RECIPES[name]}"
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_repeats_and_resumes_to_the_same_bits(name):
+    outcome = run(case_of(get_method(reference(name))), "cpu")
+    assert outcome.passed, outcome
 
 
 def trained(name: str, scene, folder, iterations=200, **config) -> Trainer:
@@ -144,10 +152,4 @@ def test_layers_take_distractors_out_of_the_static_field(tmp_path):
     layered = trained("06_view_layer", scene, tmp_path, iterations=300)
     # one seed: 27.8 dB on the wall, 24.7 dB without layers
     assert error_of_wall(layered) < 0.65 * error_of_wall(trained("3dgs", scene, tmp_path, iterations=300))
-    first = {name: field.gaussians.sh0.clone() for name, field in layered.drawing.others.items()}
-    assert len(first) == 6
-    layered.save()
-    entry = get_method(reference("06_view_layer"))
-    again = Trainer(layered.data, entry.build(entry.options()), layered.config, folder=layered.folder)
-    assert again.resume()
-    assert all(torch.equal(field.gaussians.sh0, first[name]) for name, field in again.drawing.others.items())
+    assert len(layered.drawing.others) == 6

@@ -8,6 +8,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.graft import graft_name
+from ambiguous_wild.methods.references import import_file
 
 CODE = r'''
 from dataclasses import dataclass
@@ -40,6 +41,7 @@ def nothing():
     Parts()
 
 entry = MethodEntry("its-own-name", "made by hand", tuned, config=Config)
+annotated = MethodEntry("annotated", "made by hand", tuned)
 number = 3
 '''
 
@@ -63,7 +65,7 @@ def test_a_function_without_options(recipe):
 
 
 def test_a_function_with_options_and_an_entry(recipe):
-    for name, called in (("tuned", "tuned"), ("entry", "its-own-name")):
+    for name, called in (("tuned", "tuned"), ("entry", "its-own-name"), ("annotated", "annotated")):
         entry = registry.get_method(f"{recipe}:{name}")
         assert entry.name == called
         assert entry.options().sh_degree == 2
@@ -100,12 +102,22 @@ def test_a_changed_helper_is_another_method(recipe, tmp_path, monkeypatch):
         (tmp_path / "bench_helpers" / "inner.py").write_text(f"degree = {degree}\n")
         assert len({registry.get_method(f"{recipe}:{name}").source_hash for name in ("plain", "tuned")}) == 1
         hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
-        registry.import_file(tmp_path / "sibling.py")
+        import_file(tmp_path / "sibling.py")
         hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
         assert sys.modules["aw_plugin_recipe"].degree == degree
     (tmp_path / "lib/site-packages/bench_installed.py").write_text("degree = 1000\n")
     hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
     assert hashes[0] == hashes[1] != hashes[2] == hashes[3] == hashes[4] and alone not in hashes
+
+
+def test_hashes_do_not_depend_on_the_order_of_loading(recipe, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    other = tmp_path / "other.py"
+    for name, path in (("order_one", recipe), ("order_two", other)):
+        (tmp_path / f"{name}.py").write_text("degree = 1\n")
+        path.write_text(f"import {name}\n" + CODE)
+    loaded = [[import_file(path)[1] for path in order] for order in ((recipe, other), (other, recipe))]
+    assert loaded[0] == loaded[1][::-1] and len(set(loaded[0])) == 2
 
 
 def test_it_is_a_host_of_grafts(recipe):

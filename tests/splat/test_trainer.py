@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
@@ -219,6 +220,11 @@ def _narrow(step):
             "keep or cotangent of MaskPolicy changed step.ph",
         ),
         (
+            "keep",
+            lambda step: step.rendered.image.clamp_(0, 0.5)[..., 0],
+            "changed step.photo or step.rendered.image in",
+        ),
+        (
             "cotangent",
             lambda step, keep: Cotangents(image=_narrow(step)),
             r"image \[48, 64, 1\]; .* \[48, 64, 3\]",
@@ -235,6 +241,21 @@ def test_what_a_policy_must_not_do_is_refused(scene, tmp_path, place, fault, mes
     setattr(mask, place, fault)
     with pytest.raises(AwError, match=message):
         trainer_for(scene, tmp_path, parts=Parts(mask=mask)).step()
+
+
+def test_a_method_gets_no_test_photo(scene, tmp_path):
+    given = []
+
+    class Curious(MaskPolicy):
+        def setup(self, data):
+            given.append(data)
+
+    parts = Parts(mask=Curious(), train_data=lambda data: given.append(data) or data)
+    trainer = trainer_for(scene, tmp_path, parts=parts)
+    assert len(given) == 2 and trainer.data.scene.test == scene.test
+    for data in given:
+        assert data.scene.train == scene.train and len(data.scene.test) == len(scene.test) > 0
+        assert all((view.image_path, view.keep_path) == (NO_PHOTO, None) for view in data.scene.test)
 
 
 def test_a_length_that_nobody_trains_is_refused():

@@ -48,7 +48,7 @@ STANDS_OUT = 0.12  # of the colour range: mean residual of a window in the worst
 TIMED_ROUNDS, TIMED_STEPS = 12, 3  # to time an effect, after a first round
 LARGE = 0.05  # of a photo: a larger patch is more than one instance
 
-# Limits, as shares of the photos' pixels; benchmarks/results/presets.md lists the values of the presets.
+# Limits, as shares of the photos' pixels, set on the presets.
 OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.003, 0.003, 0.05, 0.01
 
 

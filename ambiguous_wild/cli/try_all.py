@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shlex
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -60,17 +58,15 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
             return
         ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
 
-    compiling = None if (scene / "scene.json").exists() else _compile_kernels()
+    new = not (scene / "scene.json").exists()
     if video:
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
-    if compiling:
+    if new:
         step("screen", photos, *cores)
     named = source.resolve()
     if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
         named = named.parent
     step("build-scene", photos, "-o", scene, "--name", named.stem, *cores)
-    if compiling:
-        compiling.wait()
     iterations = known_iterations(runs) or _iterations(scene, seconds - (time.monotonic() - begin), threads)
     length = ["--iterations", str(iterations)]
     step("plan", scene, "--no-probe", "-o", plan, done=plan)
@@ -87,14 +83,6 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     say(
         f"\n{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
         f"{output / 'comparison.png'}. To train longer: {longer} -o longer"
-    )
-
-
-def _compile_kernels() -> subprocess.Popen[bytes]:
-    """Compile the trainer's kernels in another process, while photos are read and placed."""
-    code = "from ambiguous_wild.splat.calibration import warm_up; warm_up()"
-    return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
 
 

@@ -8,10 +8,14 @@ of different kernels cannot be compared.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -125,7 +129,8 @@ def _moved(shift: float) -> np.ndarray:
     return pose
 
 
-COLD_S = 35  # seconds to compile all kernels, measured on one core at 2.6 GHz
+_LIKE = {"extra": "image"}  # pictures of the same shape
+COLD_S = 27  # seconds to compile all kernels, measured on two cores at 2.6 GHz
 
 
 def _tiny_scene() -> tuple[Gaussians, Camera]:
@@ -143,40 +148,77 @@ def _cached() -> bool:
     return bool(adam.catch_up_all.compiled._cache._cache_file._load_index())
 
 
-def warm_up(announce: Callable[[str], None] = lambda text: None) -> float:
-    """Run every kernel that all methods need on eight Gaussians; returns the seconds it took.
+def warm_up(announce: Callable[[str], None] = lambda text: None, helper: bool = False) -> float:
+    """Run every kernel that most methods need on eight Gaussians; returns the seconds it took.
 
     Args:
         announce: gets a message before the compilation, if the compiled kernels are not on disk yet.
+        helper: compile half of them in another process meanwhile.
     """
-    from ambiguous_wild.splat.cpu.adam import all_finite
     from ambiguous_wild.splat.cpu.render import render_cpu
-    from ambiguous_wild.splat.losses import photometric, ssim_map
-    from ambiguous_wild.splat.optim import SplatAdam
 
     begin = time.perf_counter()
-    if not _cached():
-        announce(f"compiling CPU kernels (about {COLD_S} s, once per machine)...")
-    gaussians, camera = _tiny_scene()
-    optimiser = SplatAdam(gaussians, {name: 1e-9 for name, _ in gaussians.items()})
-    rendered = render_cpu(gaussians, camera)
-    photo = torch.zeros_like(rendered.image)
-    loss = photometric(rendered.image, photo)
-    keep = torch.ones(camera.height, camera.width)
-    photometric(rendered.image, photo, keep)
-    photometric(rendered.image, photo, keep, weighting="images")
-    ssim_map(rendered.image, photo)
-    gradients = rendered.backward(loss.d_image)
-    rendered.backward(Cotangents(loss.d_image, extra=loss.d_image))
-    rendered.backward(loss.d_image, frozenset({"absolute"}))
-    # the watchdog passes as many tensors of gradients and of parameters
-    all_finite([tensor for name, tensor in gaussians.items() if name != "sh_rest"])
-    all_finite([tensor for _, tensor in gaussians.items()])
-    optimiser.step(gradients, rendered.visible)
+    with ExitStack() as stack:
+        if not _cached():
+            announce(f"compiling CPU kernels (about {COLD_S} s, once per machine)...")
+            if helper:
+                stack.enter_context(_helper())
+        gaussians, camera = _tiny_scene()
+        optimiser = SplatAdam(gaussians, {name: 1e-9 for name, _ in gaussians.items()})
+        rendered = render_cpu(gaussians, camera)
+        gradients = rendered.backward(torch.zeros_like(rendered.image))
+        optimiser.step(gradients, rendered.visible)
+    warm_losses()
     render_cpu(gaussians, camera)
     optimiser.flush()
     optimiser.step(gradients, rendered.visible)
     return time.perf_counter() - begin
+
+
+def warm_backward(pictures: Collection[str], needs: frozenset[str]) -> None:
+    """Run the backward pass with cotangents of these pictures, and these statistics."""
+    from ambiguous_wild.splat.cpu.render import render_cpu
+
+    gaussians, camera = _tiny_scene()
+    rendered = render_cpu(gaussians, camera)
+    zeros: dict[str, Any] = {
+        name: torch.zeros_like(getattr(rendered, _LIKE.get(name, name))) for name in pictures
+    }
+    rendered.backward(Cotangents(**zeros), needs)
+
+
+def warm_losses() -> None:
+    """Run the kernels of losses and of the watchdog."""
+    from ambiguous_wild.splat.cpu.adam import all_finite
+    from ambiguous_wild.splat.losses import ssim_map
+
+    gaussians, camera = _tiny_scene()
+    photo, keep = torch.zeros(camera.height, camera.width, 3), torch.ones(camera.height, camera.width)
+    photometric(photo, photo)
+    photometric(photo, photo, keep)
+    photometric(photo, photo, keep, weighting="images")
+    ssim_map(photo, photo)
+    # the watchdog passes as many tensors of gradients and of parameters
+    all_finite([tensor for name, tensor in gaussians.items() if name != "sh_rest"])
+    all_finite([tensor for _, tensor in gaussians.items()])
+
+
+@contextmanager
+def _helper() -> Iterator[None]:
+    """Run `warm_losses` in another process; what it does not compile, this one does."""
+    quiet = subprocess.DEVNULL
+    code = f"from {__name__} import warm_losses; warm_losses()"
+    try:
+        process = subprocess.Popen([sys.executable, "-c", code], stdin=quiet, stdout=quiet, stderr=quiet)
+    except OSError:
+        yield
+        return
+    try:
+        yield
+        process.wait()
+    finally:
+        process.kill()
+        process.wait()
 
 
 def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: None) -> None:
@@ -190,4 +232,4 @@ def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: N
 
     if threads is not None:
         set_threads(threads)
-    warm_up(say)
+    warm_up(say, helper=threads != 1)

@@ -43,6 +43,16 @@ class Clock:
             self.cpu_s += time.process_time() - self._cpu_since
             self._since = None
 
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        running = self._since is not None
+        self.stop()
+        try:
+            yield
+        finally:
+            if running:
+                self.start()
+
     def now(self) -> float:
         running = 0.0 if self._since is None else time.perf_counter() - self._since
         return self.elapsed_s + running

@@ -38,6 +38,10 @@ class Cotangents:
     _: KW_ONLY
     own: Own = field(default_factory=dict)  # collected by effects that act on pictures
 
+    def pictures(self) -> frozenset[str]:
+        """Return the names of the pictures that have one."""
+        return frozenset(name for name in _PICTURES if getattr(self, name) is not None)
+
     def __add__(self, other: Cotangents) -> Cotangents:
         sums = {name: sum_where(getattr(self, name), getattr(other, name)) for name in _PICTURES}
         return Cotangents(**sums, own=sum_own(self.own, other.own))

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.config import State
+from ambiguous_wild.splat.calibration import warm_backward
 from ambiguous_wild.splat.data import Pyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import SceneRenderer
@@ -61,6 +62,7 @@ class Trainer(Run):
         data = data.for_method()
         self.parts = parts
         self.pyramid = Pyramid(data)
+        self._compiled: set[frozenset[str]] = set()  # cotangents for which the backward pass is compiled
         self._divisors: dict[int, int] = {}  # divisors of the steps since the sentinel was last read
         # where reading a value makes the host wait, checks stay on the device and are read later
         views = len(data.photos)
@@ -244,8 +246,10 @@ class Trainer(Run):
             self._skipped.add(step.view)
             self.iteration = iteration
             return loss.value
+        cotangents = as_cotangents(loss.d_image, method_cotangents)
+        self._compile_backward(cotangents.pictures())
         with part("backward"):
-            gradients = self._gradients(step, keep, as_cotangents(loss.d_image, method_cotangents))
+            gradients = self._gradients(step, keep, cotangents)
         called_off = None
         with part("watchdog"):
             if self.sentinel is None:
@@ -264,6 +268,13 @@ class Trainer(Run):
                 self.watchdog.look_at_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
+
+    def _compile_backward(self, pictures: frozenset[str]) -> None:
+        """Compile the backward pass with such cotangents, outside of the training time."""
+        if self.data.backend.kernels and pictures not in self._compiled:
+            with self.clock.paused():
+                warm_backward(pictures, self.density.needs)
+            self._compiled.add(pictures)
 
     def _gradients(self, step: Step, keep: Tensor | None, cotangents: Cotangents) -> Gradients:
         """Backpropagate the step's render and the further pictures that the method drew."""

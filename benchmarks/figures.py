@@ -29,6 +29,7 @@ GROUPS = {
     "composites on 12 drone photos": ("tiny_aerial-",),
 }
 BASELINES = ("courtyard-colour", "courtyard-plain", "monstree-cutouts")  # of seed 0 alone
+HAND_MADE = "labhog"  # features of rows that name none
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 
 
@@ -38,7 +39,9 @@ def board(only: str = "") -> Board:
     for name in ("simulated", "composites"):
         with (ROOT / "leaderboard" / "measured" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
-                name = ", ".join(filter(None, (row["method"], row["options"])))
+                features = re.search(r"--set \S+\.features=(\S+)", row["reproduce"])
+                kind = features[1] if features else HAND_MADE
+                name = row["method"] if kind == HAND_MADE else f"{row['method']}, {kind}"
                 for metric in ("psnr", "mask_iou"):
                     if row[metric] and only in ("", row["seed"]):
                         seeds[row["scene"], name, metric].append(float(row[metric]))

@@ -22,7 +22,7 @@ from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.report.plain_formats import read_csv
 
 REQUIRED = ("method", "scene", "metric", "value")
-OPTIONAL = ("table", "setting", "seed", "dataset", "variant", "mark", "printed")
+OPTIONAL = ("table", "setting", "options", "seed", "dataset", "variant", "mark", "printed")
 UNKNOWN = "unknown"
 MEAN, ALL = "mean", "all"  # in place of a scene: the mean over scenes; in place of a dataset: over datasets
 LARGEST = 50_000_000  # bytes
@@ -109,7 +109,9 @@ def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
     return Number(
         cell["table"] or path.stem,
         cell["method"],
-        ", ".join(filter(None, (cell["setting"], cell["seed"] and f"seed {cell['seed']}"))),
+        ", ".join(
+            filter(None, (cell["setting"], *(f"{k} {cell[k]}" for k in ("options", "seed") if cell[k])))
+        ),
         cell["dataset"] or UNKNOWN if "dataset" in row else path.stem,
         cell["scene"],
         cell["metric"],

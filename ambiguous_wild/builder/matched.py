@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import heapq
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ambiguous_wild.builder.motions import (
     LEAST,
@@ -158,13 +162,14 @@ class Matched:
         }
 
     def take_cameras(self, model: Any) -> float:
-        """Use the cameras of a model; return the median relative change of focal length over photos."""
+        """Use the cameras of a model; return the median relative change of focal length over its photos."""
         before = np.array([self.focal_px(k) for k in range(len(self.ids))])
         for camera in self.cameras:
             if camera.camera_id in model.cameras:
                 camera.params = model.cameras[camera.camera_id].params
         after = np.array([self.focal_px(k) for k in range(len(self.ids))])
-        return float(np.median(np.abs(after / before - 1.0)))
+        changes = np.abs(after / before - 1.0)[list(self.poses(model))]
+        return float(np.median(changes)) if len(changes) else 0.0
 
     def write_agreed(self, database: Path, agreed: Mapping[Pair, tuple[int, int]]) -> None:
         """Write cameras and one motion of every pair that agrees to the database, for COLMAP's mapper.
@@ -210,21 +215,37 @@ class Matched:
                 self.motions[a, b].append(Motion(*motion))
 
 
-def _well_connected(pairs: Iterable[Pair]) -> set[int]:
-    """Choose photos so that each photo has `MAPPED_PARTNERS` chosen partners, or all that it has."""
+def _well_connected(pairs: Collection[Pair]) -> set[int]:
+    """Choose photos so that each photo has `MAPPED_PARTNERS` chosen partners, or all that it has.
+
+    Photos with no more partners are chosen too, because `Placement` asks more of those that the mapper did
+    not place, and so are all pairs between parts that would fall apart, of which the mapper keeps only one.
+    """
     partners: dict[int, set[int]] = {}
     for a, b in pairs:
         partners.setdefault(a, set()).add(b)
         partners.setdefault(b, set()).add(a)
     wanted = {photo: min(MAPPED_PARTNERS, len(others)) for photo, others in partners.items()}
     chosen: set[int] = set()
-    while any(wanted.values()):
-        rest = sorted(partners.keys() - chosen)
-        best = max(rest, key=lambda photo: sum(wanted[other] > 0 for other in partners[photo]))
-        chosen.add(best)
-        for other in partners[best]:
+    # Gains only fall, so the largest is at the top of the heap if it is the same when it is counted anew.
+    heap = [(-len(o) if len(o) > MAPPED_PARTNERS else -math.inf, photo) for photo, o in partners.items()]
+    heapq.heapify(heap)
+    while heap:
+        listed, photo = heapq.heappop(heap)
+        gain = sum(wanted[other] > 0 for other in partners[photo])
+        if listed > -math.inf and gain < -listed:
+            if gain:
+                heapq.heappush(heap, (-gain, photo))
+            continue
+        chosen.add(photo)
+        for other in partners[photo]:
             wanted[other] = max(wanted[other] - 1, 0)
-    return chosen
+    rows = [(a, b) for a, b in pairs if a in chosen and b in chosen]
+    size = max(partners, default=-1) + 1
+    ends = np.array(rows, int).reshape(-1, 2).T
+    part = connected_components(coo_array((np.ones(len(rows)), tuple(ends)), (size, size)), False)[1]
+    near = {photo: {part[k] for k in (others | {photo}) & chosen} for photo, others in partners.items()}
+    return chosen.union(*(pair for pair in pairs if len(near[pair[0]] | near[pair[1]]) > 1))
 
 
 def relative_pose(first: np.ndarray, second: np.ndarray) -> np.ndarray:

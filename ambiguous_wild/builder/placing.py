@@ -122,7 +122,7 @@ class Placement:
         return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
 
     def _place_all(self, outs: list[int], only_out: bool) -> bool:
-        """Place all photos, and tell whether more than a few moved, were added or were taken out."""
+        """Place all photos; tell whether more than a few changed, or an added one may help others in."""
         rays, points = self.matched.rays(), _Points.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
         self.places, self.left_out = {}, {}
@@ -142,12 +142,15 @@ class Placement:
             self.places[photo] = best
             if not only_out and not self._same(best.pose, pose_now):
                 moves[photo] = best.pose
+        added = moves.keys() - self.poses.keys()
         for photo, pose in moves.items():
             if pose is None:
                 del self.poses[photo]
             else:
                 self.poses[photo] = pose
-        return len(moves) > STILL * len(self.matched.ids)
+        near = (pair for photo in added for pair in self.pairs[photo] if self.matched.motions[pair])
+        helps = any(photo not in self.poses for pair in near for photo in pair)
+        return helps or len(moves) > STILL * len(self.matched.ids)
 
     def _best(
         self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: _Points

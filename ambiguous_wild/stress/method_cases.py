@@ -21,6 +21,7 @@ from ambiguous_wild.core.config import State
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.references import place_of
+from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
@@ -37,10 +38,14 @@ def case_of(entry: MethodEntry) -> Case:
     """Return the case of a method, which trains 2.5 times for `ITERATIONS` on a CPU.
 
     Raises:
-        AwError: an external program trains the method, or an option has no default.
+        AwError: an external program trains the method, it reads the truth, or an option has no default.
     """
     if entry.program is not None:
         raise AwError(f"--method {entry.name}: another program trains it; name a method that we train")
+    if knows_truth(entry.name):
+        raise AwError(
+            f"--method {entry.name}: it reads exact masks, which the check has not; name another method"
+        )
     entry.options()
 
     def measure(device: str) -> Measured:
@@ -50,7 +55,8 @@ def case_of(entry: MethodEntry) -> Case:
         except Exception as error:
             if isinstance(error, AwError) or not place_of(error):
                 raise
-            raise AwError(f"{type(error).__name__}: {error}{place_of(error)}") from error
+            why = " ".join(f"{type(error).__name__}: {error}".split())
+            raise AwError(why + place_of(error)) from error
         return Measured(
             float(len(wrong)), 0.0, "; ".join(wrong) or "exact", "same bits when repeated, resumed"
         )

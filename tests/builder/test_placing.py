@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,11 +14,12 @@ from ambiguous_wild.builder import sfm
 from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placing import Place, _reason, adjustment_options
+from ambiguous_wild.builder.placing import Place, Placement, _Points, _reason, adjustment_options
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.simulate.capture import simulate
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from tests.builder.capture_maker import FOCAL, eyes, texture, write_capture
@@ -216,6 +219,9 @@ def test_of_many_photos_the_mapper_gets_some_and_all_are_placed(tmp_path, monkey
     partners = {k: {a + b - k for a, b in ring if k in (a, b)} for k in range(300)}
     assert all(len(others & chosen) >= MAPPED_PARTNERS for others in partners.values())
     assert len(chosen) < 150
+    ends = sorted(partners.keys() - chosen)[:3]  # of pairs between two places; 600 has few partners
+    ring += [(a + 300, b + 300) for a, b in ring] + [(k, k + 300) for k in ends] + [(20, 600), (21, 600)]
+    assert {*ends, *(k + 300 for k in ends), 600} <= _well_connected(ring)
     write_capture(tmp_path / "raw", 12)
     set_in_worker(monkeypatch, "matched.ALL_MAPPED, matched.MAPPED_PARTNERS = 6, 3")
     settings = BuildSettings(factor=1, max_features=800)
@@ -225,6 +231,50 @@ def test_of_many_photos_the_mapper_gets_some_and_all_are_placed(tmp_path, monkey
     true = {k: looking(eye) for k, eye in enumerate(eyes(12))}
     off = [angle_deg((found[k] @ found[0].T) @ (true[k] @ true[0].T).T) for k in found]
     assert len(found) == 12 and max(off) < 1.0
+
+
+def test_the_change_of_focal_length_is_that_of_the_photos_the_mapper_got():
+    """Photos have lenses of their own, and the mapper got one in five."""
+
+    def camera(number: int, focal: float) -> pycolmap.Camera:
+        params = [focal, 50, 40, 0]
+        return pycolmap.Camera(camera_id=number, model="SIMPLE_RADIAL", width=100, height=80, params=params)
+
+    cameras = [camera(number, 100.0) for number in range(1, 11)]
+    matched = Matched([*range(1, 11)], [*"abcdefghij"], cameras, [np.zeros((0, 2))] * 10, {})
+    model = pycolmap.Reconstruction()
+    for number in (1, 2):
+        model.add_camera_with_trivial_rig(camera(number, 110.0))
+        image = pycolmap.Image(image_id=number, camera_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    assert matched.take_cameras(model) == pytest.approx(0.1)
+
+
+def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
+    """Of many photos few changes end placing, but not while an added photo may bring the next one in."""
+
+    class Path(Placement):
+        def __init__(self) -> None:
+            self.matched = SimpleNamespace(ids=range(1000), motions=defaultdict(lambda: [1]), rays=list)
+            self.pairs = [[(k - 1, k)] * (k > 0) + [(k, k + 1)] * (k < 999) for k in range(1000)]
+            self.poses = dict.fromkeys(range(980), np.eye(3, 4))
+
+        def _best(self, photo, now, rays, points):
+            pose = None if photo > len(self.poses) else np.eye(3, 4)
+            none = Place(None, frozenset(), 0.0)
+            return (none if pose is None else Place(pose, frozenset((1, 2, 3)), 1.0)), none
+
+        def _same(self, first, second):
+            return second is not None
+
+        def _triangulate_and_adjust(self, *, final):
+            pass
+
+    monkeypatch.setattr(_Points, "read", lambda matched, model: None)
+    monkeypatch.setattr(Path, "model", None, raising=False)
+    placement = Path()
+    placement.run()
+    assert len(placement.poses) == 1000 and not placement.left_out
 
 
 def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypatch):

@@ -81,7 +81,7 @@ class Brighter(MaskPolicy):
 
 class Breaks(MaskPolicy):
     def keep(self, step):
-        return [][step.iteration]
+        raise IndexError("list index\\nout of range")
 
 class Turns(DensityControl):
     turns = 0
@@ -120,7 +120,12 @@ def test_a_faulty_method_is_found_with_its_remedy(tmp_path, recipe, line):
 
 
 def test_what_is_no_method_of_ours_is_refused(tmp_path):
-    for words in (("nowhere.py:lost",), ("3dgs", "--only", "4"), ("nerfbaselines:wild-gaussians",)):
+    for words in (
+        ("nowhere.py:lost",),
+        ("3dgs", "--only", "4"),
+        ("nerfbaselines:wild-gaussians",),
+        ("3dgs+truth",),
+    ):
         with pytest.raises(AwError):
             CliRunner().invoke(cli, ["stress", "--method", *words], catch_exceptions=False)
 

@@ -15,7 +15,6 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -129,7 +128,6 @@ def _moved(shift: float) -> np.ndarray:
     return pose
 
 
-_LIKE = {"extra": "image"}  # pictures of the same shape
 COLD_S = 27  # seconds to compile all kernels, measured on two cores at 2.6 GHz
 
 
@@ -181,10 +179,9 @@ def warm_backward(pictures: Collection[str], needs: frozenset[str]) -> None:
 
     gaussians, camera = _tiny_scene()
     rendered = render_cpu(gaussians, camera)
-    zeros: dict[str, Any] = {
-        name: torch.zeros_like(getattr(rendered, _LIKE.get(name, name))) for name in pictures
-    }
-    rendered.backward(Cotangents(**zeros), needs)
+    image, flat = torch.zeros_like(rendered.image), torch.zeros_like(rendered.alpha)
+    zeros = (("image", image), ("extra", image), ("alpha", flat), ("depth", flat))
+    rendered.backward(Cotangents(*(zero if name in pictures else None for name, zero in zeros)), needs)
 
 
 def warm_losses() -> None:

@@ -176,7 +176,7 @@ def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> 
     covered = [
         run
         for run in board["runs"]
-        if (run["dataset"], run["method"]) == ("simulated", "robustsplat")
+        if (run["dataset"], run["method"]) == ("simulated", "dronesplat")
         and "psnr_covered" in run["quality"]
     ]
     lost = [run for run in covered if run["scene"] == covered[0]["scene"]]
@@ -192,7 +192,7 @@ def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> 
     )
     done = subprocess.run(["node", "-"], input=code, capture_output=True, text=True, check=True)
     rows = {method: (value, rank, cells) for method, value, rank, cells in json.loads(done.stdout)}
-    value, rank, cells = rows["robustsplat"]
+    value, rank, cells = rows["dronesplat"]
     assert value is None and rank is None  # its scene has no other value
     assert cells["finite"] == cells["all"] - len(lost) == len(covered) - len(lost)
     assert rows["refinesplat"][1] == 1

@@ -41,10 +41,10 @@ def board(only: str = "") -> Board:
             for row in csv.DictReader(file):
                 features = re.search(r"--set \S+\.features=(\S+)", row["reproduce"])
                 kind = features[1] if features else HAND_MADE
-                name = row["method"] if kind == HAND_MADE else f"{row['method']}, {kind}"
+                method = row["method"] if kind == HAND_MADE else f"{row['method']}, {kind}"
                 for metric in ("psnr", "mask_iou"):
                     if row[metric] and only in ("", row["seed"]):
-                        seeds[row["scene"], name, metric].append(float(row[metric]))
+                        seeds[row["scene"], method, metric].append(float(row[metric]))
     found: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for (scene, method, metric), values in seeds.items():
         found[scene][method][metric] = mean(values)

@@ -94,6 +94,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if unknown := set(args.only or ()) - known.keys():
         raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
     chosen = [known[name] for name in args.only or known]
+    if idle := {option.partition(".")[0] for option in args.set} - {*args.methods}:
+        raise AwError(f"--set {min(idle)}: --methods does not have it")
     scenes = {capture: capture.build(args.work) for capture in chosen}
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
     for capture in scenes:

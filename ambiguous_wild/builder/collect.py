@@ -152,13 +152,16 @@ def _photo_folders(root: Path, masks: Path | None) -> list[tuple[Path, Side]]:
     return folders or [(root, None)]
 
 
+def _may_hold_photos(path: Path) -> bool:
+    return path.is_dir() and path.name[0] != "." and path.name.lower() not in NO_PHOTOS
+
+
 def _folders_in(base: Path, masks: Path | None) -> Iterator[Path]:
     """Yield the folder if it holds photos, else those in images/, else those of all folders below."""
     if _has_photos(base):
         yield base
         return
-    inner = [p for p in base.iterdir() if p.is_dir() and p.name[0] != "." and p.name.lower() not in NO_PHOTOS]
-    inner = [p for p in inner if p != masks]
+    inner = [p for p in base.iterdir() if _may_hold_photos(p) and p != masks]
     named = [p for p in inner if p.name == "images" and any(_folders_in(p, masks))]
     for folder in named or sorted(inner, key=lambda p: natural_key(p.name)):
         yield from _folders_in(folder, masks)
@@ -172,7 +175,7 @@ def videos_in(base: Path) -> Iterator[Path]:
         if path.is_file() and path.name[0] != "." and path.suffix.lower() in VIDEO_SUFFIXES:
             yield path
     for path in inner:
-        if path.is_dir() and path.name[0] != "." and path.name.lower() not in NO_PHOTOS:
+        if _may_hold_photos(path):
             yield from videos_in(path)
 
 
@@ -202,12 +205,8 @@ def _folder_notes(
         for unused in beside if masks is None else ():
             yield f"{unused} is not used; --keep-masks '{unused}' does (white = keep)"
         if (root, None) in folders:
-            inner = (
-                p
-                for p in sorted(root.iterdir())
-                if p.is_dir() and p.name.lower() not in NO_PHOTOS and p != masks
-            )
-            if left := [p.name for p in inner if p.name[0] != "." and any(_folders_in(p, masks))]:
+            inner = (p for p in sorted(root.iterdir()) if _may_hold_photos(p) and p != masks)
+            if left := [p.name for p in inner if any(_folders_in(p, masks))]:
                 yield f"{root} holds photos itself, so its folders {shortlist(left)} are left out"
 
 

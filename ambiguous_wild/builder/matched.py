@@ -182,11 +182,11 @@ class Matched:
                 db.update_camera(camera)
         finally:
             db.close()
+        if len(self.ids) > ALL_MAPPED:
+            mapped = _well_connected(agreed)
+            agreed = {pair: found for pair, found in agreed.items() if mapped.issuperset(pair)}
         verified = {}
-        mapped = _well_connected(agreed) if len(self.ids) > ALL_MAPPED else set(range(len(self.ids)))
         for pair, (number, way) in agreed.items():
-            if not mapped.issuperset(pair):
-                continue
             motion = self.motions[pair][number]
             pose = np.column_stack([motion.rotations[way], motion.translations[way]])
             verified[pair] = pose, motion.matches

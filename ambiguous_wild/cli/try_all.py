@@ -58,10 +58,9 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
             return
         ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
 
-    new = not (scene / "scene.json").exists()
     if video:
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
-    if new:
+    if not (scene / "scene.json").exists():
         step("screen", photos, *cores)
     named = source.resolve()
     if named.name.lower() in PHOTO_FOLDERS and named.parent.name:

@@ -239,12 +239,11 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
             refuse_strange_folder(folder)
             if not made_anew(folder, options.overwrite, cell.config):
                 refuse_other_config(folder, cell)
-    trained = [k for k, folder in enumerate(folders) if options.overwrite != "never" or not folder.exists()]
-    chosen = {folders[k] for k in trained}
-    for parent, cell in {
-        folders[k].parent: cells[k] for k in trained
-    }.items():  # seeds share the method's file
-        for other in sorted({*parent.glob("seed*/")} - chosen):
+    kept = {folder for folder in folders if options.overwrite == "never" and folder.exists()}
+    trained = {folder: cell for folder, cell in zip(folders, cells) if folder not in kept}
+    methods = {folder.parent: cell for folder, cell in trained.items()}  # seeds share the method's file
+    for parent, cell in methods.items():
+        for other in sorted({*parent.glob("seed*/")} - trained.keys()):
             refuse_other_code(other, cell)
     for needed in (output, options.cache_dir):
         check_output(needed / "run")  # a folder that cannot be written is found before the training

@@ -45,6 +45,7 @@ class Clock:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
+        """Do what is no training without its time; a clock that does not run stays stopped."""
         running = self._since is not None
         self.stop()
         try:

@@ -176,8 +176,7 @@ def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> 
     covered = [
         run
         for run in board["runs"]
-        if (run["dataset"], run["method"]) == ("simulated", "dronesplat")
-        and "psnr_covered" in run["quality"]
+        if (run["dataset"], run["method"]) == ("simulated", "dronesplat") and "psnr_covered" in run["quality"]
     ]
     lost = [run for run in covered if run["scene"] == covered[0]["scene"]]
     for run in lost:

@@ -11,7 +11,6 @@ import os
 import shutil
 import sqlite3
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path, PurePosixPath
@@ -28,6 +27,7 @@ from ambiguous_wild.builder.records import (
 from ambiguous_wild.builder.retrieval import MOTIONS, PAIRS
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.processes import python_command
 from ambiguous_wild.io.files import write_json
 
 LOG = "colmap.log"
@@ -325,11 +325,12 @@ def map_scene(
 
 def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
     """Run one task of the worker; `watch` is called while it runs."""
-    write_json(folder / "job.json", {**job, "parent": os.getpid()})
+    work = folder / "job.json"
+    write_json(work, {**job, "parent": os.getpid()})
     log = folder / LOG
     with open(log, "ab") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", "ambiguous_wild.builder.sfm_worker", str(folder / "job.json")],
+            python_command("from ambiguous_wild.builder import sfm_worker; sfm_worker.main()", str(work)),
             stdin=subprocess.DEVNULL,
             stdout=sink,
             stderr=sink,
@@ -345,7 +346,7 @@ def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
             if process.poll() is None:
                 process.kill()
                 process.wait()
-    (folder / "job.json").unlink()
+    work.unlink()
     if code != 0:
         kept = folder.parent / LOG
         shutil.copyfile(log, kept)

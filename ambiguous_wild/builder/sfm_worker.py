@@ -1,4 +1,4 @@
-"""COLMAP in a child process: `python -m ambiguous_wild.builder.sfm_worker JOB.json`.
+"""COLMAP in a child process, which `sfm.run_job` starts with the path of a job as its argument.
 
 COLMAP writes to the terminal, ignores Ctrl-C and may crash; in a child process none of that reaches the
 command. Every seed is fixed, so features and matches are the same for any number of threads. Bundle
@@ -419,7 +419,3 @@ def main() -> None:
         run_motions(job)
     else:
         run_triangulation(job)
-
-
-if __name__ == "__main__":
-    main()

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import PathName, threads_option
+from ambiguous_wild.core.processes import python_meanwhile
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import BuildResult
@@ -36,20 +34,8 @@ def kernels_meanwhile() -> Iterator[None]:
     if _compiled():
         yield
         return
-    quiet = subprocess.DEVNULL
-    one = {**os.environ, "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    try:
-        process = subprocess.Popen(
-            [sys.executable, "-c", _CODE], stdin=quiet, stdout=quiet, stderr=quiet, env=one
-        )
-    except OSError:
+    with python_meanwhile(_CODE, {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}):
         yield
-        return
-    try:
-        yield
-    finally:
-        process.kill()
-        process.wait()
 
 
 def _compiled() -> bool:

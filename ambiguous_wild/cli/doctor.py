@@ -25,6 +25,7 @@ from typing import Any, Literal
 import click
 
 from ambiguous_wild.core.errors import AwError, install_command, installed
+from ambiguous_wild.core.processes import python_command
 from ambiguous_wild.splat import readiness
 
 TIMEOUT_S = 60
@@ -70,7 +71,7 @@ def probe(name: str) -> Probe:
     code = "import json\n" + PROBES[name]
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+            python_command(code), capture_output=True, text=True, timeout=TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired:
         return Probe(None, f"no answer within {TIMEOUT_S} s")

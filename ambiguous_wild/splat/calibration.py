@@ -8,11 +8,9 @@ of different kernels cannot be compared.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,6 +18,7 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.processes import python_meanwhile
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import one_thread
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -160,7 +159,8 @@ def warm_up(announce: Callable[[str], None] = lambda text: None, helper: bool = 
         if not _cached():
             announce(f"compiling CPU kernels (about {COLD_S} s, once per machine)...")
             if helper:
-                stack.enter_context(_helper())
+                code = f"from {__name__} import warm_losses; warm_losses()"
+                stack.enter_context(python_meanwhile(code, finish=True))
         gaussians, camera = _tiny_scene()
         optimiser = SplatAdam(gaussians, {name: 1e-9 for name, _ in gaussians.items()})
         rendered = render_cpu(gaussians, camera)
@@ -198,24 +198,6 @@ def warm_losses() -> None:
     # the watchdog passes as many tensors of gradients and of parameters
     all_finite([tensor for name, tensor in gaussians.items() if name != "sh_rest"])
     all_finite([tensor for _, tensor in gaussians.items()])
-
-
-@contextmanager
-def _helper() -> Iterator[None]:
-    """Run `warm_losses` in another process; what it does not compile, this one does."""
-    quiet = subprocess.DEVNULL
-    code = f"from {__name__} import warm_losses; warm_losses()"
-    try:
-        process = subprocess.Popen([sys.executable, "-c", code], stdin=quiet, stdout=quiet, stderr=quiet)
-    except OSError:
-        yield
-        return
-    try:
-        yield
-        process.wait()
-    finally:
-        process.kill()
-        process.wait()
 
 
 def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: None) -> None:

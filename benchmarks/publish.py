@@ -27,6 +27,7 @@ PRESETS = (
     "room-colour",
     "yard-cars",
 )
+COLOURS = ("time-of-day", "white-balance")  # presets whose colours differ between photos: --protocol half
 BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "tiny_aerial": 2}  # downsampling to 240 px and more
 KINDS = ("cutouts", "patches")
 METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
@@ -55,9 +56,9 @@ class Capture:
 
 def captures(data: Path | None) -> Iterator[Capture]:
     """All captures; those of real photos only with a folder of photos."""
-    for name in PRESETS:
+    for name in (*PRESETS, *COLOURS):
         words = ("simulate", name, "--width", "480", "--seed", str(WORLD))
-        yield Capture(name, "simulated", 2, words)
+        yield Capture(name, "colours" if name in COLOURS else "simulated", 2, words)
     for base, factor in BASES.items() if data is not None else ():
         for kind in KINDS:
             words = ("composite", str(data / base), "--seed", str(WORLD))
@@ -71,6 +72,7 @@ def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
     for number in args.seeds:
         words = ("--scene", str(scene), "--seed", str(number), "--iterations", str(args.iterations))
         words += ("--device", "cpu", "--threads", "1", "--no-pictures", "-o", str(args.runs))
+        words += ("--protocol", "half") if scene.name in COLOURS else ()
         for method in args.methods:
             folder = args.runs / scene.name / method / f"seed{number}"
             own = tuple(option for owner, option in options if owner == method)
@@ -100,7 +102,7 @@ def main(words: Sequence[str] | None = None) -> int:
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
     for capture in scenes:
         # the photos of the bases may not be passed on
-        images = "1" if capture.dataset == "simulated" else "0"
+        images = "0" if capture.dataset == "composites" else "1"
         add = ("leaderboard", "add", str(args.runs / capture.name), "--board", str(args.board))
         print(aw(*add, "--dataset", capture.dataset, "--images", images, "--overwrite"), end="", flush=True)
     for line in failed:

@@ -20,6 +20,7 @@ from statistics import mean
 ROOT = Path(__file__).parents[1]
 RANKED = ("3dgs", "dronesplat", "robustsplat", "refinesplat")
 METHODS = (*RANKED, "3dgs+truth")
+RANKED_ON = ("simulated", "composites")
 GROUPS = {
     "seven simulated courtyards": ("courtyard-",),
     "simulated room and yard": ("room-", "yard-"),
@@ -28,27 +29,33 @@ GROUPS = {
     "composites on 11 photos of a facade": ("sceaux-",),
     "composites on 12 drone photos": ("tiny_aerial-",),
 }
-BASELINES = ("courtyard-colour", "courtyard-plain", "monstree-cutouts")  # of seed 0 alone
-HAND_MADE = "labhog"  # features of rows that name none
+BASELINES = ("courtyard-colour", "courtyard-plain", "monstree-cutouts")
+COLOURS = ("time-of-day", "white-balance")
+HAND_MADE = ("features=labhog", "instances=graph")  # without pretrained networks; rows need not name them
+WITHOUT_MOTION = "refinesplat, first_look.motion=0"
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 
 
-def board(only: str = "") -> Board:
-    """The board's metrics, of one seed or as means over all."""
+def board(*datasets: str, only: str = "") -> Board:
+    """The metrics of some tables of the board, of one seed or as means over all."""
     seeds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
-    for name in ("simulated", "composites"):
+    for name in datasets:
         with (ROOT / "leaderboard" / "measured" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
-                features = re.search(r"--set \S+\.features=(\S+)", row["reproduce"])
-                kind = features[1] if features else HAND_MADE
-                method = row["method"] if kind == HAND_MADE else f"{row['method']}, {kind}"
                 for metric in ("psnr", "mask_iou"):
                     if row[metric] and only in ("", row["seed"]):
-                        seeds[row["scene"], method, metric].append(float(row[metric]))
+                        seeds[row["scene"], label(row), metric].append(float(row[metric]))
     found: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for (scene, method, metric), values in seeds.items():
         found[scene][method][metric] = mean(values)
     return found
+
+
+def label(row: Mapping[str, str]) -> str:
+    """A row's method with its options; pretrained features by their name alone."""
+    options = [word.partition(".")[2] for word in re.findall(r"--set (\S+)", row["reproduce"])]
+    named = [re.sub("^(features|instances)=", "", option) for option in options if option not in HAND_MADE]
+    return ", ".join(dict.fromkeys([row["method"], *named]))
 
 
 def cells_of(psnr: Sequence[float], digits: int) -> list[str]:
@@ -64,17 +71,17 @@ def line(cells: Iterable[str]) -> str:
 
 def means() -> list[str]:
     """Mean PSNR by group of scenes."""
-    found, lines = board(), []
-    for label, prefixes in GROUPS.items():
+    found, lines = board(*RANKED_ON), []
+    for group, prefixes in GROUPS.items():
         scenes = [methods for scene, methods in found.items() if scene.startswith(prefixes)]
         psnr = [mean(methods[name]["psnr"] for methods in scenes) for name in METHODS]
-        lines.append(line([label, *cells_of(psnr, 1)]))
+        lines.append(line([group, *cells_of(psnr, 1)]))
     return lines
 
 
 def scenes() -> list[str]:
     """PSNR and mask IoU by scene."""
-    found = board()
+    found = board(*RANKED_ON)
     prefixes = [prefix for group in GROUPS.values() for prefix in group]
     ordered = sorted(found, key=lambda name: next(k for k, p in enumerate(prefixes) if name.startswith(p)))
     lines = []
@@ -88,21 +95,44 @@ def scenes() -> list[str]:
 
 
 def baselines() -> list[str]:
-    """PSNR of every method on some scenes, the best in the mean first."""
-    found = board("0")
+    """PSNR of every method on some scenes."""
+    return ranking(board(*RANKED_ON, only="0"), BASELINES)
+
+
+def colours() -> list[str]:
+    """PSNR of every method where colours differ between photos."""
+    return ranking(board("colours", only="0"), COLOURS)
+
+
+def ranking(found: Board, scenes: Sequence[str]) -> list[str]:
+    """PSNR of the methods that are measured on all these scenes, the best in the mean first."""
     psnr = {
-        name: [found[scene][name]["psnr"] for scene in BASELINES]
-        for name in found[BASELINES[0]]
-        if all(name in found[scene] for scene in BASELINES)
+        name: [found[scene][name]["psnr"] for scene in scenes]
+        for name in found[scenes[0]]
+        if name != WITHOUT_MOTION and all(name in found[scene] for scene in scenes)
     }
-    ordered = sorted(psnr, key=lambda name: -mean(psnr[name]))
-    return [line([f"`{name}`", *(f"{x:.2f}" for x in psnr[name])]) for name in ordered]
+    best = sorted(psnr, key=lambda name: -mean(psnr[name]))
+    return [line([f"`{name}`", *(f"{x:.2f}" for x in psnr[name])]) for name in best]
+
+
+def motion() -> list[str]:
+    """PSNR and mask IoU of RefineSplat without and with what moves, by group of scenes."""
+    found, lines = board(*RANKED_ON), []
+    for group, prefixes in GROUPS.items():
+        scenes = [methods for scene, methods in found.items() if scene.startswith(prefixes)]
+        measured = [methods for methods in scenes if WITHOUT_MOTION in methods]
+        if measured:
+            both = (WITHOUT_MOTION, "refinesplat")
+            psnr = [f"{mean(methods[name]['psnr'] for methods in measured):.2f}" for name in both]
+            iou = [f"{mean(methods[name]['mask_iou'] for methods in measured):.3f}" for name in both]
+            lines.append(line([group, " / ".join(psnr), " / ".join(iou)]))
+    return lines
 
 
 TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
     "README.md": {"means": means},
-    "docs/refinesplat.md": {"scenes": scenes},
-    "docs/baselines.md": {"baselines": baselines},
+    "docs/refinesplat.md": {"motion": motion, "scenes": scenes},
+    "docs/baselines.md": {"baselines": baselines, "colours": colours},
 }
 
 

@@ -127,11 +127,9 @@ def draw_density(trainer: Trainer, path: Path) -> list[Path]:
     log = trainer.density.log
     if not log.rounds:
         return []
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, 4.6), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
     counts, top, view = figure.subplots(1, 3, width_ratios=[1.0, 1.1, 1.4])
     _counts(counts, trainer)
     _top_view(top, trainer)

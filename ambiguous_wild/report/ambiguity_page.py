@@ -83,13 +83,11 @@ def write_figure(
     path: Path,
 ) -> None:
     """Write the figure with photos, maps and histograms as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     picks = chosen(measured)
     columns = max(len(picks), 3)
     figure = Figure(figsize=(3.6 * columns, 9.2), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(4, 12)
     for column, index in enumerate(picks):
         view = scene.train[index]

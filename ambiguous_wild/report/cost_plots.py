@@ -28,13 +28,11 @@ def new_figure(
     panels: int, *, panel: tuple[float, float] = PANEL, reading: str = ""
 ) -> tuple[Any, list[Any]]:
     """Make a figure without a screen; return it with the axes of its panels. `reading` is a line below it."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = 2 if panels == 4 else min(MOST_COLUMNS, panels)
     rows = -(-panels // columns)
     figure = Figure(figsize=(panel[0] * columns, panel[1] * rows), layout="constrained", dpi=DPI)
-    FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     if reading:
         figure.supxlabel(reading, fontsize=8, color=GREY)

@@ -13,7 +13,7 @@ import click
 
 from ambiguous_wild.cli import options
 from ambiguous_wild.cli.options import PathName, engine_options, metric_file_option, say, training_options
-from ambiguous_wild.cli.progress import Progress, finish
+from ambiguous_wild.cli.progress import ProgressBar, finish
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.bench import bench
 
@@ -217,7 +217,7 @@ def command(
         parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
         train=train,  # type: ignore[arg-type]
         protocol=protocol,  # type: ignore[arg-type]
-        callbacks=Progress(),
+        callbacks=ProgressBar(),
         **given,
     )
     if prepared is not None and not as_json:

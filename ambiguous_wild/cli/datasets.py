@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,19 +129,12 @@ def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, a
         return
     if name is None:
         raise AwError("which dataset? 'aw fetch --list' lists them")
-    from tqdm import tqdm
-
+    from ambiguous_wild.cli.progress import ticking
     from ambiguous_wild.datasets.fetch import fetch
 
     data = find_public(name)
     click.echo(f"{data.name}: licence: {data.license} ({data.page})", err=True)
-    bar = tqdm(desc=name, unit="B", unit_scale=True, file=sys.stderr, disable=True if as_json else None)
-
-    def tick(done: int, total: int | None) -> None:
-        bar.total = total
-        bar.update(done - bar.n)
-
-    with bar:
+    with ticking(desc=name, unit="B", unit_scale=True, disable=True if as_json else None) as tick:
         done = fetch(data, output, unpack=unpack, tick=tick, say=lambda text: click.echo(text, err=True))
     if as_json:
         facts = {"archive": str(done.archive), "folder": str(done.folder) if done.folder else None}

@@ -74,17 +74,11 @@ def add_command(
     Changed, partial, failed and foreign runs are refused, one line each; unfinished runs are
     left for later. Adding a run twice changes nothing.
     """
-    from tqdm import tqdm
-
+    from ambiguous_wild.cli.progress import ticking
     from ambiguous_wild.core import AwError
     from ambiguous_wild.report.board_edit import add
 
-    with tqdm(unit="run", disable=None, file=sys.stderr) as bar:
-
-        def tick(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with ticking(unit="run") as tick:
         reports = add(board, runs, dry=dry_run, tick=tick, **options)
     _print_reports(reports, as_json)
     counts = Counter(r.outcome for r in reports)

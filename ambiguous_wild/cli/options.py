@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -35,13 +36,20 @@ class Number(click.FloatRange):
         return number
 
 
-plugin_option = click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    type=PathName(),
+def _load_plugins(_: click.Context, __: click.Parameter, paths: tuple[Path, ...]) -> None:
+    """Register the methods of the files, before the command runs."""
+    if paths:
+        from ambiguous_wild.methods.registry import load_plugin
+
+        for path in paths:
+            load_plugin(path)
+
+
+_plugins = functools.partial(
+    click.option, "--plugin", "plugins", multiple=True, type=PathName(),
     help="A Python file that registers your methods; repeatable.",
-)
+)  # fmt: skip
+plugin_option = _plugins(callback=_load_plugins, expose_value=False)
 metric_file_option = click.option("--metric-file", "metrics", multiple=True, type=PathName(),
     help="A Python file with a metric of your own (docs/metrics.md); repeatable.")  # fmt: skip
 scene_folder_option = click.option(
@@ -90,7 +98,7 @@ _TRAINING = (
         type=click.IntRange(4),
         help="Growth stops at this number of Gaussians.  [default: the method's]",
     ),
-    plugin_option,
+    _plugins(),  # a run in another process needs the files too
     click.option(
         "--overwrite",
         type=click.Choice(["never", "missing", "changed", "always"]),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +79,6 @@ def view_command(
     scene: str | None,
     scene_folder: Path | None,
     most_gaussians: int,
-    plugins: tuple[Path, ...],
     title: str | None,
     live: Path | None,
     method: str,
@@ -97,10 +95,7 @@ def view_command(
     aw view stranger.ply --scene scene         without --scene: seen from a circle around it
     aw view --live scene --method 3dgs         watch a training at http://127.0.0.1:8080
     """
-    from ambiguous_wild.methods.registry import load_plugin
 
-    for plugin in plugins:
-        load_plugin(plugin)
     chosen = ctx.get_parameter_source("output")
     if live is not None:
         if runs:
@@ -154,47 +149,21 @@ def view_command(
 @scene_folder_option
 @plugin_option
 @threads_option
-def video_command(
-    runs: tuple[Path, ...], output: Path, path: str, plugins: tuple[Path, ...], **options: Any
-) -> None:
+def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: Any) -> None:
     """Film the models of RUNS (run folders, folders of them, or splat files) side by side along one camera path.
 
     \b
     aw video runs -o video.mp4
     aw video runs --path orbit --seconds 12 --fps 30 --gif video.gif
     """
-    from ambiguous_wild.methods.registry import load_plugin
+    from ambiguous_wild.cli.progress import ticking
     from ambiguous_wild.report.model_views import video_runs
 
-    for plugin in plugins:
-        load_plugin(plugin)
-
-    with _Bar() as bar:
-        done = video_runs(runs, output, path=path, **options, say=say, tick=bar.tick)
+    with ticking(unit="frame") as tick:
+        done = video_runs(runs, output, path=path, **options, say=say, tick=tick)
     say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
     if done.gif is not None:
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
-
-
-class _Bar:
-    """A bar over the frames, shown in a terminal only."""
-
-    def __init__(self) -> None:
-        self.bar: Any = None
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def tick(self, done: int, total: int) -> None:
-        from tqdm import tqdm
-
-        if self.bar is None:
-            self.bar = tqdm(total=total, unit="frame", disable=not sys.stderr.isatty(), file=sys.stderr)
-        self.bar.update(done - self.bar.n)
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
 
 
 FORMATS = ("compressed-ply", "spz", "sog", "gltf")
@@ -228,7 +197,6 @@ def export_command(
     runs: tuple[Path, ...],
     formats: tuple[str, ...],
     output: Path | None,
-    plugins: tuple[Path, ...],
     as_json: bool,
     **options: Any,  # the other arguments of `export_runs`, by their names
 ) -> None:
@@ -244,11 +212,7 @@ def export_command(
     aw export runs --up z --format ply
     aw export stranger.spz --format ply
     """
-    from ambiguous_wild.methods.registry import load_plugin
     from ambiguous_wild.report.model_views import export_runs
-
-    for plugin in plugins:
-        load_plugin(plugin)
 
     reports = export_runs(runs, formats, output, say=say, **options)
     if as_json:

@@ -240,7 +240,6 @@ def bench(
             **(train or {}),
         )
         given_plan = _read_plan(plan)
-        cache_dir = out / ".cache" if cache is None else Path(cache)
         say = callbacks.say
         planned = {
             wanted: plan_cells(
@@ -279,20 +278,12 @@ def bench(
                 say(expected_line(to_train))
         one_by_one = session.in_process(cells)
         callbacks.planned(cells, one_by_one)
+        options = RunOptions(out / ".cache" if cache is None else Path(cache), overwrite, pictures)
         if one_by_one:
-            reports = run_cells(
-                cells,
-                out,
-                overwrite=overwrite,
-                cache_dir=cache_dir,
-                tick=callbacks.tick,
-                pictures=pictures,
-                on_start=callbacks.started,
-                on_end=callbacks.ended,
-            )
+            reports = run_cells(cells, out, options, callbacks)
         else:
             sources = read_sources(plugins, list(entries), metrics)
-            reports = session.run(cells, out, RunOptions(cache_dir, overwrite, pictures), sources)
+            reports = session.run(cells, out, options, sources)
     bench_report = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
     if hint := _rescore_hint(bench_report, metrics):
         say(hint)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.harness.callbacks import Callbacks
 from ambiguous_wild.harness.cell import (
     Cell,
     CellReport,
@@ -35,7 +36,6 @@ from ambiguous_wild.harness.run import (
 )
 from ambiguous_wild.harness.start import start_file, start_line, started
 from ambiguous_wild.harness.timing import LEAST, MOST, expected_s, slowness
-from ambiguous_wild.harness.training import Tick
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
@@ -201,28 +201,26 @@ def cell_folder(output: Path, cell: Cell) -> Path:
 def run_cells(
     cells: Sequence[Cell],
     output: Path,
-    *,
-    overwrite: Overwrite = "missing",
-    cache_dir: Path | None = None,
-    tick: Tick | None = None,
-    pictures: bool = True,
-    on_start: Callable[[Cell, Path], None] | None = None,
-    on_end: Callable[[Cell, CellReport], None] | None = None,
+    options: RunOptions | None = None,
+    callbacks: Callbacks | None = None,
 ) -> list[CellReport]:
     """Run the unfinished cells one after another; an error of one is its outcome and does not stop others.
+
+    Args:
+        cells: what to run.
+        output: folder of the runs.
+        options: how they are made and kept; None = the defaults, with the cache in OUTPUT/.cache.
+        callbacks: told when a run starts, ticks and ends.
 
     Raises:
         AwError: a run folder holds another configuration; checked before anything is trained.
     """
-    options = RunOptions(cache_dir or output / ".cache", overwrite, pictures)
+    options, callbacks = options or RunOptions(output / ".cache"), callbacks or Callbacks()
     reports = []
     for cell, folder in zip(cells, checked_folders(cells, output, options)):
-        if on_start is not None:
-            on_start(cell, folder)
-        report = run_cell(cell, folder, options, tick)
-        if on_end is not None:
-            on_end(cell, report)
-        reports.append(report)
+        callbacks.started(cell, folder)
+        reports.append(run_cell(cell, folder, options, callbacks.tick))
+        callbacks.ended(cell, reports[-1])
     return reports
 
 

@@ -9,6 +9,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import sheets
+from ambiguous_wild.harness.cell import RunOptions
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.harness.pictures import (
     CELL,
@@ -125,7 +126,7 @@ def test_pictures_grow_while_any_method_trains(scene, tmp_path):
 
 def test_pictures_can_be_left_away(scene, tmp_path):
     cells = plan_cells(["3dgs"], [scene.root], [0], TrainConfig(iterations=20, probes=0))
-    (report,) = run_cells(cells, tmp_path, pictures=False)
+    (report,) = run_cells(cells, tmp_path, RunOptions(tmp_path / ".cache", pictures=False))
     assert report.outcome == "trained"
     assert not (report.folder / "pictures").exists()
 

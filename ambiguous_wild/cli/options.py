@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -188,3 +189,21 @@ def prepare_cpu(threads: int | None) -> None:
 def say(text: str) -> None:
     """Write a line on stderr, so that stdout stays clean for results; names of runs cannot break it."""
     click.echo(plain(text), err=True)
+
+
+def command_line(**values: Any) -> str:
+    """Return the present command, as it makes the same result again: with all options that are not at their default.
+
+    Args:
+        values: values to write in place of those that were given; None, False or () leaves an option out.
+    """
+    context = click.get_current_context()
+    words = ["aw", str(context.info_name)]
+    for param in context.command.params:
+        value = (context.params | values).get(str(param.name))
+        if value is None or value is False or value in ((), param.default):
+            continue
+        for one in value if isinstance(value, tuple) else [value]:
+            words += param.opts[:1] if isinstance(param, click.Option) else []
+            words += [] if one is True else [f"{one:g}" if isinstance(one, float) else str(one)]
+    return shlex.join(words)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shlex
 import shutil
 import sys
 from collections import Counter
@@ -14,7 +13,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName, metric_file_option, only_option, scene_folder_option
+from ambiguous_wild.cli.options import (
+    PathName,
+    command_line,
+    metric_file_option,
+    only_option,
+    scene_folder_option,
+)
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -117,9 +122,8 @@ def table_command(
 
         shown = write_sheet(loaded, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
-    made_by = "command: " + command_line(
-        runs, style, metrics, scenes, layout, datasets, reported, reported_from
-    )
+    shown = None if style == "text" else style
+    made_by = "command: " + command_line(style=shown, output=None, everything=None, sheet=None)
     color = style == "text" and output is None and sys.stdout.isatty()
     width = _width(everything, output)
     if loaded is not None and layout == "blocks" and style != "html":
@@ -271,28 +275,6 @@ def _named(datasets: Sequence[str]) -> dict[str, list[str]]:
             raise AwError(f"--dataset {text!r}: write NAME=SCENE,SCENE")
         named.setdefault(name.strip(), []).extend(scenes)
     return named
-
-
-def command_line(
-    runs: Sequence[Path],
-    style: str,
-    metrics: Sequence[str],
-    scenes: Sequence[str],
-    layout: str = "blocks",
-    datasets: Sequence[str] = (),
-    reported: bool = False,
-    reported_from: Path | None = None,
-) -> str:
-    """Return the command that makes this table again."""
-    words = ["aw", "table", *map(str, runs)]
-    words += ["--format", style] if style != "text" else []
-    words += ["--layout", layout] if layout != "blocks" else []
-    for flag, values in (("--metric", metrics), ("--only", scenes), ("--dataset", datasets)):
-        for value in values:
-            words += [flag, value]
-    words += ["--reported"] if reported else []
-    words += ["--reported-from", str(reported_from)] if reported_from else []
-    return shlex.join(words)
 
 
 @click.command(name="rescore")

@@ -11,8 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli import options
-from ambiguous_wild.cli.options import PathName, engine_options, metric_file_option, say, training_options
+from ambiguous_wild.cli.options import (
+    Number,
+    PathName,
+    engine_options,
+    metric_file_option,
+    say,
+    training_options,
+)
 from ambiguous_wild.cli.progress import ProgressBar, finish
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.bench import bench
@@ -127,7 +133,7 @@ def parse_budget(text: str) -> float:
 )
 @click.option(
     "--checkpoint-every",
-    type=options.Number(min=0.0, min_open=True),
+    type=Number(min=0.0, min_open=True),
     default=60.0,
     show_default=True,
     help="Seconds between checkpoints.",

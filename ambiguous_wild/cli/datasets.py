@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, threads_option
+from ambiguous_wild.cli.options import PathName, seed_option, threads_option
 from ambiguous_wild.core.errors import AwError, shortlist
 
 if TYPE_CHECKING:
@@ -43,13 +43,7 @@ KINDS = (
     help="Leave out keep masks: those that the layout names, masks/ beside the photos, the photos' alpha.",
 )  # fmt: skip
 @threads_option
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Seed of matching and of random points.",
-)
+@seed_option("Seed of matching and of random points.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene imported from other files or settings.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def import_command(

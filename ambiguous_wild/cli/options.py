@@ -70,6 +70,18 @@ only_option = click.option(
     help="Only the scene of this name; repeatable.  [default: all]",
 )
 
+
+def device_option(help: str) -> Callable[..., Any]:
+    """Return the option --device."""
+    choices = click.Choice(["auto", "cpu", "cuda"])
+    return click.option("--device", type=choices, default="auto", show_default=True, help=help)
+
+
+def seed_option(help: str) -> Callable[..., Any]:
+    """Return the option --seed for one seed."""
+    return click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=help)
+
+
 _TRAINING = (
     click.option(
         "--seed",
@@ -81,13 +93,7 @@ _TRAINING = (
         help="Random seed; repeatable.",
     ),
     click.option("--iterations", type=click.IntRange(1), help="Training iterations.  [default: 30000]"),
-    click.option(
-        "--device",
-        type=click.Choice(["auto", "cpu", "cuda"]),
-        default="auto",
-        show_default=True,
-        help="auto: the GPU if torch and gsplat can use one, else the CPU.",
-    ),
+    device_option("auto: the GPU if torch and gsplat can use one, else the CPU."),
     threads_option,
     click.option(
         "--factor",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from ambiguous_wild.cli.options import Number, PathName
+from ambiguous_wild.cli.options import Number, PathName, seed_option
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.twin import Twin
@@ -28,9 +28,7 @@ if TYPE_CHECKING:
     help="Simulate a capture that calls for the same effects as this scene, instead of NAME.",
 )
 @click.option("-o", "--output", type=PathName(file_okay=False), help="Folder to write.")
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of world, walk, distractors."
-)
+@seed_option("Seed of world, walk, distractors.")
 @click.option("--views", type=int, help="Number of train photos; test photos in proportion.")
 @click.option("--width", type=int, help="Width of a photo in px; keeps the aspect ratio.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, device_option
 from ambiguous_wild.core.errors import AwError
 
 
@@ -24,13 +24,7 @@ from ambiguous_wild.core.errors import AwError
     help="Instead of the cases: check this method, such as FILE.py:RECIPE, in a short training; repeatable.",
 )
 @click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="auto: the CPU, and the GPU if there is one.",
-)
+@device_option("auto: the CPU, and the GPU if there is one.")
 @click.option(
     "--format",
     "style",

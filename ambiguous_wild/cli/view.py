@@ -10,8 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli import options as shared
-from ambiguous_wild.cli.options import PathName, plugin_option, say, scene_folder_option, threads_option
+from ambiguous_wild.cli.options import (
+    Number,
+    PathName,
+    device_option,
+    plugin_option,
+    say,
+    scene_folder_option,
+    seed_option,
+    threads_option,
+)
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
 
@@ -53,15 +61,9 @@ _one_scene = click.option(
     type=click.IntRange(4),
     help="With --live: largest number of Gaussians.  [default: the method's]",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="With --live: seed.")
+@seed_option("With --live: seed.")
 @click.option("--threads", type=click.IntRange(1), help="With --live: CPU threads.")
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="With --live: auto is the GPU if torch and gsplat can use one, else the CPU.",
-)
+@device_option("With --live: auto is the GPU if torch and gsplat can use one, else the CPU.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="With --live: address to listen on.")
 @click.option(
     "--port",
@@ -136,14 +138,14 @@ def view_command(
     "--path", "path", default="test", show_default=True, metavar="test|orbit|FILE",
     help="Along the test cameras, around the scene, or FILE saved by 'aw view', nerfstudio or a 3DGS viewer.",
 )  # fmt: skip
-@click.option("--seconds", type=shared.Number(0.1, 600), default=8.0, show_default=True)
-@click.option("--fps", type=shared.Number(1, 120), default=24.0, show_default=True, help="Frames per second.")
+@click.option("--seconds", type=Number(0.1, 600), default=8.0, show_default=True)
+@click.option("--fps", type=Number(1, 120), default=24.0, show_default=True, help="Frames per second.")
 @click.option(
     "--width", type=click.IntRange(16, 4096), help="Width of each render, px.  [default: as the photos]"
 )
 @click.option("--columns", type=click.IntRange(1), help="Renders in a row.  [default: up to three]")
 @click.option("--gif", type=PathName(dir_okay=False), help="Also write this GIF of the whole path.")
-@click.option("--gif-seconds", type=shared.Number(0.5, 30), default=4.0, show_default=True)
+@click.option("--gif-seconds", type=Number(0.5, 30), default=4.0, show_default=True)
 @click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
 @_one_scene
 @scene_folder_option

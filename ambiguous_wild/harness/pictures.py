@@ -18,7 +18,6 @@ import numpy as np
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.harness import sheets
-from ambiguous_wild.harness.sheets import write_contact
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.palette import ADDED, MERGED, NEUTRAL, plot_colour, ramp
@@ -39,9 +38,7 @@ class Recorder:
     """
 
     def __init__(self, trainer: Trainer, folder: Path) -> None:
-        views = trainer.data.scene.train
-        chosen = np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)
-        self.views = [int(v) for v in np.unique(chosen)]
+        self.views = sheets.spread(range(len(trainer.data.scene.train)), VIEWS)
         self.folder = folder
         self.passed = self._passed(trainer)
 
@@ -115,7 +112,7 @@ def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
     written = recorder.finish(trainer)
     written += trainer.parts.mask.draw(pictures)
     written += draw_density(trainer, pictures / "density.png")
-    written += write_contact(trainer.data.scene, folder / "masks", pictures / "masks.jpg")
+    written += sheets.write_contact(trainer.data.scene, folder / "masks", pictures / "masks.jpg")
     return written
 
 
@@ -185,7 +182,8 @@ def _top_view(axes: Any, trainer: Trainer) -> None:
         right = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     right /= np.linalg.norm(right)
     plane = np.stack([right, np.cross(up, right)])
-    everything = _thin(trainer.gaussians.means.detach().cpu().numpy()) @ plane.T
+    means = trainer.gaussians.means.detach().cpu().numpy()
+    everything = means[:: max(len(means) // SHOWN, 1)] @ plane.T
     centres = np.stack([camera.center for camera in trainer.data.cameras]) @ plane.T
     axes.scatter(everything[:, 0], everything[:, 1], 0.5, color=plot_colour(NEUTRAL), alpha=0.4, lw=0)
     for _, xyz, marker, colour, size in _kinds(trainer):
@@ -231,7 +229,3 @@ def _pixels_in_view(xyz: np.ndarray, camera: Camera) -> np.ndarray:
     v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
     inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     return np.stack([u[inside], v[inside]], axis=1)
-
-
-def _thin(rows: np.ndarray) -> np.ndarray:
-    return rows[:: max(len(rows) // SHOWN, 1)]

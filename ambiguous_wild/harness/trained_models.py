@@ -15,12 +15,13 @@ from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
 from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders
+from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import Model, RenderSettings, file_model
-from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
+from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, PAGE, Page, check_page_folder, page_text
 from ambiguous_wild.viewing.video import scene_around
 
 MASKS = "masks"
@@ -256,8 +257,7 @@ def view_runs(
     """
     shown = read_models(paths, scene=scene, scene_folder=scene_folder)
     check_page_folder(output)
-    return write_page(
-        output,
+    text, models_bytes, notes = page_text(
         shown.scene,
         shown.models,
         title=shown.scene.name if title is None else title,
@@ -265,6 +265,8 @@ def view_runs(
         notes=shown.notes,
         say=say,
     )
+    write_text(output / PAGE, text)
+    return Page(output / PAGE, len(text.encode("utf-8")), models_bytes, notes)
 
 
 class Viewer:

@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core import AwError, Camera, View
 from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness import evaluate, pictures
 from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
@@ -26,7 +26,7 @@ from ambiguous_wild.harness.meter import Meter
 from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult, TimeRecord
 from ambiguous_wild.harness.start import started
 from ambiguous_wild.io.files import atomic_dir, write_json
-from ambiguous_wild.io.images import read_keep_map, write_png
+from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
 from ambiguous_wild.splat.data import load_train_data
@@ -225,14 +225,14 @@ def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | Non
     trainer.train(tick=tick)
     cost = cost_of(cell, trainer)
     shutil.rmtree(place / MASKS, ignore_errors=True)
-    with atomic_dir(place / MASKS) as temporary:
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for index, view in enumerate(cell.scene.train):
             step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
             keep = trainer.parts.mask.predict(step)
-            kept = np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
-            path = temporary / Path(view.name).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, kept.astype(np.uint8) * 255)
+            yield view, np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
+
+    evaluate.write_keeps(cell.scene, keeps(), place / MASKS)
     write_json(place / COST, cost)  # written last: this file marks the pass as finished
 
 

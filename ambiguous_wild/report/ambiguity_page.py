@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.harness.sheets import spread
 from ambiguous_wild.io.files import atomic_dir, atomic_path, refuse_file, write_json, write_text
+from ambiguous_wild.io.images import load_image_float
 from ambiguous_wild.io.page_parts import data_uri, jpeg_bytes, narrowed
 from ambiguous_wild.io.palette import ADDED, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.report.ambiguity_measure import BINS, Measured, SceneFeatures, cosine_map, load_photo
+from ambiguous_wild.report.ambiguity_measure import BINS, Measured, SceneFeatures, cosine_map
 from ambiguous_wild.report.ambiguity_sources import Background, Masks
 from ambiguous_wild.report.ambiguity_summary import (
     NO_DISTRACTORS,
@@ -38,7 +40,7 @@ SIDE = 480  # px a picture in the figure at most
 def chosen(measured: list[Measured], most: int = PHOTOS) -> list[int]:
     """Return indices of photos spread evenly over the range of occlusion, from little to much."""
     order = sorted(range(len(measured)), key=lambda i: measured[i].counts.occlusion)
-    return [order[round(k)] for k in np.linspace(0, len(order) - 1, min(most, len(order)))]
+    return spread(order, most)
 
 
 def overlay(photo: np.ndarray, distractor: np.ndarray) -> np.ndarray:
@@ -91,7 +93,7 @@ def write_figure(
     grid = figure.add_gridspec(4, 12)
     for column, index in enumerate(picks):
         view = scene.train[index]
-        photo, distractor = load_photo(view), masks.load(view)
+        photo, distractor = load_image_float(view.image_path), masks.load(view)
         behind, known = background.load(index, view)
         pictures = [
             overlay(photo, distractor),
@@ -216,7 +218,7 @@ def _pictures(
     """Yield the name and JPEGs (photo, overlay, residual, cosine) of each photo on the page."""
     for index in sorted(chosen(measured, SHOWN)):
         view = scene.train[index]
-        photo, distractor = load_photo(view), masks.load(view)
+        photo, distractor = load_image_float(view.image_path), masks.load(view)
         behind, known = background.load(index, view)
         plain = (255 * photo + 0.5).astype(np.uint8)
         images = [("photo", plain), ("distractors", overlay(photo, distractor))]

@@ -290,7 +290,7 @@ def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
             f"(limit {100 * sem.LOOKALIKE_ABOVE:.0f} %)"
         )
     return (
-        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
+        f"semantic: cosine {_with_interval(look, 1, 3, '')} of a photo's most similar distractor to the "
         f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})"
     )
 
@@ -300,25 +300,18 @@ def _one(look: SemanticScore) -> str:
 
 
 def _percent(score: Scored) -> str:
-    if score["value"] is None:
-        return "missing"
-    text = f"{100 * score['value']:.1f} %"
-    return (
-        text
-        if score["low"] is None or score["high"] is None
-        else f"{text} [{100 * score['low']:.1f}, {100 * score['high']:.1f}]"
-    )
+    return _with_interval(score, 100, 1, " %")
 
 
-def _value(score: Scored) -> str:
-    if score["value"] is None:
-        return "missing"
-    text = f"{score['value']:.3f}"
-    return (
-        text
-        if score["low"] is None or score["high"] is None
-        else f"{text} [{score['low']:.3f}, {score['high']:.3f}]"
+def _with_interval(score: Scored, times: int, digits: int, unit: str) -> str:
+    """Return the score as text, behind it its interval, both multiplied by `times`."""
+    value, low, high = (
+        None if x is None else f"{times * x:.{digits}f}"
+        for x in (score["value"], score["low"], score["high"])
     )
+    if value is None:
+        return "missing"
+    return value + unit + ("" if low is None or high is None else f" [{low}, {high}]")
 
 
 def _word(score: ColourScore | SemanticScore) -> str:

@@ -11,11 +11,11 @@ from dataclasses import fields
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
+from ambiguous_wild.harness.cell import option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import own_json
@@ -133,11 +133,13 @@ def _changed(config: RunConfig) -> dict[str, str]:
     options, name = flatten(config["options"]), config["method"]
     if "@" in name:
         kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in _chosen(name)}
-        return {key: _word(value) for key, value in kept.items() if value is not None}
+        return {key: option_text(value) for key, value in kept.items() if value is not None}
     usual = {} if config["source"] else _defaults(name)
     if usual is None:
         return {}
-    return {f"{name}.{k}": _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
+    return {
+        f"{name}.{k}": option_text(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v
+    }
 
 
 def _chosen(method: str) -> list[tuple[str, str, str]]:
@@ -162,13 +164,6 @@ def _defaults(method: str) -> Options | None:
     except (AwError, ImportError):
         return None
     return {k: v for k, v in options.items() if k not in entry.by_machine()}
-
-
-def _word(value: Any) -> str:
-    """Return the value as `--set` reads it."""
-    if isinstance(value, (list, tuple)):
-        return ",".join(map(_word, value))
-    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def hardware(path: Path, result: RunResult) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.board_edit import AddReport
@@ -75,7 +76,6 @@ def add_command(
     left for later. Adding a run twice changes nothing.
     """
     from ambiguous_wild.cli.progress import ticking
-    from ambiguous_wild.core import AwError
     from ambiguous_wild.report.board_edit import add
 
     with ticking(unit="run") as tick:
@@ -84,9 +84,7 @@ def add_command(
     counts = Counter(r.outcome for r in reports)
     outcomes = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
     dry_note = " (nothing written)" if dry_run else ""
-    click.echo(
-        f"{len(reports)} run{'' if len(reports) == 1 else 's'}: {outcomes}{dry_note}; board {board}", err=True
-    )
+    click.echo(f"{counted(len(reports), 'run')}: {outcomes}{dry_note}; board {board}", err=True)
     if counts["refused"]:
         sys.exit(AwError.exit_code)
 
@@ -118,7 +116,7 @@ def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
     gone = remove(board, dry=dry_run, **chosen)
     for entry in gone:
         click.echo(f"{'would remove' if dry_run else 'removed'}: {entry.name}")
-    click.echo(f"{len(gone)} run{'' if len(gone) == 1 else 's'}; board {board}", err=True)
+    click.echo(f"{counted(len(gone), 'run')}; board {board}", err=True)
 
 
 @command.command("publish")
@@ -175,7 +173,6 @@ def check_command(board: Path, as_json: bool) -> None:
     """
     import dataclasses
 
-    from ambiguous_wild.core import AwError
     from ambiguous_wild.report.board_edit import check
 
     result = check(board)

@@ -130,11 +130,7 @@ def csv_of(data: StudyReport) -> str:
     lines = []
     for row in data["rows"]:
         line: Facts = {
-            "group": row["group"],
-            "variant": row["variant"],
-            "status": row["status"],
-            "reason": row["reason"],
-            "same_as": row["same_as"],
+            k: v for k, v in row.items() if k in ("group", "variant", "status", "reason", "same_as")
         }
         line |= {"settings": " ".join(row["settings"]), "runs": len(row["runs"])}
         for key, entry in row["values"].items():

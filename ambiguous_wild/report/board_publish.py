@@ -257,12 +257,6 @@ def _link(url: object) -> str:
     return text if re.fullmatch(r"https?://[^\s\"'<>]+", text) else ""
 
 
-def reported_csv(numbers: Sequence[Number]) -> str:
-    """Return CSV with one number per row, each marked as reported, with its value and as printed."""
-    rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in numbers)
-    return board_csv(REPORTED_COLUMNS, rows)
-
-
 def _plain(number: Number, column: str) -> CsvValue:
     value: CsvValue = getattr(number, "text" if column == "printed" else column)
     return value
@@ -338,8 +332,8 @@ def publish(
                     folder / "images" / row["file"],
                     row["sha256"],
                 )
-            pages = write_model_pages(entries, models, folder, say) if models else ModelPages({}, 0)
-            text = page(title, facts(entries, index, printed, names, pages.links))
+            links, pages = write_model_pages(entries, models, folder, say) if models else ({}, 0)
+            text = page(title, facts(entries, index, printed, names, links))
             (folder / "index.html").write_text(text, encoding="utf-8")
             write_json(folder / MANIFEST, list_names(folder))
     return Published(
@@ -348,7 +342,7 @@ def publish(
         images=len(index),
         reported=len(printed.numbers),
         reported_from=None if source is None else str(source),
-        model_pages=pages.pages,
+        model_pages=pages,
     )
 
 
@@ -393,7 +387,8 @@ def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Se
     folder.mkdir()
     files = {path.name: text for path, text in files_of(board, entries).items()}
     if printed:
-        files["reported.csv"] = reported_csv(printed)
+        rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in printed)
+        files["reported.csv"] = board_csv(REPORTED_COLUMNS, rows)
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8")
     return list(files)
@@ -420,15 +415,9 @@ MODELS = "models"
 Say = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class ModelPages:
-    """The pages of models that were written."""
-
-    links: dict[str, str]  # link to a run's entry, relative to index.html, by the hash of its result
-    pages: int
-
-
-def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path, say: Say) -> ModelPages:
+def write_model_pages(
+    entries: Sequence[Entry], runs: Sequence[Path], out: Path, say: Say
+) -> tuple[dict[str, str], int]:
     """Write OUT/models/*.html from run folders whose results are on the board.
 
     A method with its setting is shown by the lowest seed that has a model below `runs`.
@@ -438,6 +427,9 @@ def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path,
         runs: run folders, or folders of them.
         out: folder of the published page.
         say: gets a line for each method without a model.
+
+    Returns:
+        The link to each run's entry, relative to index.html, by the hash of its result; and how many pages.
 
     Raises:
         AwError: no run with a model below `runs`, or a scene is not where its run says.
@@ -459,8 +451,7 @@ def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path,
             if not at_hand:
                 say(f"no model of {label} on {scene}: its run is not below the given folders")
                 continue
-            chosen = at_hand[0]
-            shown.append((label, by_hash[chosen.result_hash]))
+            shown.append((label, by_hash[at_hand[0].result_hash]))
         if not shown:
             continue
         if len({f.scene_hash for _, f in shown}) > 1:
@@ -473,7 +464,7 @@ def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path,
         for label, _ in shown:
             for entry in groups[label]:
                 links[entry.result_hash] = f"{MODELS}/{name}#left={quote(label, safe='')}"
-    return ModelPages(links, len(names))
+    return links, len(names)
 
 
 def _page_name(dataset: str, scene: str, taken: set[str]) -> str:

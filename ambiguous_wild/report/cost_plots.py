@@ -87,22 +87,16 @@ def spread_out(heights: Sequence[float], gap: float) -> list[float]:
     pools: list[tuple[float, list[int]]] = []  # (middle, members)
     for i in order:
         pools.append((heights[i], [i]))
-        while len(pools) > 1 and _top(pools[-2], gap) > _bottom(pools[-1], gap):
+        while len(pools) > 1:
             (a, one), (b, two) = pools[-2:]
+            if b - a >= (len(one) + len(two)) * gap / 2:
+                break
             pools[-2:] = [((a * len(one) + b * len(two)) / (len(one) + len(two)), one + two)]
     placed = [0.0] * len(heights)
     for pool in pools:
         for k, i in enumerate(pool[1]):
             placed[i] = pool[0] + (k - (len(pool[1]) - 1) / 2) * gap
     return placed
-
-
-def _top(pool: tuple[float, list[int]], gap: float) -> float:
-    return pool[0] + len(pool[1]) * gap / 2
-
-
-def _bottom(pool: tuple[float, list[int]], gap: float) -> float:
-    return pool[0] - len(pool[1]) * gap / 2
 
 
 def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> None:

@@ -69,7 +69,7 @@ def unequal(frame: pd.DataFrame) -> list[str]:
         apart = [scene for scene, of in given.groupby("scene") if of[column].astype(str).nunique() > 1]
         if apart:
             rows = given[given["scene"].isin(apart)].groupby("method")[column]
-            each = [f"{method}: {_shared(values)}" for method, values in rows]
+            each = [f"{method}: {' or '.join(dict.fromkeys(map(str, values)))}" for method, values in rows]
             lines.append(
                 f"{UNEQUAL}: {what} differ on {shortlist(map(str, apart))}: {shortlist(each, limit=12)}; a "
                 "rank may be due to this and not to the method"
@@ -86,10 +86,6 @@ def _mixed(frame: pd.DataFrame) -> list[str]:
     """Return a line for each reason to doubt test photos, with the scenes."""
     rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
     return [f"{reason} ({shortlist(sorted(set(of['scene'])))})" for reason, of in rows.groupby("test_photos")]
-
-
-def _shared(values: pd.Series) -> str:
-    return " or ".join(dict.fromkeys(map(str, values)))
 
 
 def _failed(runs: Runs) -> list[str]:

@@ -78,7 +78,8 @@ def _tabular(table: Table) -> list[str]:
                 f"\\multicolumn{{{span}}}{{l}}{{\\emph{{reported, not measured here}}}} \\\\",
             ]
             before = row.kind
-        lines.append(_latex_row(table, row))
+        cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
+        lines.append(" & ".join([latex_text(row.name), *cells]) + r" \\")
     # these notes are printed, as they limit what a rank means; the others are comments
     below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
     if not table.title and any(cell.tie for cell in table.cells):  # a bare tabular has no caption
@@ -127,11 +128,6 @@ def _latex_head(table: Table) -> list[str]:
 def _latex_label(measure: Measure) -> str:
     arrow = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", None: ""}[measure.better]
     return latex_text(measure.label) + arrow
-
-
-def _latex_row(table: Table, row: Row) -> str:
-    cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
-    return " & ".join([latex_text(row.name), *cells]) + r" \\"
 
 
 def _latex_cell(cell: Cell, measure: Measure) -> str:

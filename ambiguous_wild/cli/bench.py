@@ -21,7 +21,7 @@ from ambiguous_wild.cli.options import (
 )
 from ambiguous_wild.cli.progress import ProgressBar, finish
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.bench import bench
+from ambiguous_wild.harness.bench import Engine, bench
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.suite import PreparedSuite
@@ -171,7 +171,7 @@ def command(
     checkpoint_every: float,
     on_nonfinite: str,
     as_json: bool,
-    **given: Any,  # the other arguments of `bench`, by their names
+    **given: Any,  # the other arguments of `bench`, and the fields of `Engine`, by their names
 ) -> None:
     """Train METHODs on SCENEs and measure them on the test views.
 
@@ -223,6 +223,7 @@ def command(
         parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
         train=train,  # type: ignore[arg-type]
         protocol=protocol,  # type: ignore[arg-type]
+        engine=Engine(**{name: given.pop(name) for name in Engine.__dataclass_fields__}),
         callbacks=ProgressBar(),
         **given,
     )

@@ -12,7 +12,6 @@ from typing import Any
 import click
 
 from ambiguous_wild.core.names import plain
-from ambiguous_wild.harness.callbacks import Engine
 
 
 class PathName(click.Path):
@@ -82,7 +81,18 @@ def seed_option(help: str) -> Callable[..., Any]:
     return click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=help)
 
 
-_TRAINING = (
+def _all(*options: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a decorator that adds these options to a click command."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+training_options = _all(
     click.option(
         "--seed",
         "seeds",
@@ -124,15 +134,7 @@ _TRAINING = (
 )
 
 
-def training_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add these options to a click command: seeds, iterations, device, threads, factor, max_gaussians,
-    plugins, overwrite, cache."""
-    for option in reversed(_TRAINING):
-        command = option(command)
-    return command
-
-
-_ENGINE = (
+engine_options = _all(  # the fields of `Engine`
     click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True,
                  help="local: this machine; ray: Ray, also on a cluster (docs/cluster.md)."),
     click.option("--jobs", type=click.IntRange(1),
@@ -152,22 +154,6 @@ _ENGINE = (
     click.option("--transfer-limit", type=Number(min=0, min_open=True), default=4000.0,
                  show_default=True, metavar="MB", help="Ray: largest scene or run that is sent through Ray."),
 )  # fmt: skip
-
-
-def engine_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the engine's options to a click command, which gets them as one argument `engine`, an `Engine`."""
-
-    def with_engine(**values: Any) -> Any:
-        names = [f for f in Engine.__dataclass_fields__ if f in values]
-        return command(engine=Engine(**{name: values.pop(name) for name in names}), **values)
-
-    with_engine.__doc__, with_engine.__name__ = command.__doc__, command.__name__
-    # Keep the options that decorators below this one have added.
-    with_engine.__dict__.update(command.__dict__)
-    wrapped: Callable[..., Any] = with_engine
-    for option in reversed(_ENGINE):
-        wrapped = option(wrapped)
-    return wrapped
 
 
 def choose_device(device: str) -> str:

@@ -214,16 +214,13 @@ def export_command(
     aw export runs --up z --format ply
     aw export stranger.spz --format ply
     """
+    from ambiguous_wild.harness.result_file import encoded
     from ambiguous_wild.report.model_views import export_runs
 
     reports = export_runs(runs, formats, output, say=say, **options)
     if as_json:
-        rows = [
-            {k: _plain(v) for k, v in {"label": label, **dataclasses.asdict(e)}.items()}
-            for label, files in reports
-            for e in files
-        ]
-        click.echo(json.dumps(rows, indent=2, ensure_ascii=False))
+        rows = [{"label": label, **dataclasses.asdict(e)} for label, files in reports for e in files]
+        click.echo(json.dumps(encoded(rows), indent=2, ensure_ascii=False, default=str))
         return
     for label, files in reports:
         click.echo(f"{plain(label)}: {files[0].gaussians:,} Gaussians")
@@ -243,12 +240,6 @@ def _place(e: Exported) -> str:
         else f"turn by the quaternion ({', '.join(f'{v:.6g}' for v in (w, *(-v for v in axis)))}), "
     )
     return f"{smaller}{back}add ({x:.15g}, {y:.15g}, {z:.15g})"
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, Path):
-        return str(value)
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _line(e: Exported) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import cache
@@ -19,7 +18,7 @@ from ambiguous_wild.harness.cell import option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import own_json
-from ambiguous_wild.report.board import HIDDEN, Entry
+from ambiguous_wild.report.board import Entry, hidden_in
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
 
@@ -97,7 +96,7 @@ def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -
         words += ["--set", f"{key}={value}"]
     words += ["--device", config.get("device", "cpu"), "-o", "runs"]
     text = " && ".join([*before, shlex.join(str(w) for w in words)])
-    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    hidden = hidden_in(text)
     if hidden is not None:
         raise AwError(f"config.yaml holds the invisible character {hidden!a}: run again without it")
     return text

@@ -30,7 +30,7 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.run import EFFECTS
+from ambiguous_wild.harness.run import EFFECTS, ENVIRONMENT
 from ambiguous_wild.harness.store import impossible_values, read_config
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io.files import sha256_file
@@ -45,7 +45,6 @@ from ambiguous_wild.report.board_reproduce import (
     setting,
 )
 
-ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
 REQUIRED = ("psnr", "ssim", "ssim_inria")  # always measurable: they need only the two pictures
 

@@ -112,10 +112,6 @@ class LiveView:
             self._stale = True
             self._woken.notify_all()
 
-    @property
-    def paused(self) -> bool:
-        return self._paused
-
     # -- called in the trainer's thread ------------------------------------------------------------
 
     def tick(self, trainer: Trainer) -> None:

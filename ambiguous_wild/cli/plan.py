@@ -15,7 +15,6 @@ import click
 from ambiguous_wild.cli.options import PathName
 
 if TYPE_CHECKING:
-    from ambiguous_wild.core import Scene
     from ambiguous_wild.harness.effects_plan import Decision, Plan
 
 COLUMNS = 100  # of the table
@@ -76,7 +75,12 @@ def command(
         prepare_cpu(None)
     plan = dataclasses.replace(plan_effects(loaded), scene_hash=scene_identity(loaded))
     if probe:
-        plan = _with_masks(plan, loaded, as_json)
+        from tqdm import tqdm
+
+        from ambiguous_wild.harness.mask_plan import with_masks
+
+        bar = functools.partial(tqdm, unit="it", desc="masks", disable=as_json or None)
+        plan = with_masks(plan, loaded, bar)
     if costs:
         from ambiguous_wild.harness.mask_plan import effect_costs
 
@@ -88,14 +92,6 @@ def command(
     for line in table(plan):
         click.echo(line)
     click.echo(f"wrote {path}")
-
-
-def _with_masks(plan: Plan, scene: Scene, quiet: bool) -> Plan:
-    from tqdm import tqdm
-
-    from ambiguous_wild.harness.mask_plan import with_masks
-
-    return with_masks(plan, scene, functools.partial(tqdm, unit="it", desc="masks", disable=quiet or None))
 
 
 def _check_overwrite(path: Path, probe: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shlex
 from collections.abc import Iterable
@@ -14,7 +15,6 @@ from click.core import ParameterSource
 from ambiguous_wild.cli.options import Number, PathName, seed_option
 
 if TYPE_CHECKING:
-    from ambiguous_wild.report.twin import Twin
     from ambiguous_wild.simulate.records import PhotoTruth
     from ambiguous_wild.simulate.spec import CaptureSpec
 
@@ -74,7 +74,10 @@ def simulate_command(
         raise AwError(f"{given} ('aw simulate --list' describes them)")
     twin = None
     if like is not None:
-        twin = _twin(like, width, seed, views)
+        from ambiguous_wild.io.scene_folder import load_scene
+        from ambiguous_wild.report.twin import measure_likeness, spec_like
+
+        twin = spec_like(measure_likeness(load_scene(like)), width, seed, views)
         spec, called = twin.spec, f"--like {shlex.quote(str(like))}"
     else:
         called = str(name)
@@ -98,9 +101,7 @@ def simulate_command(
     from ambiguous_wild.io.files import check_output, folder_lock, sweep_siblings
     from ambiguous_wild.simulate.capture import simulate
 
-    def bar(shots: list) -> tqdm:
-        return tqdm(shots, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
-
+    bar = functools.partial(tqdm, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
     check_output(output)
     with folder_lock(output, f"aw simulate {called}"):
         sweep_siblings(output)  # left by a killed call
@@ -125,14 +126,10 @@ def simulate_command(
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
         return
-    share = facts["occlusion"]
     state = "already there, unchanged" if facts["reused"] else "wrote"
     things = counted(len(spec.distractors), "distractor")
     cover = "covers" if len(spec.distractors) == 1 else "cover"
-    covered = (
-        f"{things} {cover} {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
-        f"(mean {100 * share['mean']:.1f} %) of a train photo"
-    )
+    covered = f"{things} {cover} {_range(facts['occlusion'])} of a train photo"
     click.echo(
         f"{state}: {output}: {spec.train_views} train and {spec.test_views} test photos of "
         f"{spec.width}x{spec.height}; {covered if spec.distractors else 'no distractors'}"
@@ -147,12 +144,8 @@ def simulate_command(
     click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
 
 
-def _twin(scene: Path, width: int | None, seed: int, views: int | None) -> Twin:
-    """Measure a scene and return the spec of a capture like it."""
-    from ambiguous_wild.io.scene_folder import load_scene
-    from ambiguous_wild.report.twin import measure_likeness, spec_like
-
-    return spec_like(measure_likeness(load_scene(scene)), width, seed, views)
+def _range(share: dict[str, float]) -> str:
+    return f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %)"
 
 
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:
@@ -249,9 +242,7 @@ def composite_command(
             "or give a scene from 'aw build-scene'"
         )
 
-    def bar(items):
-        return tqdm(items, unit="photo", desc="composite", disable=as_json or None)
-
+    bar = functools.partial(tqdm, unit="photo", desc="composite", disable=as_json or None)
     check_output(output)
     with folder_lock(output, "aw composite"):
         sweep_siblings(output)  # left by a killed call
@@ -260,10 +251,7 @@ def composite_command(
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k != "photos"}, indent=2))
         return
-    share, train = facts["occlusion"], facts["photos"]
-    shares = (
-        f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %) of each"
-    )
+    train, shares = facts["photos"], f"{_range(facts['occlusion'])} of each"
     place = shlex.quote(str(output))
     if plain:
         changed = sum(bool(photo["distractors"]) for photo in train.values())

@@ -22,6 +22,7 @@ from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.palette import ADDED, MERGED, NEUTRAL, plot_colour, ramp
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.vision.sparse_surface import in_map, inside
 
 MOMENTS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)  # shares of the run
 VIEWS = 3
@@ -223,9 +224,9 @@ def _in_a_view(axes: Any, trainer: Trainer) -> None:
 
 def _pixels_in_view(xyz: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the pixels [n, 2] of the positions in front of the camera and inside its picture."""
-    local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    local = local[local[:, 2] > 1e-6]
-    u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-    v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return np.stack([u[inside], v[inside]], axis=1)
+    local, shape = (
+        xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3],
+        (camera.height, camera.width),
+    )
+    x, y = in_map(camera, local, shape)
+    return np.stack([x, y], axis=1)[inside(x, y, shape)] + 0.5

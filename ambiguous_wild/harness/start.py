@@ -101,13 +101,13 @@ def _read(path: Path) -> Splats | tuple[np.ndarray, np.ndarray]:
 
 def _refuse_unseen(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     """Raise AwError if no train camera sees any of the points [N, 3]."""
+    from ambiguous_wild.vision.sparse_surface import in_map, inside
+
     sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:_CHECKED_POINTS]].astype(np.float64)
     for view in scene.train:
-        camera = view.camera
-        x, y, z = (sample @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]).T
-        ahead = np.where(z > 0, z, np.nan)
-        u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
-        if ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).any():
+        camera, shape = view.camera, (view.camera.height, view.camera.width)
+        local = sample @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        if inside(*in_map(camera, local, shape), shape).any():
             return
     middle = np.median(sample, axis=0) / scene.place.scale + scene.place.centre
     coordinates = ", ".join(f"{c:.4g}" for c in middle)

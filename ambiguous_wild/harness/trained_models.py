@@ -14,7 +14,7 @@ from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
-from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders
+from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders, section
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
@@ -204,14 +204,13 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
     to is imported.
     """
     name = str(config.get("method", ""))
-    options = config.get("options")
     try:
         if is_reference(name):
             raise AwError(f"{name} is a file")
         entry = get_method(name)
         if entry.program is not None:
             return RenderSettings(), ""
-        chosen = from_plain(type(entry.options()), options if isinstance(options, dict) else {}, "options")
+        chosen = from_plain(type(entry.options()), section(config, "options"), "options")
         parts = entry.build(chosen)
     except AwError:
         advice = "it is drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"

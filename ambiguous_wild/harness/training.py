@@ -22,6 +22,7 @@ from ambiguous_wild.core import AwError, Camera, View
 from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness import evaluate, pictures
 from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
+from ambiguous_wild.harness.measures import ImageRow
 from ambiguous_wild.harness.meter import Meter
 from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult, TimeRecord
 from ambiguous_wild.harness.start import started
@@ -342,9 +343,7 @@ def _measure(
         trainer.data.scene.place,
     )
     LOG.info("measuring %s", counted(len(truth), "test view"))
-    per_image, missing = evaluate.render_and_measure(
-        trainer, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
-    )
+    per_image, missing = _measured_views(cell, trainer, truth, folder / "renders" / "test")
     evaluate.refuse_empty(truth, folder / "renders" / "test")
     LOG.info("drawing masks and pictures")
     masks = evaluate.write_masks(trainer, folder / "masks")
@@ -362,6 +361,14 @@ def _measure(
     )
 
 
+def _measured_views(
+    cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto], folder: Path
+) -> tuple[list[ImageRow], dict[str, str]]:
+    half = cell.protocol == "half"
+    draw = evaluate.drawn_by(trainer, half)
+    return evaluate.render_and_measure(draw, truth, folder, scene=cell.scene, half=half)
+
+
 def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto]) -> str:
     """Measure and save the model after Ctrl-C; return a message. A second Ctrl-C leaves that out."""
     folder, train = trainer.folder, cell.train
@@ -372,10 +379,7 @@ def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto])
         with atomic_dir(folder / STOPPED) as kept:
             model = {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
             write_splat_ply(kept / "point_cloud.ply", model, trainer.data.scene.place)
-            half = cell.protocol == "half"
-            rows, missing = evaluate.render_and_measure(
-                trainer, truth, kept / "renders", half=half, scene=cell.scene
-            )
+            rows, missing = _measured_views(cell, trainer, truth, kept / "renders")
             state = {"iteration": trainer.iteration, "train_s": trainer.clock.now()}
             write_json(kept / "measured.json", {**state, "per_image": rows, "missing": missing})
     except KeyboardInterrupt:

@@ -13,7 +13,7 @@ from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.result_file import Options
-from ambiguous_wild.harness.store import Runs, read_config
+from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
@@ -170,9 +170,7 @@ def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
 def _options_of(folder: Path, name: str) -> Options:
     """Return the options of a method in a run, by dotted names; a graft has them below its places."""
     config = read_config(folder)
-    options = config.get("options")
-    if not isinstance(options, dict):
-        return {}
+    options = section(config, "options")
     written = str(config.get("method"))
     if "=" in written:
         host, _, rest = written.rpartition("@")

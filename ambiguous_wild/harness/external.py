@@ -23,8 +23,8 @@ from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
 from ambiguous_wild.io.ply import read_splat_ply, splat_count, write_splat_ply
 from ambiguous_wild.methods.external_process import LOGS, WORK, Produced, Program, Task
-from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import render
+from ambiguous_wild.viewing.model import gaussians_of
 
 
 def run_program(cell: Cell, folder: Path) -> RunResult:
@@ -117,8 +117,7 @@ def _splats(produced: Produced, device: str) -> evaluate.Draw:
         AwError: the file of splats cannot be read.
     """
     assert produced.ply is not None
-    tensors = {name: torch.from_numpy(a) for name, a in read_splat_ply(produced.ply).items()}
-    gaussians = Gaussians(**tensors).to(device)  # type: ignore[arg-type]
+    gaussians = gaussians_of(read_splat_ply(produced.ply)).to(device)
 
     @torch.no_grad()
     def draw(test: evaluate.TestPhoto) -> torch.Tensor:

@@ -56,10 +56,7 @@ def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
     """
     if start is None:
         return parts
-    import torch
-
-    from ambiguous_wild.splat.gaussians import Gaussians
-    from ambiguous_wild.viewing.model import moved
+    from ambiguous_wild.viewing.model import gaussians_of, moved
 
     content, place = _read(start.path), scene.place
     if sha256_file(start.path) != start.sha256:
@@ -67,8 +64,7 @@ def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
     if isinstance(content, Splats):
         arrays = moved(content.gaussians, content.place, place)
         _refuse_unseen(start.path, arrays["means"], scene)
-        tensors = {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
-        return replace(parts, given=Gaussians(**tensors))  # type: ignore[arg-type]
+        return replace(parts, given=gaussians_of(arrays))
     xyz = (content[0] - place.centre) * place.scale
     _refuse_unseen(start.path, xyz, scene)
     return replace(parts, given=(xyz, content[1]))

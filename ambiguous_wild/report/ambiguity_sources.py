@@ -6,17 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.result_file import MODEL
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.images import load_image_float, read_mask
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.io.ply import read_splat_ply
+from ambiguous_wild.viewing.model import gaussians_of
 
 # limits for a background that a run renders
 OPAQUE = 0.9  # accumulated alpha of a surface
@@ -162,7 +161,7 @@ class RunBackground:
         """
         check_run(scene, run)
         self.views, self.masks = list(scene.train), masks
-        self._gaussians = _load(run)
+        self._gaussians = gaussians_of(read_splat_ply(run / MODEL))
         self._depth: dict[int, tuple[Camera, np.ndarray, np.ndarray]] = {}  # of the other photos, coarse
 
     def load(self, index: int, view: View) -> Seen:
@@ -239,7 +238,7 @@ def check_run(scene: Scene, run: Path) -> None:
     from ambiguous_wild.harness.cell import scene_identity
 
     path = run / "config.yaml"
-    if not path.is_file() or not (run / "point_cloud.ply").is_file():
+    if not path.is_file() or not (run / MODEL).is_file():
         raise AwError(
             f"{run} is no finished run (config.yaml and point_cloud.ply); give a folder of 'aw bench', "
             "RUNS/SCENE/METHOD/seed0"
@@ -283,14 +282,3 @@ def sees(
     inside = (local[:, 2] > 1e-6) & (cols >= 0) & (cols < camera.width) & (rows >= 0) & (rows < camera.height)
     r, c = rows.clip(0, camera.height - 1), cols.clip(0, camera.width - 1)
     return inside & static[r, c] & (np.abs(depth[r, c] - z) <= DEPTH_SLACK * z)
-
-
-def _load(run: Path) -> Gaussians:
-    import torch
-
-    from ambiguous_wild.io.ply import read_splat_ply
-    from ambiguous_wild.splat.gaussians import Gaussians
-
-    arrays = read_splat_ply(run / "point_cloud.ply")
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
-    return Gaussians(**tensors)  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from click.core import ParameterSource
 from ambiguous_wild.cli.options import Number, PathName, seed_option
 
 if TYPE_CHECKING:
-    from ambiguous_wild.simulate.records import PhotoTruth
+    from ambiguous_wild.simulate.records import PhotoTruth, Spread
     from ambiguous_wild.simulate.spec import CaptureSpec
 
 
@@ -144,7 +144,7 @@ def simulate_command(
     click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
 
 
-def _range(share: dict[str, float]) -> str:
+def _range(share: Spread) -> str:
     return f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %)"
 
 

@@ -129,9 +129,8 @@ def csv_of(data: StudyReport) -> str:
     """Return one line for each variant; cells are empty where a value is missing."""
     lines = []
     for row in data["rows"]:
-        line: Facts = {
-            k: v for k, v in row.items() if k in ("group", "variant", "status", "reason", "same_as")
-        }
+        line: Facts = {"group": row["group"], "variant": row["variant"], "status": row["status"]}
+        line |= {"reason": row["reason"], "same_as": row["same_as"]}
         line |= {"settings": " ".join(row["settings"]), "runs": len(row["runs"])}
         for key, entry in row["values"].items():
             line |= {key: entry["mean"], f"{key}_spread": entry["spread"]}

@@ -168,7 +168,7 @@ def why_unranked(runs: Iterable[CostRun]) -> str:
 def _run(folder: Path, result: RunResult) -> CostRun:
     config = read_config(folder)
     train, scene = section(config, "train"), section(config, "scene")
-    cost, record = result["cost"], dict(result["cost"].get("timing") or {})
+    cost, record = result["cost"], section(dict(result["cost"]), "timing")
     images = {row["name"]: _number(row.get("psnr")) for row in result["per_image"]}
     psnr, train_s = stats.mean(list(images.values())), _number(cost.get("train_s"))
     effects = config.get("effects") or result["facts"].get("effects") or []

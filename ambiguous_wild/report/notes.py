@@ -175,7 +175,7 @@ def _options_of(folder: Path, name: str) -> Options:
     if "=" in written:
         host, _, rest = written.rpartition("@")
         places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
-        options = next((options.get(p) for p, member in places.items() if member == name), {})
+        options = next((section(options, p) for p, member in places.items() if member == name), {})
     elif "host" in options:  # a graft that is the variant of an ablation: the method is its donor
         options = next((value for place, value in options.items() if place != "host"), {})
     return flatten(options) if isinstance(options, dict) else {}

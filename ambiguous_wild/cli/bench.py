@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -197,8 +196,16 @@ def command(
     seconds = [parse_budget(budget) for budget in budgets]
     prepared = None
     if suite_name is not None:
-        prepared, methods, iterations = _suite(suite_name, root, scenes, output, methods, iterations, seconds)
-        scenes, protocol = tuple(prepared.scenes.values()), protocol or prepared.suite.protocol
+        from ambiguous_wild.datasets.suites import get_suite
+        from ambiguous_wild.report.suite import prepare_suite, suite_methods
+
+        if root is None or scenes:
+            raise AwError(f"--suite {suite_name} takes its scenes from --root DIR; leave --scene out")
+        suite = get_suite(suite_name)
+        prepared = prepare_suite(suite, root, output, say=say)
+        scenes, protocol = tuple(prepared.scenes.values()), protocol or suite.protocol
+        methods = methods or tuple(suite_methods(suite))
+        iterations = iterations if iterations is not None or seconds else suite.iterations
     elif root is not None:
         raise AwError("--root goes with --suite: name the suite whose scenes it holds")
     for flag, names in (("--method", methods), ("--scene", scenes)):
@@ -231,27 +238,6 @@ def command(
         for folder in report.folders:
             _print_tables(prepared, folder)
     finish(report, as_json)
-
-
-def _suite(
-    name: str,
-    root: Path | None,
-    scenes: Sequence[Path],
-    output: Path,
-    methods: Sequence[str],
-    iterations: int | None,
-    budgets_s: Sequence[float],
-) -> tuple[PreparedSuite, tuple[str, ...], int | None]:
-    """Return the suite's scenes, and its methods and length unless others are given."""
-    from ambiguous_wild.datasets.suites import get_suite
-    from ambiguous_wild.report.suite import prepare_suite, suite_methods
-
-    if root is None or scenes:
-        raise AwError(f"--suite {name} takes its scenes from --root DIR; leave --scene out")
-    suite = get_suite(name)
-    prepared = prepare_suite(suite, root, output, say=say)
-    length = iterations if iterations is not None or budgets_s else suite.iterations
-    return prepared, tuple(methods or suite_methods(suite)), length
 
 
 def _print_tables(prepared: PreparedSuite, folder: Path) -> None:

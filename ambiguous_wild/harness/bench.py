@@ -217,6 +217,7 @@ def bench(
     out = Path(output)
     with Session(engine, threads, callbacks) as session:
         from ambiguous_wild.harness.cell import RunOptions
+        from ambiguous_wild.harness.effects_plan import read_plan
         from ambiguous_wild.harness.external import check_program
         from ambiguous_wild.harness.grid import (
             check_grafts,
@@ -239,7 +240,6 @@ def bench(
             budget_s=budgets_s[0] if budgets_s else None,
             **(train or {}),
         )
-        given_plan = _read_plan(plan)
         say = callbacks.say
         planned = {
             wanted: plan_cells(
@@ -251,7 +251,7 @@ def bench(
                 device=used_device,
                 factor=factor,
                 effects=wanted,
-                plan=given_plan,
+                plan=read_plan(Path(plan)) if isinstance(plan, str | Path) else plan,
                 protocol=protocol,
                 start=None if start is None else Path(start),
             )
@@ -338,14 +338,6 @@ def _check_effects(
             f"--plan {name} would not be used: {', '.join(method.name for method in methods)} with "
             f"--effects {', '.join(choices)}; add --effects auto"
         )
-
-
-def _read_plan(plan: Plan | Words | None) -> Plan | None:
-    if not isinstance(plan, str | Path):
-        return plan
-    from ambiguous_wild.harness.effects_plan import read_plan
-
-    return read_plan(Path(plan))
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:

@@ -49,9 +49,7 @@ def read_key(path: Path) -> Key:
             f"cannot read the key {path}: {error.strerror}; 'aw study make' wrote it next to the page"
         ) from None
     except (ValueError, RecursionError) as error:
-        raise AwError(
-            f"the key {path} is damaged ({error}); use the one that 'aw study make' wrote"
-        ) from None
+        raise _damaged(path, str(error)) from None
     if not isinstance(data, dict) or data.get("format") != KEY_FORMAT:
         raise AwError(f"{path} is no key of a study; 'aw study make' wrote it next to the page (*.key.json)")
     if data.get("version") != KEY_VERSION:
@@ -67,12 +65,14 @@ def read_key(path: Path) -> Key:
         and all(_complete(entry) for entry in questions.values())
     )
     if not complete:
-        raise AwError(
-            f"the key {path} is damaged (a field is missing); use the one that 'aw study make' wrote"
-        )
+        raise _damaged(path, "a field is missing")
     if not is_text(json.dumps(data, ensure_ascii=False)):
-        raise AwError(f"the key {path} is damaged (half a character); use the one that 'aw study make' wrote")
+        raise _damaged(path, "half a character")
     return Key(data["study"], data["title"], data["questions"])
+
+
+def _damaged(path: Path, why: str) -> AwError:
+    return AwError(f"the key {path} is damaged ({why}); use the one that 'aw study make' wrote")
 
 
 def _complete(entry: Any) -> bool:

@@ -180,12 +180,7 @@ def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, object]:
     return {
         "name": view.name,
         "split": view.split if view.image_path != NO_PHOTO else "",
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
+        **{field: getattr(camera, field) for field in ("width", "height", "fx", "fy", "cx", "cy")},
         "cam_from_world": camera.cam_from_world.ravel().tolist(),
         "photo": photo,
         "points": points,

@@ -256,7 +256,7 @@ def view_runs(
     """
     shown = read_models(paths, scene=scene, scene_folder=scene_folder)
     check_page_folder(output)
-    text, models_bytes, notes = page_text(
+    text, models_bytes = page_text(
         shown.scene,
         shown.models,
         title=shown.scene.name if title is None else title,
@@ -265,7 +265,7 @@ def view_runs(
         say=say,
     )
     write_text(output / PAGE, text)
-    return Page(output / PAGE, len(text.encode("utf-8")), models_bytes, notes)
+    return Page(output / PAGE, len(text.encode("utf-8")), models_bytes)
 
 
 class Viewer:
@@ -283,7 +283,7 @@ class Viewer:
         shown = read_models(paths)
         self.labels = tuple(model.label for model in shown.models)
         self.height = height
-        self.page, _, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
+        self.page, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
 
     def __repr__(self) -> str:
         return f"Viewer of {', '.join(self.labels)}; a notebook shows it, 'aw view' writes it to a file"

@@ -259,8 +259,14 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
         trainer = _make_trainer(cell, folder, options.cache_dir, truth, first)
         trainer.resume()
         recorder = pictures.Recorder(trainer, folder) if options.pictures else None
+        ticks = [call for call in (recorder, tick) if call is not None]
+
+        def after_iteration(trained: Trainer) -> None:
+            for call in ticks:
+                call(trained)
+
         try:
-            trainer.train(tick=_each(recorder, tick))
+            trainer.train(tick=after_iteration)
         except Stopped:
             raise Stopped(_keep_stopped(cell, trainer, truth)) from None
         return _measure(cell, trainer, truth, recorder, first)
@@ -310,17 +316,6 @@ def _make_trainer(
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer
-
-
-def _each(*ticks: Tick | None) -> Tick:
-    """Return a tick that calls all of these that are given."""
-
-    def after_iteration(trainer: Trainer) -> None:
-        for tick in ticks:
-            if tick is not None:
-                tick(trainer)
-
-    return after_iteration
 
 
 def _measure(

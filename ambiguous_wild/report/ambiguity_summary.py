@@ -54,17 +54,8 @@ class ColourScore(Scored):
     unknown_px: int  # with an unknown background
 
 
-class EvidenceCounts(TypedDict):
-    """Number of distractors that each kind of evidence reveals; None = the evidence is not available."""
-
-    distractors: int
-    colour: int | None
-    structure: int | None
-    features: int | None
-    motion: int | None
-    nothing: int  # number that no evidence reveals
-
-
+# Number of distractors, of those that a kind of evidence reveals (None = not available), and of the others.
+EvidenceCounts = dict[str, int | None]
 # The content of ambiguity.json. Two keys are names of metrics, so that the type cannot list them.
 Summary = dict[str, Any]
 PhotoRow = dict[str, str | float | None]  # a row of photos.csv, by column
@@ -206,18 +197,12 @@ def _count_evidence(measured: list[Measured]) -> EvidenceCounts:
         answers = [answer for d in every if (answer := getattr(d, kind)) is not None]
         return sum(answers) if answers else None
 
-    return {
-        "distractors": len(every),
-        "colour": count("colour"),
-        "structure": count("structure"),
-        "features": count("features"),
-        "motion": count("motion"),
-        "nothing": sum(not d.told_by for d in every),
-    }
+    nothing = sum(not d.told_by for d in every)
+    return {"distractors": len(every), **{kind: count(kind) for kind in KINDS}, "nothing": nothing}
 
 
 def _evidence_line(counts: EvidenceCounts) -> str:
-    known = {kind: counts[kind] for kind in KINDS if counts[kind] is not None}  # type: ignore[literal-required]
+    known = {kind: counts[kind] for kind in KINDS if counts[kind] is not None}
     parts = ", ".join(f"{kind} reveals {count}" for kind, count in known.items())
     text = f"distractors: {counts['distractors']}; {parts or 'no evidence is available'}; "
     text += f"no evidence reveals {counts['nothing']}"

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypedDict
 from urllib.parse import quote
 
 from ambiguous_wild import __version__
@@ -82,38 +81,13 @@ PAPERS = {
 }
 
 
-class ReportedData(TypedDict):
-    """Reported numbers, as the page's scripts read them."""
-
-    reported: list[dict[str, CsvValue]]  # by `REPORTED_COLUMNS`, and "where"
-    findings: list[dict[str, str | list[str]]]  # kind, text, where
-    sources: dict[str, dict[str, str]]  # table -> title, venue, url, caption
-
-
-class PageData(ReportedData):
-    """What the page's scripts read."""
-
-    date: str
-    version: str
-    order: list[str]  # of the metrics
-    partial: list[str]  # metrics that some images or scenes lack
-    times: list[str]
-    references: list[str]
-    methods: dict[str, dict[str, str]]  # name -> summary, paper, links
-    measures: dict[str, dict[str, str | int | None]]  # key -> label, better, digits
-    runs: list[Facts]  # by `COLUMNS`, and quality, cost, alone
-    models: dict[str, str]
-    images: list[Facts]  # rows of the index of pictures
-    files: list[str]
-
-
 def facts(
     entries: Sequence[Entry],
     index: Iterable[Mapping[str, str]],
     reported: Reported,
     files: list[str],
     models: Mapping[str, str] = MappingProxyType({}),
-) -> PageData:
+) -> Facts:
     """Return the page's data, ready for JSON.
 
     Args:
@@ -138,9 +112,11 @@ def facts(
         "date": datetime.now(UTC).date().isoformat(),
         "version": __version__,
         "order": order,
+        # metrics that some images or scenes lack
         "partial": [*(k for k in (*order, *sorted(missing)) if measure(k).partial), *MASKS],
         "times": list(TIMES),
         "references": sorted({e.method for e in entries if knows_truth(e.method)}),
+        # name -> summary, paper, links
         "methods": {name: _method(name) for name in sorted({e.method for e in entries})},
         "measures": measures,
         "runs": [_run(e) for e in entries],
@@ -197,7 +173,7 @@ class Reported:
     findings: tuple[Finding, ...] = ()
     sources: dict[str, dict[str, str]] = field(default_factory=dict)  # table -> title, venue, url, caption
 
-    def plain(self) -> ReportedData:
+    def plain(self) -> Facts:
         """Return the data for the page, which finds a number's findings by its place ("where")."""
         return {
             "reported": [
@@ -404,7 +380,7 @@ def _copy_picture(source: Path, target: Path, digest: str) -> None:
     shutil.copyfile(source, target)
 
 
-def page(title: str, data: PageData) -> str:
+def page(title: str, data: Facts) -> str:
     """Return the page; data and title remain text, whatever they hold."""
     # a picture beside a file:// page is not 'self' in every browser
     template = Path(__file__).resolve().parent / "page"
@@ -458,7 +434,7 @@ def write_model_pages(
             raise AwError(f"runs on scene {scene!r} of {dataset!r} used different photos: publish them apart")
         name = _page_name(dataset, scene, names)
         models = [replace(f.model, label=label) for label, f in shown]
-        text, _, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
+        text, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
         (out / MODELS).mkdir(exist_ok=True)
         (out / MODELS / name).write_text(text, encoding="utf-8")
         for label, _ in shown:

@@ -63,8 +63,6 @@ def unequal(frame: pd.DataFrame) -> list[str]:
     done = frame[frame["status"] == "ok"]
     lines = []
     for column, what in CONDITIONS.items():
-        if column not in done:
-            continue
         given = done[done[column].astype(str) != ""]  # a method without features is not another condition
         apart = [scene for scene, of in given.groupby("scene") if of[column].astype(str).nunique() > 1]
         if apart:
@@ -133,7 +131,7 @@ FITTED = {
 def _fitted(runs: Runs) -> list[str]:
     """Return what each method used of test photos; no lines if all runs were measured on whole photos."""
     ok = runs.runs[runs.runs["status"] == "ok"]
-    if "fit" not in ok or not len(ok) or set(ok["fit"]) == {"full"}:
+    if not len(ok) or set(ok["fit"]) == {"full"}:
         return []
     lines = []
     for kind, text in FITTED.items():
@@ -146,8 +144,6 @@ def _fitted(runs: Runs) -> list[str]:
 def _unfitted(runs: Runs) -> list[str]:
     """Return a line where colour effects were learnt and whole test photos are measured without any fit."""
     ok = runs.runs[runs.runs["status"] == "ok"]
-    if "fit" not in ok or "effects" not in ok:
-        return []
     concerned = ok[(ok["fit"] == "full") & ok["effects"].str.contains("appearance|exposure")]
     scenes = shortlist(sorted(set(concerned["scene"])))
     why = "renders have the mean look of the train photos; PSNR affine or --protocol half compares without"
@@ -231,12 +227,12 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
-    for _, group in ok.groupby(["method", "scene"]) if "options_hash" in ok else ():
+    for _, group in ok.groupby(["method", "scene"]):
         if group["options_hash"].nunique() > 1:
             method, scene = group["method"].iloc[0], group["scene"].iloc[0]
             lines.append(f"{UNEQUAL}: runs of {method} on {scene} have different options")
     for method, group in ok.groupby("method"):
-        if "source" in ok and group["source"].nunique() > 1:
+        if group["source"].nunique() > 1:
             lines.append(
                 f"{UNEQUAL}: results of {method!s} come from {group['source'].nunique()} versions of its "
                 "file (source in config.yaml differs); run them again with one"
@@ -256,7 +252,7 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
             f"{UNEQUAL}: results of different versions of ambiguous_wild: "
             + ", ".join(sorted(set(ok["version"])))
         )
-    elif "code_hash" in ok and ok["code_hash"].nunique() > 1:
+    elif ok["code_hash"].nunique() > 1:
         lines.append(f"{UNEQUAL}: results of {ok['code_hash'].nunique()} states of ambiguous_wild's code")
     seeds = ok.groupby("method")["seed"].nunique()
     if seeds.nunique() > 1:

@@ -38,7 +38,6 @@ class Page:
     path: Path
     bytes: int
     models_bytes: int  # text of the models, part of `bytes`
-    notes: tuple[str, ...]
 
 
 def check_page_folder(folder: Path) -> None:
@@ -64,8 +63,8 @@ def page_text(
     most_gaussians: int = MOST_GAUSSIANS,
     notes: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
-) -> tuple[str, int, tuple[str, ...]]:
-    """Return the page's text, the bytes of models in it, and its notes.
+) -> tuple[str, int]:
+    """Return the page's text, and the bytes of models in it.
 
     Args:
         scene: scene of all the models.
@@ -123,7 +122,7 @@ def page_text(
         "models": facts,
         "notes": page_notes,
     }
-    return _fill(title, data, "\n".join(elements)), sum(map(len, elements)), tuple(page_notes)
+    return _fill(title, data, "\n".join(elements)), sum(map(len, elements))
 
 
 def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: bytes, camera: Camera) -> str:

@@ -15,9 +15,10 @@ import torch
 
 from ambiguous_wild.core import UNMOVED, AwError, Scene, View
 from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness.callbacks import allowed_cores
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.chosen_effects import NOT_OURS
-from ambiguous_wild.harness.meter import Meter, cores, own_s
+from ambiguous_wild.harness.meter import Meter, own_s
 from ambiguous_wild.harness.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
@@ -86,7 +87,7 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
     The cost is empty where the program's training ended before this call, or where the calibration kernel
     cannot run: a program needs none of our packages.
     """
-    meter, begin, before = Meter(task.device, cores()), time.perf_counter(), own_s()
+    meter, begin, before = Meter(task.device, len(allowed_cores())), time.perf_counter(), own_s()
     try:
         meter.begin(0.0)
     except AwError:

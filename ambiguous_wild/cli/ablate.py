@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, training_options
+from ambiguous_wild.cli.options import PathName, choose_device, prepare_cpu, training_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.ablation import Group
 
@@ -84,7 +84,6 @@ def command(
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
 
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.cli.options import choose_device, prepare_cpu
     from ambiguous_wild.cli.progress import ProgressBar
     from ambiguous_wild.harness.ablation import earlier_groups, plan_study
     from ambiguous_wild.harness.cell import RunOptions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from collections import Counter
@@ -148,7 +149,6 @@ def publish_command(
 
     OUT then holds index.html, data/, images/ and, with --models, models/. An earlier page there is replaced.
     """
-    import dataclasses
 
     from ambiguous_wild.report.board_publish import publish
 
@@ -171,7 +171,6 @@ def check_command(board: Path, as_json: bool) -> None:
 
     A damaged board ends with exit code 2.
     """
-    import dataclasses
 
     from ambiguous_wild.report.board_edit import check
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, prepare_cpu
+from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.effects_plan import Decision, Plan
@@ -57,7 +58,6 @@ def command(
 
     'aw bench --effects auto' decides the same way. Masks are not its decision, but that of METHOD.
     """
-    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.cell import scene_identity
     from ambiguous_wild.harness.effects_plan import plan_effects
     from ambiguous_wild.io.files import check_output, write_json
@@ -70,8 +70,6 @@ def command(
     check_output(path)
     _check_overwrite(path, probe)
     if probe or costs:
-        from ambiguous_wild.cli.options import prepare_cpu
-
         prepare_cpu(None)
     plan = dataclasses.replace(plan_effects(loaded), scene_hash=scene_identity(loaded))
     if probe:
@@ -96,7 +94,6 @@ def command(
 
 def _check_overwrite(path: Path, probe: bool) -> None:
     """Refuse to replace any other file than a plan, or a plan with probes by one without."""
-    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.effects_plan import read_plan
 
     if not path.exists():

@@ -13,6 +13,7 @@ import click
 from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import Number, PathName, seed_option
+from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
     from ambiguous_wild.simulate.records import PhotoTruth, Spread
@@ -62,7 +63,6 @@ def simulate_command(
     NAME is a preset of --list. SPEC.yaml describes world, walk, distractors and effects (docs/simulation.md).
     Missing keys are as in the preset courtyard; if distractors is missing, there are none.
     """
-    from ambiguous_wild.core.errors import AwError, counted
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized
     from ambiguous_wild.simulate.spec_file import dump_spec, is_spec_file, plain_spec, read_spec
 
@@ -227,7 +227,6 @@ def composite_command(
     from tqdm import tqdm
 
     from ambiguous_wild.core.config import from_plain
-    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.io.files import check_output, folder_lock, sweep_siblings
     from ambiguous_wild.simulate.composite_photos import composite_photos, is_photo_folder
     from ambiguous_wild.simulate.composite_scene import composite

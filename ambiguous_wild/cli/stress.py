@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, device_option
+from ambiguous_wild.cli.options import PathName, choose_device, device_option, prepare_cpu
 from ambiguous_wild.core.errors import AwError
 
 
@@ -105,7 +105,6 @@ def command(
 
 
 def _devices(wanted: str) -> list[str]:
-    from ambiguous_wild.cli.options import choose_device, prepare_cpu
 
     usable = choose_device(wanted)  # its error names what is missing for a GPU
     devices = ["cuda"] if wanted == "cuda" else ["cpu"] if usable == "cpu" else ["cpu", "cuda"]
@@ -115,7 +114,6 @@ def _devices(wanted: str) -> list[str]:
 
 
 def _replay(run: Path) -> None:
-    from ambiguous_wild.cli.options import prepare_cpu
     from ambiguous_wild.harness.replay import replay
 
     prepare_cpu(None)

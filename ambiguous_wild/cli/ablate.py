@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, training_options
+from ambiguous_wild.cli.options import PathName, choose_device, prepare_cpu, training_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.ablation import Group
 
@@ -84,9 +84,9 @@ def command(
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
 
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.cli.options import choose_device, prepare_cpu
     from ambiguous_wild.cli.progress import ProgressBar
     from ambiguous_wild.harness.ablation import earlier_groups, plan_study
+    from ambiguous_wild.harness.cell import RunOptions
     from ambiguous_wild.harness.grid import run_cells
     from ambiguous_wild.io.files import check_output
     from ambiguous_wild.report.ablation import markdown_of, report, write_report
@@ -114,11 +114,10 @@ def command(
     absent = sum(1 for row in study.rows if row.missing)
     more = f", {absent} variants cannot run here" if absent else ""
     click.echo(f"{len(study.rows)} rows: {len(cells)} runs{more}", err=True)
-    progress = ProgressBar(len(cells))
-    reports = run_cells(
-        cells, output, overwrite=overwrite, cache_dir=cache, tick=progress.tick, pictures=pictures,  # type: ignore[arg-type]
-        on_start=progress.started, on_end=progress.ended,
-    )  # fmt: skip
+    progress = ProgressBar()
+    progress.planned(cells, one_by_one=True)
+    options = RunOptions(cache or output / ".cache", overwrite, pictures)  # type: ignore[arg-type]
+    reports = run_cells(cells, output, options, progress)
     words = ["aw", *sys.argv[1:], *(word for name in before for word in ("--group", name))]
     data = report(study, output, made_by=shlex.join(words))
     written = write_report(data, output)

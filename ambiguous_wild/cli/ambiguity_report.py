@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, seed_option
 
 
 @click.command("ambiguity-report")
@@ -46,7 +46,7 @@ from ambiguous_wild.cli.options import PathName
     help="Folder of masks of the static objects to compare with, <stem>.png, white = object.  "
     "[default: every static segment]",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the bootstrap.")
+@seed_option("Seed of the bootstrap.")
 @click.option("--record/--no-record", default=True, show_default=True, help="Save the scores in scene.json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def command(

@@ -5,17 +5,22 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli import options
-from ambiguous_wild.cli.options import PathName, engine_options, metric_file_option, say, training_options
-from ambiguous_wild.cli.progress import Progress, finish
+from ambiguous_wild.cli.options import (
+    Number,
+    PathName,
+    engine_options,
+    metric_file_option,
+    say,
+    training_options,
+)
+from ambiguous_wild.cli.progress import ProgressBar, finish
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.bench import bench
+from ambiguous_wild.harness.bench import Engine, bench
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.suite import PreparedSuite
@@ -127,7 +132,7 @@ def parse_budget(text: str) -> float:
 )
 @click.option(
     "--checkpoint-every",
-    type=options.Number(min=0.0, min_open=True),
+    type=Number(min=0.0, min_open=True),
     default=60.0,
     show_default=True,
     help="Seconds between checkpoints.",
@@ -165,7 +170,7 @@ def command(
     checkpoint_every: float,
     on_nonfinite: str,
     as_json: bool,
-    **given: Any,  # the other arguments of `bench`, by their names
+    **given: Any,  # the other arguments of `bench`, and the fields of `Engine`, by their names
 ) -> None:
     """Train METHODs on SCENEs and measure them on the test views.
 
@@ -191,8 +196,16 @@ def command(
     seconds = [parse_budget(budget) for budget in budgets]
     prepared = None
     if suite_name is not None:
-        prepared, methods, iterations = _suite(suite_name, root, scenes, output, methods, iterations, seconds)
-        scenes, protocol = tuple(prepared.scenes.values()), protocol or prepared.suite.protocol
+        from ambiguous_wild.datasets.suites import get_suite
+        from ambiguous_wild.report.suite import prepare_suite, suite_methods
+
+        if root is None or scenes:
+            raise AwError(f"--suite {suite_name} takes its scenes from --root DIR; leave --scene out")
+        suite = get_suite(suite_name)
+        prepared = prepare_suite(suite, root, output, say=say)
+        scenes, protocol = tuple(prepared.scenes.values()), protocol or suite.protocol
+        methods = methods or tuple(suite_methods(suite))
+        iterations = iterations if iterations is not None or seconds else suite.iterations
     elif root is not None:
         raise AwError("--root goes with --suite: name the suite whose scenes it holds")
     for flag, names in (("--method", methods), ("--scene", scenes)):
@@ -217,34 +230,14 @@ def command(
         parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
         train=train,  # type: ignore[arg-type]
         protocol=protocol,  # type: ignore[arg-type]
-        callbacks=Progress(),
+        engine=Engine(**{name: given.pop(name) for name in Engine.__dataclass_fields__}),
+        callbacks=ProgressBar(),
         **given,
     )
     if prepared is not None and not as_json:
         for folder in report.folders:
             _print_tables(prepared, folder)
     finish(report, as_json)
-
-
-def _suite(
-    name: str,
-    root: Path | None,
-    scenes: Sequence[Path],
-    output: Path,
-    methods: Sequence[str],
-    iterations: int | None,
-    budgets_s: Sequence[float],
-) -> tuple[PreparedSuite, tuple[str, ...], int | None]:
-    """Return the suite's scenes, and its methods and length unless others are given."""
-    from ambiguous_wild.datasets.suites import get_suite
-    from ambiguous_wild.report.suite import prepare_suite, suite_methods
-
-    if root is None or scenes:
-        raise AwError(f"--suite {name} takes its scenes from --root DIR; leave --scene out")
-    suite = get_suite(name)
-    prepared = prepare_suite(suite, root, output, say=say)
-    length = iterations if iterations is not None or budgets_s else suite.iterations
-    return prepared, tuple(methods or suite_methods(suite)), length
 
 
 def _print_tables(prepared: PreparedSuite, folder: Path) -> None:

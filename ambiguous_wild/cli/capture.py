@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import shlex
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ambiguous_wild.cli.options import Number, PathName, threads_option
+from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.checks import CaptureReport
@@ -43,11 +45,9 @@ def capture_command(
 ) -> None:
     """Take photos from SOURCE: a video (sharp, evenly spaced frames), a folder of photos, videos or folders
     (copies with EXIF), several of these (a folder each), or 'camera' ('camera:1' is the second one)."""
-    import os
 
     from ambiguous_wild.builder import capture_photos
     from ambiguous_wild.builder.progress import Bar
-    from ambiguous_wild.core.errors import AwError
 
     wanted = "give a video, a folder of photos, or 'camera'"
     if not all(source.strip() for source in sources):
@@ -102,7 +102,6 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 def screen_command(raw: tuple[Path, ...], strict: bool, threads: int | None, as_json: bool) -> None:
     """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
     near-duplicates, overlap, motion. Nothing is written."""
-    import os
 
     from ambiguous_wild.builder.checks import check_capture, refuse_failed
     from ambiguous_wild.builder.progress import Bar

@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import Number, PathName, only_option
+from ambiguous_wild.cli.options import Number, PathName, command_line, only_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ def command(
     if recommended is not None and budget is not None:
         _recommend(cost_runs, recommended, budget, as_json)
         return
-    made_by = command_line(runs, output, targets, scenes, with_setup)
+    made_by = command_line(plots=None, as_json=None)
     report = cost_report(cost_runs, targets=targets, setup=with_setup, made_by=made_by)
     check_output(output / "cost.json")
     written = write_report(report, output)
@@ -106,15 +105,3 @@ def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> 
         click.echo(json.dumps(encoded(facts), indent=2))
     else:
         click.echo(in_words(advice, str(scene)), nl=False)
-
-
-def command_line(
-    runs: tuple[Path, ...], output: Path, targets: tuple[float, ...], scenes: tuple[str, ...], setup: bool
-) -> str:
-    """Return the command that makes this report again."""
-    words = ["aw", "cost", *map(str, runs), "-o", str(output)]
-    for target in targets:
-        words += ["--target", f"{target:g}"]
-    for scene in scenes:
-        words += ["--scene", scene]
-    return shlex.join(words + (["--with-setup"] if setup else []))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, threads_option
+from ambiguous_wild.cli.options import PathName, seed_option, threads_option
 from ambiguous_wild.core.errors import AwError, shortlist
 
 if TYPE_CHECKING:
@@ -44,13 +43,7 @@ KINDS = (
     help="Leave out keep masks: those that the layout names, masks/ beside the photos, the photos' alpha.",
 )  # fmt: skip
 @threads_option
-@click.option(
-    "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Seed of matching and of random points.",
-)
+@seed_option("Seed of matching and of random points.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene imported from other files or settings.")
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 def import_command(
@@ -130,19 +123,12 @@ def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, a
         return
     if name is None:
         raise AwError("which dataset? 'aw fetch --list' lists them")
-    from tqdm import tqdm
-
+    from ambiguous_wild.cli.progress import ticking
     from ambiguous_wild.datasets.fetch import fetch
 
     data = find_public(name)
     click.echo(f"{data.name}: licence: {data.license} ({data.page})", err=True)
-    bar = tqdm(desc=name, unit="B", unit_scale=True, file=sys.stderr, disable=True if as_json else None)
-
-    def tick(done: int, total: int | None) -> None:
-        bar.total = total
-        bar.update(done - bar.n)
-
-    with bar:
+    with ticking(desc=name, unit="B", unit_scale=True, disable=True if as_json else None) as tick:
         done = fetch(data, output, unpack=unpack, tick=tick, say=lambda text: click.echo(text, err=True))
     if as_json:
         facts = {"archive": str(done.archive), "folder": str(done.folder) if done.folder else None}

@@ -26,6 +26,7 @@ import click
 
 from ambiguous_wild.core.errors import AwError, install_command, installed
 from ambiguous_wild.core.processes import python_command
+from ambiguous_wild.harness.callbacks import allowed_cores
 from ambiguous_wild.splat import readiness
 
 TIMEOUT_S = 60
@@ -138,11 +139,10 @@ def all_checks() -> list[Check]:
 
 
 def _machine() -> list[Check]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     python = _system_install("python3.11", "https://www.python.org/downloads")
     checks = [
         _core("python", sys.version_info >= (3, 11), platform.python_version(), python),
-        _core("cpu", True, f"{cores} cores usable of {os.cpu_count()}, {platform.machine()}"),
+        _core("cpu", True, f"{len(allowed_cores())} cores usable of {os.cpu_count()}, {platform.machine()}"),
     ]
     with contextlib.suppress(AttributeError, ValueError, OSError):  # a system that does not report it
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9

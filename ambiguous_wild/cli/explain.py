@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, say
+from ambiguous_wild.cli.options import PathName, prepare_cpu, say
+from ambiguous_wild.core.errors import AwError, unknown
 
 
 @click.command("explain")
@@ -22,8 +23,6 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     \b
     aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64
     """
-    from ambiguous_wild.cli.options import prepare_cpu
-    from ambiguous_wild.core.errors import AwError, unknown
     from ambiguous_wild.harness.replay import open_run
 
     prepare_cpu(None)

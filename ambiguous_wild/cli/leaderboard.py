@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from collections import Counter
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.board_edit import AddReport
@@ -74,25 +76,16 @@ def add_command(
     Changed, partial, failed and foreign runs are refused, one line each; unfinished runs are
     left for later. Adding a run twice changes nothing.
     """
-    from tqdm import tqdm
-
-    from ambiguous_wild.core import AwError
+    from ambiguous_wild.cli.progress import ticking
     from ambiguous_wild.report.board_edit import add
 
-    with tqdm(unit="run", disable=None, file=sys.stderr) as bar:
-
-        def tick(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with ticking(unit="run") as tick:
         reports = add(board, runs, dry=dry_run, tick=tick, **options)
     _print_reports(reports, as_json)
     counts = Counter(r.outcome for r in reports)
     outcomes = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
     dry_note = " (nothing written)" if dry_run else ""
-    click.echo(
-        f"{len(reports)} run{'' if len(reports) == 1 else 's'}: {outcomes}{dry_note}; board {board}", err=True
-    )
+    click.echo(f"{counted(len(reports), 'run')}: {outcomes}{dry_note}; board {board}", err=True)
     if counts["refused"]:
         sys.exit(AwError.exit_code)
 
@@ -124,7 +117,7 @@ def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
     gone = remove(board, dry=dry_run, **chosen)
     for entry in gone:
         click.echo(f"{'would remove' if dry_run else 'removed'}: {entry.name}")
-    click.echo(f"{len(gone)} run{'' if len(gone) == 1 else 's'}; board {board}", err=True)
+    click.echo(f"{counted(len(gone), 'run')}; board {board}", err=True)
 
 
 @command.command("publish")
@@ -156,7 +149,6 @@ def publish_command(
 
     OUT then holds index.html, data/, images/ and, with --models, models/. An earlier page there is replaced.
     """
-    import dataclasses
 
     from ambiguous_wild.report.board_publish import publish
 
@@ -179,9 +171,7 @@ def check_command(board: Path, as_json: bool) -> None:
 
     A damaged board ends with exit code 2.
     """
-    import dataclasses
 
-    from ambiguous_wild.core import AwError
     from ambiguous_wild.report.board_edit import check
 
     result = check(board)

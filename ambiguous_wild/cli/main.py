@@ -81,61 +81,63 @@ def with_new_names(args: Sequence[str]) -> list[str]:
     return renamed + words
 
 
-# command -> (module, one line of help); help is here so that `aw --help` imports no command.
-COMMANDS = {
-    "try": ("try_all", "Try it on your photos or video: scene, two methods, page and table in one go."),
-    "doctor": ("doctor", "Check this machine: missing dependencies and the commands that install them."),
-    "simulate": (
-        "simulate",
-        "Simulate a capture with exact truth: poses, distractor masks, clean photos.",
-    ),
-    "composite": (
-        "simulate",
-        "Add distractors with exact masks to a scene of real photos, or to plain photos.",
-    ),
-    "capture": ("capture", "Select sharp, evenly spaced photos from a video, a folder or a camera."),
-    "screen": ("capture", "Check a capture: exposure, white balance, focus, blur, overlap; with advice."),
-    "build-scene": (
-        "build_scene",
-        "Build a scene from a folder of photos: check, COLMAP, downsample, split.",
-    ),
-    "import": ("datasets", "Import a scene of a public dataset: On-the-go, RobustNeRF, COLMAP, ..."),
-    "fetch": ("datasets", "Download a public dataset, resumed and checked by its hash."),
-    "export-scene": ("datasets", "Write a scene for nerfstudio, NerfBaselines, COLMAP, or as On-the-go."),
-    "package": ("datasets", "Pack scenes for release: archives, checksums, Croissant, data card."),
-    "verify": ("datasets", "Check a package, its archives and their scenes."),
-    "ambiguity-report": ("ambiguity_report", "Measure how similar the distractors are to the scene."),
-    "plan": ("plan", "Recommend optional effects for a scene, with their cost."),
-    "bench": ("bench", "Train methods on scenes and evaluate them."),
-    "ablate": ("ablate", "Measure the gain and cost of each part of a method."),
-    "table": ("table", "Compare runs in tables: terminal, Markdown, CSV, LaTeX, HTML."),
-    "rescore": ("table", "Add metrics that were missing when runs ended, from their saved renders."),
-    "cost": ("cost", "Accuracy against training time: tables and plots."),
-    "audit": ("table", "Find errors in tables of results."),
-    "view": ("view", "Write a page to fly through models and compare them; or watch a training."),
-    "video": ("view", "Film models side by side along one camera path: mp4, GIF."),
-    "export": ("view", "Write models as compressed PLY, SPZ, SOG and glTF, with the loss in dB."),
-    "explain": ("explain", "Say why a pixel of a train photo is masked or kept."),
-    "leaderboard": ("leaderboard", "Check runs, collect them in CSV files and publish them as a page."),
-    "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
-    "stress": ("stress", "Numerical stress tests against float64; replay of a training that met a NaN."),
-    "weights": ("weights", "Pretrained networks: list, download, check."),
-    "methods": ("methods", "List the methods; with a name, show one in full."),
-}
-
-# Heading of `aw --help` -> its commands, in the order of the work.
+# Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
+# `aw --help` imports no command.
 SECTIONS = {
-    "In one go": ("try",),
-    "Photos": (
-        "simulate", "composite", "capture", "screen", "build-scene", "import", "fetch", "export-scene",
-        "ambiguity-report",
-    ),
-    "Train": ("plan", "bench", "ablate", "methods", "weights", "doctor"),
-    "Compare": ("table", "cost", "study"),
-    "Look": ("view", "video", "explain", "export"),
-    "Publish": ("leaderboard", "package"),
-    "For maintainers": ("stress", "rescore", "audit", "verify"),
-}  # fmt: skip
+    "In one go": {
+        "try": ("try_all", "Try it on your photos or video: scene, two methods, page and table in one go."),
+    },
+    "Photos": {
+        "simulate": (
+            "simulate",
+            "Simulate a capture with exact truth: poses, distractor masks, clean photos.",
+        ),
+        "composite": (
+            "simulate",
+            "Add distractors with exact masks to a scene of real photos, or to plain photos.",
+        ),
+        "capture": ("capture", "Select sharp, evenly spaced photos from a video, a folder or a camera."),
+        "screen": ("capture", "Check a capture: exposure, white balance, focus, blur, overlap; with advice."),
+        "build-scene": (
+            "build_scene",
+            "Build a scene from a folder of photos: check, COLMAP, downsample, split.",
+        ),
+        "import": ("datasets", "Import a scene of a public dataset: On-the-go, RobustNeRF, COLMAP, ..."),
+        "fetch": ("datasets", "Download a public dataset, resumed and checked by its hash."),
+        "export-scene": ("datasets", "Write a scene for nerfstudio, NerfBaselines, COLMAP, or as On-the-go."),
+        "ambiguity-report": ("ambiguity_report", "Measure how similar the distractors are to the scene."),
+    },
+    "Train": {
+        "plan": ("plan", "Recommend optional effects for a scene, with their cost."),
+        "bench": ("bench", "Train methods on scenes and evaluate them."),
+        "ablate": ("ablate", "Measure the gain and cost of each part of a method."),
+        "methods": ("methods", "List the methods; with a name, show one in full."),
+        "weights": ("weights", "Pretrained networks: list, download, check."),
+        "doctor": ("doctor", "Check this machine: missing dependencies and the commands that install them."),
+    },
+    "Compare": {
+        "table": ("table", "Compare runs in tables: terminal, Markdown, CSV, LaTeX, HTML."),
+        "cost": ("cost", "Accuracy against training time: tables and plots."),
+        "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
+    },
+    "Look": {
+        "view": ("view", "Write a page to fly through models and compare them; or watch a training."),
+        "video": ("view", "Film models side by side along one camera path: mp4, GIF."),
+        "explain": ("explain", "Say why a pixel of a train photo is masked or kept."),
+        "export": ("view", "Write models as compressed PLY, SPZ, SOG and glTF, with the loss in dB."),
+    },
+    "Publish": {
+        "leaderboard": ("leaderboard", "Check runs, collect them in CSV files and publish them as a page."),
+        "package": ("datasets", "Pack scenes for release: archives, checksums, Croissant, data card."),
+    },
+    "For maintainers": {
+        "stress": ("stress", "Numerical stress tests against float64; replay of a training that met a NaN."),
+        "rescore": ("table", "Add metrics that were missing when runs ended, from their saved renders."),
+        "audit": ("table", "Find errors in tables of results."),
+        "verify": ("datasets", "Check a package, its archives and their scenes."),
+    },
+}
+COMMANDS = {name: about for commands in SECTIONS.values() for name, about in commands.items()}
 
 
 class _LazyGroup(click.Group):
@@ -166,9 +168,9 @@ class _LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        for heading, names in SECTIONS.items():
+        for heading, commands in SECTIONS.items():
             with formatter.section(heading):
-                formatter.write_dl([(name, COMMANDS[name][1]) for name in names])
+                formatter.write_dl([(name, text) for name, (_, text) in commands.items()])
 
 
 @click.command(

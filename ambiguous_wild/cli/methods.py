@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -23,16 +22,14 @@ WIDTH = 100
 @click.option("--table", is_flag=True, help="Table of the parts of each method: masks, density, ...")
 @plugin_option
 @click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.")
-def command(names: tuple[str, ...], table: bool, plugins: tuple[Path, ...], as_json: bool) -> None:
+def command(names: tuple[str, ...], table: bool, as_json: bool) -> None:
     """List the methods: name, summary, paper, extra requirements.
 
     With NAME: differences from the published code and why, features in the publication and here, options with
     their defaults, and ablations.
     """
-    from ambiguous_wild.methods.registry import all_methods, get_method, load_plugin
+    from ambiguous_wild.methods.registry import all_methods, get_method
 
-    for plugin in plugins:
-        load_plugin(plugin)
     entries = [get_method(name) for name in names] or [entry for _, entry in sorted(all_methods().items())]
     if table:
         _table(entries, as_json)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,6 @@ from typing import Any
 import click
 
 from ambiguous_wild.core.names import plain
-from ambiguous_wild.harness.callbacks import Engine
 
 
 class PathName(click.Path):
@@ -35,13 +36,20 @@ class Number(click.FloatRange):
         return number
 
 
-plugin_option = click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    type=PathName(),
+def _load_plugins(_: click.Context, __: click.Parameter, paths: tuple[Path, ...]) -> None:
+    """Register the methods of the files, before the command runs."""
+    if paths:
+        from ambiguous_wild.methods.registry import load_plugin
+
+        for path in paths:
+            load_plugin(path)
+
+
+_plugins = functools.partial(
+    click.option, "--plugin", "plugins", multiple=True, type=PathName(),
     help="A Python file that registers your methods; repeatable.",
-)
+)  # fmt: skip
+plugin_option = _plugins(callback=_load_plugins, expose_value=False)
 metric_file_option = click.option("--metric-file", "metrics", multiple=True, type=PathName(),
     help="A Python file with a metric of your own (docs/metrics.md); repeatable.")  # fmt: skip
 scene_folder_option = click.option(
@@ -61,7 +69,30 @@ only_option = click.option(
     help="Only the scene of this name; repeatable.  [default: all]",
 )
 
-_TRAINING = (
+
+def device_option(help: str) -> Callable[..., Any]:
+    """Return the option --device."""
+    choices = click.Choice(["auto", "cpu", "cuda"])
+    return click.option("--device", type=choices, default="auto", show_default=True, help=help)
+
+
+def seed_option(help: str) -> Callable[..., Any]:
+    """Return the option --seed for one seed."""
+    return click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=help)
+
+
+def _all(*options: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a decorator that adds these options to a click command."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+training_options = _all(
     click.option(
         "--seed",
         "seeds",
@@ -72,13 +103,7 @@ _TRAINING = (
         help="Random seed; repeatable.",
     ),
     click.option("--iterations", type=click.IntRange(1), help="Training iterations.  [default: 30000]"),
-    click.option(
-        "--device",
-        type=click.Choice(["auto", "cpu", "cuda"]),
-        default="auto",
-        show_default=True,
-        help="auto: the GPU if torch and gsplat can use one, else the CPU.",
-    ),
+    device_option("auto: the GPU if torch and gsplat can use one, else the CPU."),
     threads_option,
     click.option(
         "--factor",
@@ -90,7 +115,7 @@ _TRAINING = (
         type=click.IntRange(4),
         help="Growth stops at this number of Gaussians.  [default: the method's]",
     ),
-    plugin_option,
+    _plugins(),  # a run in another process needs the files too
     click.option(
         "--overwrite",
         type=click.Choice(["never", "missing", "changed", "always"]),
@@ -109,15 +134,7 @@ _TRAINING = (
 )
 
 
-def training_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add these options to a click command: seeds, iterations, device, threads, factor, max_gaussians,
-    plugins, overwrite, cache."""
-    for option in reversed(_TRAINING):
-        command = option(command)
-    return command
-
-
-_ENGINE = (
+engine_options = _all(  # the fields of `Engine`
     click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True,
                  help="local: this machine; ray: Ray, also on a cluster (docs/cluster.md)."),
     click.option("--jobs", type=click.IntRange(1),
@@ -137,22 +154,6 @@ _ENGINE = (
     click.option("--transfer-limit", type=Number(min=0, min_open=True), default=4000.0,
                  show_default=True, metavar="MB", help="Ray: largest scene or run that is sent through Ray."),
 )  # fmt: skip
-
-
-def engine_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the engine's options to a click command, which gets them as one argument `engine`, an `Engine`."""
-
-    def with_engine(**values: Any) -> Any:
-        names = [f for f in Engine.__dataclass_fields__ if f in values]
-        return command(engine=Engine(**{name: values.pop(name) for name in names}), **values)
-
-    with_engine.__doc__, with_engine.__name__ = command.__doc__, command.__name__
-    # Keep the options that decorators below this one have added.
-    with_engine.__dict__.update(command.__dict__)
-    wrapped: Callable[..., Any] = with_engine
-    for option in reversed(_ENGINE):
-        wrapped = option(wrapped)
-    return wrapped
 
 
 def choose_device(device: str) -> str:
@@ -180,3 +181,21 @@ def prepare_cpu(threads: int | None) -> None:
 def say(text: str) -> None:
     """Write a line on stderr, so that stdout stays clean for results; names of runs cannot break it."""
     click.echo(plain(text), err=True)
+
+
+def command_line(**values: Any) -> str:
+    """Return the present command, as it makes the same result again: with all options that are not at their default.
+
+    Args:
+        values: values to write in place of those that were given; None, False or () leaves an option out.
+    """
+    context = click.get_current_context()
+    words = ["aw", str(context.info_name)]
+    for param in context.command.params:
+        value = (context.params | values).get(str(param.name))
+        if value is None or value is False or value in ((), param.default):
+            continue
+        for one in value if isinstance(value, tuple) else [value]:
+            words += param.opts[:1] if isinstance(param, click.Option) else []
+            words += [] if one is True else [f"{one:g}" if isinstance(one, float) else str(one)]
+    return shlex.join(words)

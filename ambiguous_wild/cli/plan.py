@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, prepare_cpu
+from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
-    from ambiguous_wild.core import Scene
     from ambiguous_wild.harness.effects_plan import Decision, Plan
 
 COLUMNS = 100  # of the table
@@ -58,7 +58,6 @@ def command(
 
     'aw bench --effects auto' decides the same way. Masks are not its decision, but that of METHOD.
     """
-    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.cell import scene_identity
     from ambiguous_wild.harness.effects_plan import plan_effects
     from ambiguous_wild.io.files import check_output, write_json
@@ -71,12 +70,15 @@ def command(
     check_output(path)
     _check_overwrite(path, probe)
     if probe or costs:
-        from ambiguous_wild.cli.options import prepare_cpu
-
         prepare_cpu(None)
     plan = dataclasses.replace(plan_effects(loaded), scene_hash=scene_identity(loaded))
     if probe:
-        plan = _with_masks(plan, loaded, as_json)
+        from tqdm import tqdm
+
+        from ambiguous_wild.harness.mask_plan import with_masks
+
+        bar = functools.partial(tqdm, unit="it", desc="masks", disable=as_json or None)
+        plan = with_masks(plan, loaded, bar)
     if costs:
         from ambiguous_wild.harness.mask_plan import effect_costs
 
@@ -90,17 +92,8 @@ def command(
     click.echo(f"wrote {path}")
 
 
-def _with_masks(plan: Plan, scene: Scene, quiet: bool) -> Plan:
-    from tqdm import tqdm
-
-    from ambiguous_wild.harness.mask_plan import with_masks
-
-    return with_masks(plan, scene, functools.partial(tqdm, unit="it", desc="masks", disable=quiet or None))
-
-
 def _check_overwrite(path: Path, probe: bool) -> None:
     """Refuse to replace any other file than a plan, or a plan with probes by one without."""
-    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.harness.effects_plan import read_plan
 
     if not path.exists():

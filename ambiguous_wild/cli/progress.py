@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import click
 
 from ambiguous_wild.cli.options import say
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.callbacks import Callbacks, Lines, outcome_line, run_name
+from ambiguous_wild.harness.callbacks import Lines, outcome_line, run_name
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.bench import BenchReport
@@ -25,14 +26,16 @@ if TYPE_CHECKING:
 VERBOSE = "verbose"  # name of the handler of --verbose, which prints what bars do not
 
 
-class ProgressBar(Callbacks):
+class ProgressBar(Lines):
     """A bar for each run, if runs are made one by one; it also names work between the steps.
 
-    Warnings stay above the bar; where standard error is no terminal the names of work are lines as well.
+    Warnings stay above the bar; where standard error is no terminal the names of work are lines as well. Several
+    runs at a time have lines alone, because their bars would mix.
     """
 
-    def __init__(self, cells: int) -> None:
-        self.cells, self.index = cells, 0
+    def __init__(self) -> None:
+        super().__init__(say)
+        self.one_by_one = False
         self.bar: Any = None
         self.phases = logging.Handler(logging.INFO)
         self.phases.emit = self._phase  # type: ignore[method-assign]
@@ -40,13 +43,16 @@ class ProgressBar(Callbacks):
         if context is not None:  # none after Ctrl-C or an error
             context.call_on_close(self._close)
 
-    def say(self, text: str) -> None:
-        say(text)
+    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
+        super().planned(cells, one_by_one)
+        self.one_by_one = one_by_one
 
     def started(self, cell: Cell, folder: Path) -> None:
-        self.index += 1
+        if not self.one_by_one:
+            super().started(cell, folder)
+            return
         group = f", {cell.group}" if cell.group else ""
-        say(f"[{self.index}/{self.cells}] {run_name(cell)}{group} -> {folder}")
+        say(f"[{self.done + 1}/{self.total}] {run_name(cell)}{group} -> {folder}")
         from tqdm import tqdm
 
         self._close()
@@ -85,33 +91,34 @@ class ProgressBar(Callbacks):
         self.bar.update(done - self.bar.n)
 
     def ended(self, cell: Cell, report: CellReport) -> None:
+        if not self.one_by_one:
+            super().ended(cell, report)
+            return
         self._close()
-        if report.outcome != "failed" or self.cells > 1:  # a single failure is the command's one error line
+        self.done += 1
+        if report.outcome != "failed" or self.total > 1:  # a single failure is the command's one error line
             say(f"    {outcome_line(report)}")
 
 
-class Progress(Callbacks):
-    """Bars for runs made one by one; lines for several at a time, because their bars would mix."""
+@contextlib.contextmanager
+def ticking(**settings: Any) -> Iterator[Callable[[int, int | None], None]]:
+    """Yield a function that moves a bar in the terminal to (done, total); the bar appears with its first call."""
+    from tqdm import tqdm
 
-    def __init__(self) -> None:
-        self.shown: Callbacks = Lines(say)
+    bar: Any = None
 
-    def say(self, text: str) -> None:
-        say(text)
+    def tick(done: int, total: int | None) -> None:
+        nonlocal bar
+        if bar is None:
+            bar = tqdm(**{"disable": None, "file": sys.stderr, **settings})
+        bar.total = total
+        bar.update(done - bar.n)
 
-    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
-        if one_by_one:
-            self.shown = ProgressBar(len(cells))
-        self.shown.planned(cells, one_by_one)
-
-    def started(self, cell: Cell, folder: Path) -> None:
-        self.shown.started(cell, folder)
-
-    def tick(self, trainer: Trainer) -> None:
-        self.shown.tick(trainer)
-
-    def ended(self, cell: Cell, report: CellReport) -> None:
-        self.shown.ended(cell, report)
+    try:
+        yield tick
+    finally:
+        if bar is not None:
+            bar.close()
 
 
 def finish(report: BenchReport, as_json: bool) -> None:

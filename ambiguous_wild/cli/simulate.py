@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shlex
 from collections.abc import Iterable
@@ -11,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from ambiguous_wild.cli.options import Number, PathName
+from ambiguous_wild.cli.options import Number, PathName, seed_option
+from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
-    from ambiguous_wild.report.twin import Twin
-    from ambiguous_wild.simulate.records import PhotoTruth
+    from ambiguous_wild.simulate.records import PhotoTruth, Spread
     from ambiguous_wild.simulate.spec import CaptureSpec
 
 
@@ -28,9 +29,7 @@ if TYPE_CHECKING:
     help="Simulate a capture that calls for the same effects as this scene, instead of NAME.",
 )
 @click.option("-o", "--output", type=PathName(file_okay=False), help="Folder to write.")
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of world, walk, distractors."
-)
+@seed_option("Seed of world, walk, distractors.")
 @click.option("--views", type=int, help="Number of train photos; test photos in proportion.")
 @click.option("--width", type=int, help="Width of a photo in px; keeps the aspect ratio.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
@@ -64,7 +63,6 @@ def simulate_command(
     NAME is a preset of --list. SPEC.yaml describes world, walk, distractors and effects (docs/simulation.md).
     Missing keys are as in the preset courtyard; if distractors is missing, there are none.
     """
-    from ambiguous_wild.core.errors import AwError, counted
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized
     from ambiguous_wild.simulate.spec_file import dump_spec, is_spec_file, plain_spec, read_spec
 
@@ -76,7 +74,10 @@ def simulate_command(
         raise AwError(f"{given} ('aw simulate --list' describes them)")
     twin = None
     if like is not None:
-        twin = _twin(like, width, seed, views)
+        from ambiguous_wild.io.scene_folder import load_scene
+        from ambiguous_wild.report.twin import measure_likeness, spec_like
+
+        twin = spec_like(measure_likeness(load_scene(like)), width, seed, views)
         spec, called = twin.spec, f"--like {shlex.quote(str(like))}"
     else:
         called = str(name)
@@ -100,9 +101,7 @@ def simulate_command(
     from ambiguous_wild.io.files import check_output, folder_lock, sweep_siblings
     from ambiguous_wild.simulate.capture import simulate
 
-    def bar(shots: list) -> tqdm:
-        return tqdm(shots, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
-
+    bar = functools.partial(tqdm, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
     check_output(output)
     with folder_lock(output, f"aw simulate {called}"):
         sweep_siblings(output)  # left by a killed call
@@ -127,14 +126,10 @@ def simulate_command(
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
         return
-    share = facts["occlusion"]
     state = "already there, unchanged" if facts["reused"] else "wrote"
     things = counted(len(spec.distractors), "distractor")
     cover = "covers" if len(spec.distractors) == 1 else "cover"
-    covered = (
-        f"{things} {cover} {100 * share['min']:.0f} to {100 * share['max']:.0f} % "
-        f"(mean {100 * share['mean']:.1f} %) of a train photo"
-    )
+    covered = f"{things} {cover} {_range(facts['occlusion'])} of a train photo"
     click.echo(
         f"{state}: {output}: {spec.train_views} train and {spec.test_views} test photos of "
         f"{spec.width}x{spec.height}; {covered if spec.distractors else 'no distractors'}"
@@ -149,12 +144,8 @@ def simulate_command(
     click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
 
 
-def _twin(scene: Path, width: int | None, seed: int, views: int | None) -> Twin:
-    """Measure a scene and return the spec of a capture like it."""
-    from ambiguous_wild.io.scene_folder import load_scene
-    from ambiguous_wild.report.twin import measure_likeness, spec_like
-
-    return spec_like(measure_likeness(load_scene(scene)), width, seed, views)
+def _range(share: Spread) -> str:
+    return f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %)"
 
 
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:
@@ -236,7 +227,6 @@ def composite_command(
     from tqdm import tqdm
 
     from ambiguous_wild.core.config import from_plain
-    from ambiguous_wild.core.errors import AwError
     from ambiguous_wild.io.files import check_output, folder_lock, sweep_siblings
     from ambiguous_wild.simulate.composite_photos import composite_photos, is_photo_folder
     from ambiguous_wild.simulate.composite_scene import composite
@@ -251,9 +241,7 @@ def composite_command(
             "or give a scene from 'aw build-scene'"
         )
 
-    def bar(items):
-        return tqdm(items, unit="photo", desc="composite", disable=as_json or None)
-
+    bar = functools.partial(tqdm, unit="photo", desc="composite", disable=as_json or None)
     check_output(output)
     with folder_lock(output, "aw composite"):
         sweep_siblings(output)  # left by a killed call
@@ -262,10 +250,7 @@ def composite_command(
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k != "photos"}, indent=2))
         return
-    share, train = facts["occlusion"], facts["photos"]
-    shares = (
-        f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %) of each"
-    )
+    train, shares = facts["photos"], f"{_range(facts['occlusion'])} of each"
     place = shlex.quote(str(output))
     if plain:
         changed = sum(bool(photo["distractors"]) for photo in train.values())

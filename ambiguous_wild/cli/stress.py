@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, choose_device, device_option, prepare_cpu
 from ambiguous_wild.core.errors import AwError
 
 
@@ -24,13 +24,7 @@ from ambiguous_wild.core.errors import AwError
     help="Instead of the cases: check this method, such as FILE.py:RECIPE, in a short training; repeatable.",
 )
 @click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="auto: the CPU, and the GPU if there is one.",
-)
+@device_option("auto: the CPU, and the GPU if there is one.")
 @click.option(
     "--format",
     "style",
@@ -111,7 +105,6 @@ def command(
 
 
 def _devices(wanted: str) -> list[str]:
-    from ambiguous_wild.cli.options import choose_device, prepare_cpu
 
     usable = choose_device(wanted)  # its error names what is missing for a GPU
     devices = ["cuda"] if wanted == "cuda" else ["cpu"] if usable == "cpu" else ["cpu", "cuda"]
@@ -121,7 +114,6 @@ def _devices(wanted: str) -> list[str]:
 
 
 def _replay(run: Path) -> None:
-    from ambiguous_wild.cli.options import prepare_cpu
     from ambiguous_wild.harness.replay import replay
 
     prepare_cpu(None)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, only_option
+from ambiguous_wild.cli.options import PathName, only_option, seed_option
 
 
 @click.group("study")
@@ -73,9 +73,7 @@ def command() -> None:
     help="JPEG quality of the images.",
 )
 @click.option("--title", default="Picture study", show_default=True, help="Title of the page.")
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the choice of questions."
-)
+@seed_option("Seed of the choice of questions.")
 @click.option(
     "--overwrite",
     is_flag=True,
@@ -158,9 +156,7 @@ def make_command(
     type=PathName(file_okay=False),
     help="Folder for scores.md, .csv and .json.  [default: KEY-scores]",
 )
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the bootstrap over raters."
-)
+@seed_option("Seed of the bootstrap over raters.")
 @click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
 def score_command(
     answers: tuple[Path, ...], key: Path, output: Path | None, seed: int, as_json: bool

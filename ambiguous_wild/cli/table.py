@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shlex
 import shutil
 import sys
 from collections import Counter
@@ -14,8 +13,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName, metric_file_option, only_option, scene_folder_option
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.cli.options import (
+    PathName,
+    command_line,
+    metric_file_option,
+    only_option,
+    scene_folder_option,
+)
+from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.store import Runs
@@ -109,27 +114,28 @@ def table_command(
                 raise AwError(
                     f"{flag} does not go with --layout {layout}: give --layout paper, means or memory"
                 )
-    from ambiguous_wild.io.files import write_text
-
     loaded = None if layout == "ablation" else _read(runs)
     if sheet is not None and loaded is not None:
         from ambiguous_wild.harness.sheets import write_sheet
 
         shown = write_sheet(loaded, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
-    made_by = "command: " + command_line(
-        runs, style, metrics, scenes, layout, datasets, reported, reported_from
-    )
+    named_style = None if style == "text" else style
+    made_by = "command: " + command_line(style=named_style, output=None, everything=None, sheet=None)
+    tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported, reported_from)
+    blocks = layout == "blocks" and style != "html"
+    width = _width(everything or (blocks and bool(metrics)), output) if style == "text" else None
     color = style == "text" and output is None and sys.stdout.isatty()
-    width = _width(everything, output)
-    if loaded is not None and layout == "blocks" and style != "html":
-        text, summary = _blocks(loaded, style, metrics, scenes, made_by, color, width)
-    else:
-        tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported, reported_from)
-        text, summary = _laid_out(tables, style, made_by, color, width)
+    _put(*_formatted(tables, style, blocks, made_by, color, width), output)
+
+
+def _put(text: str, summary: str, output: Path | None) -> None:
+    """Print the text, or write it to a file and say what it holds."""
     if output is None:
         click.echo(text, nl=False)
         return
+    from ambiguous_wild.io.files import write_text
+
     write_text(output, text)
     click.echo(f"wrote {output}: {summary}", err=True)
 
@@ -160,7 +166,6 @@ def _width(everything: bool, output: Path | None) -> int | None:
 
 
 def _write_tidy(loaded: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
-    from ambiguous_wild.io.files import write_text
     from ambiguous_wild.report.comparison import tidy
     from ambiguous_wild.report.plain_formats import to_csv
 
@@ -168,36 +173,32 @@ def _write_tidy(loaded: Runs, output: Path | None, metrics: Sequence[str], scene
     text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
     for run in loaded.incomplete:
         click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
-    if output is None:
-        click.echo(text, nl=False)
-        return
-    write_text(output, text)
-    click.echo(f"wrote {output}: {len(frame)} rows", err=True)
+    _put(text, f"{len(frame)} rows", output)
 
 
-def _blocks(
-    loaded: Runs,
-    style: str,
-    metrics: Sequence[str],
-    scenes: Sequence[str],
-    made_by: str,
-    color: bool,
-    width: int | None,
+def _formatted(
+    tables: list[Table], style: str, blocks: bool, made_by: str, color: bool, width: int | None
 ) -> tuple[str, str]:
-    from ambiguous_wild.report.papers import cost_at_the_end, in_blocks
-    from ambiguous_wild.report.plain_formats import fitted, to_wide_csv
+    """Return the tables as text, and what they hold in words; `blocks`: all have the same columns."""
+    from ambiguous_wild.report.papers import cost_at_the_end
+    from ambiguous_wild.report.plain_formats import divided, fitted, to_long_csv, to_wide_csv
 
-    tables = in_blocks(loaded, metrics=metrics, scenes=scenes)
-    if style == "text" and not metrics and width is not None:
-        tables = fitted(tables, width)
-    scene_count = sum(bool(table.columns[0].scene) for table in tables)
-    counts = {"method": len(tables[0].rows), "scene": scene_count, "column": len(tables[0].columns)}
-    summary = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for what, n in counts.items())
+    summary = counted(len(tables), "table")
+    if blocks:
+        tables = tables if width is None else fitted(tables, width)
+        scenes = sum(bool(table.columns[0].scene) for table in tables)
+        counts = {"method": len(tables[0].rows), "scene": scenes, "column": len(tables[0].columns)}
+        summary = ", ".join(counted(n, what) for what, n in counts.items())
     if style == "csv":
         _echo_notes(tables, made_by)
-        return to_wide_csv(tables), summary
-    tables = [cost_at_the_end(tables)] if style == "latex" else tables
-    return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color), summary
+        return to_wide_csv(tables) if blocks else to_long_csv(tables), summary
+    if blocks:
+        tables = [cost_at_the_end(tables)] if style == "latex" else tables
+        return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color), summary
+    tables = [one.with_notes(made_by) for one in tables]
+    if width is not None:
+        tables = [part for one in tables for part in divided(one, width)]
+    return _written(tables, style, color), summary
 
 
 def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
@@ -247,21 +248,6 @@ def _layouts(
     return [with_reported(one, numbers) for one in tables] if numbers else tables
 
 
-def _laid_out(
-    tables: list[Table], style: str, made_by: str, color: bool, width: int | None
-) -> tuple[str, str]:
-    from ambiguous_wild.report.plain_formats import divided, to_long_csv
-
-    summary = f"{len(tables)} table{'' if len(tables) == 1 else 's'}"
-    if style == "csv":
-        _echo_notes(tables, made_by)
-        return to_long_csv(tables), summary
-    tables = [one.with_notes(made_by) for one in tables]
-    if style == "text" and width is not None:
-        tables = [part for one in tables for part in divided(one, width)]
-    return _written(tables, style, color), summary
-
-
 def _named(datasets: Sequence[str]) -> dict[str, list[str]]:
     named: dict[str, list[str]] = {}
     for text in datasets:
@@ -271,28 +257,6 @@ def _named(datasets: Sequence[str]) -> dict[str, list[str]]:
             raise AwError(f"--dataset {text!r}: write NAME=SCENE,SCENE")
         named.setdefault(name.strip(), []).extend(scenes)
     return named
-
-
-def command_line(
-    runs: Sequence[Path],
-    style: str,
-    metrics: Sequence[str],
-    scenes: Sequence[str],
-    layout: str = "blocks",
-    datasets: Sequence[str] = (),
-    reported: bool = False,
-    reported_from: Path | None = None,
-) -> str:
-    """Return the command that makes this table again."""
-    words = ["aw", "table", *map(str, runs)]
-    words += ["--format", style] if style != "text" else []
-    words += ["--layout", layout] if layout != "blocks" else []
-    for flag, values in (("--metric", metrics), ("--only", scenes), ("--dataset", datasets)):
-        for value in values:
-            words += [flag, value]
-    words += ["--reported"] if reported else []
-    words += ["--reported-from", str(reported_from)] if reported_from else []
-    return shlex.join(words)
 
 
 @click.command(name="rescore")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, say, threads_option
+from ambiguous_wild.cli.options import PathName, prepare_cpu, say, threads_option
 from ambiguous_wild.core.errors import AwError, counted
 
 METHODS = ("3dgs", "refinesplat")
@@ -109,7 +109,6 @@ def _minutes(seconds: float) -> str:
 
 def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
     """Print and return how many iterations each method can train in this time on this machine."""
-    from ambiguous_wild.cli.options import prepare_cpu
     from ambiguous_wild.harness.timing import expected_s, slowness
     from ambiguous_wild.io.scene_folder import load_scene
 

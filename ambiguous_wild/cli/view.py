@@ -5,14 +5,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli import options as shared
-from ambiguous_wild.cli.options import PathName, plugin_option, say, scene_folder_option, threads_option
+from ambiguous_wild.cli.options import (
+    Number,
+    PathName,
+    device_option,
+    plugin_option,
+    say,
+    scene_folder_option,
+    seed_option,
+    threads_option,
+)
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
 
@@ -54,15 +61,9 @@ _one_scene = click.option(
     type=click.IntRange(4),
     help="With --live: largest number of Gaussians.  [default: the method's]",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="With --live: seed.")
+@seed_option("With --live: seed.")
 @click.option("--threads", type=click.IntRange(1), help="With --live: CPU threads.")
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="With --live: auto is the GPU if torch and gsplat can use one, else the CPU.",
-)
+@device_option("With --live: auto is the GPU if torch and gsplat can use one, else the CPU.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="With --live: address to listen on.")
 @click.option(
     "--port",
@@ -80,7 +81,6 @@ def view_command(
     scene: str | None,
     scene_folder: Path | None,
     most_gaussians: int,
-    plugins: tuple[Path, ...],
     title: str | None,
     live: Path | None,
     method: str,
@@ -97,10 +97,7 @@ def view_command(
     aw view stranger.ply --scene scene         without --scene: seen from a circle around it
     aw view --live scene --method 3dgs         watch a training at http://127.0.0.1:8080
     """
-    from ambiguous_wild.methods.registry import load_plugin
 
-    for plugin in plugins:
-        load_plugin(plugin)
     chosen = ctx.get_parameter_source("output")
     if live is not None:
         if runs:
@@ -141,60 +138,34 @@ def view_command(
     "--path", "path", default="test", show_default=True, metavar="test|orbit|FILE",
     help="Along the test cameras, around the scene, or FILE saved by 'aw view', nerfstudio or a 3DGS viewer.",
 )  # fmt: skip
-@click.option("--seconds", type=shared.Number(0.1, 600), default=8.0, show_default=True)
-@click.option("--fps", type=shared.Number(1, 120), default=24.0, show_default=True, help="Frames per second.")
+@click.option("--seconds", type=Number(0.1, 600), default=8.0, show_default=True)
+@click.option("--fps", type=Number(1, 120), default=24.0, show_default=True, help="Frames per second.")
 @click.option(
     "--width", type=click.IntRange(16, 4096), help="Width of each render, px.  [default: as the photos]"
 )
 @click.option("--columns", type=click.IntRange(1), help="Renders in a row.  [default: up to three]")
 @click.option("--gif", type=PathName(dir_okay=False), help="Also write this GIF of the whole path.")
-@click.option("--gif-seconds", type=shared.Number(0.5, 30), default=4.0, show_default=True)
+@click.option("--gif-seconds", type=Number(0.5, 30), default=4.0, show_default=True)
 @click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
 @_one_scene
 @scene_folder_option
 @plugin_option
 @threads_option
-def video_command(
-    runs: tuple[Path, ...], output: Path, path: str, plugins: tuple[Path, ...], **options: Any
-) -> None:
+def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: Any) -> None:
     """Film the models of RUNS (run folders, folders of them, or splat files) side by side along one camera path.
 
     \b
     aw video runs -o video.mp4
     aw video runs --path orbit --seconds 12 --fps 30 --gif video.gif
     """
-    from ambiguous_wild.methods.registry import load_plugin
+    from ambiguous_wild.cli.progress import ticking
     from ambiguous_wild.report.model_views import video_runs
 
-    for plugin in plugins:
-        load_plugin(plugin)
-
-    with _Bar() as bar:
-        done = video_runs(runs, output, path=path, **options, say=say, tick=bar.tick)
+    with ticking(unit="frame") as tick:
+        done = video_runs(runs, output, path=path, **options, say=say, tick=tick)
     say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
     if done.gif is not None:
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
-
-
-class _Bar:
-    """A bar over the frames, shown in a terminal only."""
-
-    def __init__(self) -> None:
-        self.bar: Any = None
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def tick(self, done: int, total: int) -> None:
-        from tqdm import tqdm
-
-        if self.bar is None:
-            self.bar = tqdm(total=total, unit="frame", disable=not sys.stderr.isatty(), file=sys.stderr)
-        self.bar.update(done - self.bar.n)
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
 
 
 FORMATS = ("compressed-ply", "spz", "sog", "gltf")
@@ -228,7 +199,6 @@ def export_command(
     runs: tuple[Path, ...],
     formats: tuple[str, ...],
     output: Path | None,
-    plugins: tuple[Path, ...],
     as_json: bool,
     **options: Any,  # the other arguments of `export_runs`, by their names
 ) -> None:
@@ -244,20 +214,13 @@ def export_command(
     aw export runs --up z --format ply
     aw export stranger.spz --format ply
     """
-    from ambiguous_wild.methods.registry import load_plugin
+    from ambiguous_wild.harness.result_file import encoded
     from ambiguous_wild.report.model_views import export_runs
-
-    for plugin in plugins:
-        load_plugin(plugin)
 
     reports = export_runs(runs, formats, output, say=say, **options)
     if as_json:
-        rows = [
-            {k: _plain(v) for k, v in {"label": label, **dataclasses.asdict(e)}.items()}
-            for label, files in reports
-            for e in files
-        ]
-        click.echo(json.dumps(rows, indent=2, ensure_ascii=False))
+        rows = [{"label": label, **dataclasses.asdict(e)} for label, files in reports for e in files]
+        click.echo(json.dumps(encoded(rows), indent=2, ensure_ascii=False, default=str))
         return
     for label, files in reports:
         click.echo(f"{plain(label)}: {files[0].gaussians:,} Gaussians")
@@ -277,12 +240,6 @@ def _place(e: Exported) -> str:
         else f"turn by the quaternion ({', '.join(f'{v:.6g}' for v in (w, *(-v for v in axis)))}), "
     )
     return f"{smaller}{back}add ({x:.15g}, {y:.15g}, {z:.15g})"
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, Path):
-        return str(value)
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _line(e: Exported) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 from collections.abc import Sequence
@@ -162,7 +163,10 @@ def plan_study(
     every = entry.ablation_groups()
     chosen = choose_groups(method, every, groups)
     own = [f"{method}.{text}" for text in settings]
-    default = tuple(plan_cells([method], scenes, seeds, train, settings=own, device=device, factor=factor))
+    plan = functools.partial(
+        plan_cells, scenes=scenes, seeds=seeds, train=train, device=device, factor=factor
+    )
+    default = tuple(plan([method], settings=own))
     names = _Names(entry, default[0].options, every)
     rows = []
     for group in chosen:
@@ -173,9 +177,7 @@ def plan_study(
                     _check_features(variant)
                     host = variant.method.partition("@")[0] == method
                     given = own if host else _settings_of(variant, method, settings)
-                    cells = plan_cells(
-                        [variant.method], scenes, seeds, train, settings=given, device=device, factor=factor
-                    )
+                    cells = plan([variant.method], settings=given)
                     if given or variant.settings:  # without settings the run has the method's own name
                         of_graft = variant.settings if host else ()
                         cells = _renamed(cells, variant.method, of_graft, folder_name(method, group, variant))

@@ -217,6 +217,7 @@ def bench(
     out = Path(output)
     with Session(engine, threads, callbacks) as session:
         from ambiguous_wild.harness.cell import RunOptions
+        from ambiguous_wild.harness.effects_plan import read_plan
         from ambiguous_wild.harness.external import check_program
         from ambiguous_wild.harness.grid import (
             check_grafts,
@@ -239,8 +240,6 @@ def bench(
             budget_s=budgets_s[0] if budgets_s else None,
             **(train or {}),
         )
-        given_plan = _read_plan(plan)
-        cache_dir = out / ".cache" if cache is None else Path(cache)
         say = callbacks.say
         planned = {
             wanted: plan_cells(
@@ -252,7 +251,7 @@ def bench(
                 device=used_device,
                 factor=factor,
                 effects=wanted,
-                plan=given_plan,
+                plan=read_plan(Path(plan)) if isinstance(plan, str | Path) else plan,
                 protocol=protocol,
                 start=None if start is None else Path(start),
             )
@@ -279,20 +278,12 @@ def bench(
                 say(expected_line(to_train))
         one_by_one = session.in_process(cells)
         callbacks.planned(cells, one_by_one)
+        options = RunOptions(out / ".cache" if cache is None else Path(cache), overwrite, pictures)
         if one_by_one:
-            reports = run_cells(
-                cells,
-                out,
-                overwrite=overwrite,
-                cache_dir=cache_dir,
-                tick=callbacks.tick,
-                pictures=pictures,
-                on_start=callbacks.started,
-                on_end=callbacks.ended,
-            )
+            reports = run_cells(cells, out, options, callbacks)
         else:
             sources = read_sources(plugins, list(entries), metrics)
-            reports = session.run(cells, out, RunOptions(cache_dir, overwrite, pictures), sources)
+            reports = session.run(cells, out, options, sources)
     bench_report = BenchReport(out, tuple(_run_report(cell, report) for cell, report in zip(cells, reports)))
     if hint := _rescore_hint(bench_report, metrics):
         say(hint)
@@ -347,14 +338,6 @@ def _check_effects(
             f"--plan {name} would not be used: {', '.join(method.name for method in methods)} with "
             f"--effects {', '.join(choices)}; add --effects auto"
         )
-
-
-def _read_plan(plan: Plan | Words | None) -> Plan | None:
-    if not isinstance(plan, str | Path):
-        return plan
-    from ambiguous_wild.harness.effects_plan import read_plan
-
-    return read_plan(Path(plan))
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:

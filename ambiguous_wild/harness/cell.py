@@ -354,13 +354,14 @@ def _settings(method: MethodEntry, name: str, options: Any) -> list[str]:
         if method.places:  # a graft: its settings are named after the donor of the part
             place, _, rest = key.partition(".")
             owner = dict(method.places)[place]
-        settings.append(f"{owner}.{rest}={_text(value)}")
+        settings.append(f"{owner}.{rest}={option_text(value)}")
     return list(dict.fromkeys(settings))
 
 
-def _text(value: Any) -> str:
+def option_text(value: Any) -> str:
+    """Return the value of an option as `--set` reads it."""
     if isinstance(value, (list, tuple)):
-        return ",".join(map(_text, value))
+        return ",".join(map(option_text, value))
     return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 

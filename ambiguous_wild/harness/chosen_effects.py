@@ -5,14 +5,14 @@ Imports no torch before a plan is needed: a misspelt name is answered at once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.methods.registry import MethodEntry
-from ambiguous_wild.splat.effects import DEGREES, check_effects
+from ambiguous_wild.splat.effects import check_effects
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.effects_plan import Plan
@@ -101,27 +101,6 @@ def check_wanted(wanted: str) -> tuple[str, ...]:
     return check_effects(names)
 
 
-def chosen_by(planned: Sequence[str], scene: Scene, method: MethodEntry) -> Chosen:
-    """Return the effects of one method under `--effects auto`: the same for all that can take effects.
-
-    Args:
-        planned: effects that the plan of the scene calls for.
-        scene: the scene.
-        method: the method.
-
-    Raises:
-        AwError: unknown effect.
-    """
-    if not takes_effects(method):
-        return Chosen()
-    return Chosen(check_effects([*planned, *published_effects(scene)]), "auto")
-
-
 def takes_effects(method: MethodEntry) -> bool:
     """Return whether the method takes effects: they are parts of our trainer, which programs do not use."""
     return method.program is None
-
-
-def describe(effects: Sequence[str]) -> str:
-    """Return the effects as text for a line, "none" without any."""
-    return ", ".join(f"SH degree {DEGREES[e]}" if e in DEGREES else e for e in effects) or "none"

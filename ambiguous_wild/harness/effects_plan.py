@@ -52,12 +52,13 @@ def measure(scene: Scene, photos: Iterable[np.ndarray]) -> Evidence:
     gains = log_gains(colours, len(scene.train))
     enough = len(colours.point) >= LEAST
     grey = colours.rgb.mean(axis=1) / np.exp(gains[colours.view].mean(axis=1))
-    in_codes, in_logs = (_fit_points(scene, colours, v) for v in (grey, np.log(grey)))
+    # variances in the colour range and in logarithms, explained by direction and left
+    (in_codes, _), (_, in_logs) = (_fit_points(scene, colours, v) for v in (grey, np.log(grey)))
     return Evidence(
         exposure=exposure_spread(colours, gains) if enough else np.nan,
-        appearance=remaining_spread(in_logs),
+        appearance=_typical_spread(in_logs),
         sampling=sampling_ratio(scene),
-        view_dependence=view_dependence(in_codes),
+        view_dependence=_typical_spread(in_codes),
         observations=len(colours.point),
         photos=len(scene.train),
         outward=outward(scene),
@@ -129,18 +130,14 @@ def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
     return cameras
 
 
-@dataclass(frozen=True)
-class _Fits:
-    """The variance of each point's colour, split by whether the viewing direction explains it."""
-
-    explained: np.ndarray  # [P] explained variance beyond chance; about zero without view dependence
-    left: np.ndarray  # [P] unbiased variance of the rest
-
-
-def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fits:
+def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> np.ndarray:
     """Fit colour as linear in the viewing direction, by least squares, for points in six photos or more.
 
     A fit explains some noise too; that share is subtracted (adjusted coefficient of determination).
+
+    Returns:
+        [2, P]: the variance that the direction explains beyond chance, about zero without view dependence;
+        the unbiased variance of the rest.
     """
     order = np.argsort(colours.point, kind="stable")
     point, view, values = colours.point[order], colours.view[order], values[order]
@@ -158,7 +155,7 @@ def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> _Fit
         direction = centres[view[rows]] - scene.points.xyz[point[rows[0]]]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         fits.append(_fit(direction, values[rows]))
-    return _Fits(*np.array(fits).reshape(-1, 2).T)
+    return np.array(fits).reshape(-1, 2).T
 
 
 def _without_outliers(groups: Sequence[np.ndarray], values: np.ndarray, view: np.ndarray) -> list[np.ndarray]:
@@ -190,18 +187,9 @@ def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     return float(centred @ centred) / (n - 1) - variance, variance
 
 
-def view_dependence(fits: _Fits) -> float:
-    """Return the median over points of the amplitude of colour that is linear in the viewing direction."""
-    if len(fits.explained) < 10:
-        return float("nan")
-    return float(np.sqrt(max(np.median(fits.explained), 0.0)))
-
-
-def remaining_spread(fits: _Fits) -> float:
-    """Return the median over points of the spread between photos that gain and direction do not explain."""
-    if len(fits.left) < 10:
-        return float("nan")
-    return float(np.sqrt(np.median(fits.left)))
+def _typical_spread(variances: np.ndarray) -> float:
+    """Return the root of the median over points; NaN for fewer than ten."""
+    return float(np.sqrt(max(np.median(variances), 0.0))) if len(variances) >= 10 else float("nan")
 
 
 def _point_of_observation(scene: Scene) -> np.ndarray:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -28,33 +27,6 @@ FPS_ROUNDS = 5
 FPS_SECONDS = 2.0  # of all rounds together: long enough to average over scheduling noise
 
 
-class Picture(Protocol):
-    """The result of `Renderable.render`."""
-
-    @property
-    def image(self) -> torch.Tensor:
-        """[H, W, 3] float32 in [0, 1] after clamping."""
-        ...
-
-
-class Renderable(Protocol):
-    """Draws test views: a trained model, or the splats or pictures that an external program wrote."""
-
-    def render(self, camera: Camera) -> Picture:
-        """Return the picture of a test view's camera."""
-        ...
-
-    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
-        """Fit colour effects, if there are any, to a part of the photo; return the picture [H, W, 3].
-
-        Args:
-            camera: of the test view.
-            photo: [H, W, 3] float32 in [0, 1], on the CPU.
-            keep: [H, W] float32 on the CPU, 1 where the fit may use the photo.
-        """
-        ...
-
-
 @dataclass(frozen=True)
 class TestPhoto:
     """A test view with its photo, [H, W, 3] uint8."""
@@ -63,6 +35,9 @@ class TestPhoto:
 
     view: View
     photo: np.ndarray
+
+
+Draw = Callable[[TestPhoto], torch.Tensor]  # the picture of a test view, [H, W, 3] in [0, 1] after clamping
 
 
 def load_test_photos(scene: Scene) -> list[TestPhoto]:
@@ -82,7 +57,7 @@ def mean_psnr(truth: Sequence[TestPhoto], draw: Callable[[Camera], np.ndarray]) 
 
 
 def render_and_measure(
-    model: Renderable,
+    draw: Draw,
     truth: list[TestPhoto],
     folder: Path,
     *,
@@ -92,12 +67,11 @@ def render_and_measure(
     """Render the test views to PNG and measure what was written.
 
     Args:
-        model: draws the test views.
+        draw: draws a test view: a trained model, or splats or pictures that an external program wrote.
         truth: the test photos.
         folder: where the PNG files are written.
         scene: the scene, for metrics of regions.
-        half: NeRF-W's protocol: colour effects are fitted on the left half of each test photo, columns
-            0 to ceil(W / 2), nothing else is changed, and the right half, from W // 2, is measured.
+        half: NeRF-W's protocol: the right half, from W // 2, is measured.
 
     Returns:
         Metrics of each image, and the reason for each metric that is missing.
@@ -109,8 +83,7 @@ def render_and_measure(
         for t in truth:
             path = temporary / Path(t.view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            image = _fitted(model, t) if half else model.render(t.view.camera).image
-            write_png(path, to_uint8(image.cpu().numpy()))
+            write_png(path, to_uint8(draw(t).cpu().numpy()))
             yield t.view.name, read_png_rgb(path), t.photo
 
     with atomic_dir(folder) as temporary:
@@ -145,11 +118,22 @@ def kernel_threads() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _fitted(model: Renderable, test: TestPhoto) -> torch.Tensor:
-    photo = torch.from_numpy(test.photo.astype(np.float32) / 255.0)
-    keep = torch.zeros(photo.shape[:2])
-    keep[:, : -(-photo.shape[1] // 2)] = 1.0
-    return model.render_fitted(test.view.camera, photo, keep)
+def drawn_by(trainer: Trainer, half: bool) -> Draw:
+    """Return how a trained model draws test views.
+
+    `half`: colour effects are fitted on the left half of the photo, columns 0 to ceil(W / 2); nothing else is
+    changed.
+    """
+
+    def draw(test: TestPhoto) -> torch.Tensor:
+        if not half:
+            return trainer.render(test.view.camera).image
+        photo = torch.from_numpy(test.photo.astype(np.float32) / 255.0)
+        keep = torch.zeros(photo.shape[:2])
+        keep[:, : -(-photo.shape[1] // 2)] = 1.0
+        return trainer.render_fitted(test.view.camera, photo, keep)
+
+    return draw
 
 
 def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:

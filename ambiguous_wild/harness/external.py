@@ -6,26 +6,26 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 import torch
 
-from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Scene, View
 from ambiguous_wild.harness import evaluate
+from ambiguous_wild.harness.callbacks import allowed_cores
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.chosen_effects import NOT_OURS
-from ambiguous_wild.harness.meter import Meter, cores, own_s
+from ambiguous_wild.harness.meter import Meter, own_s
 from ambiguous_wild.harness.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb
 from ambiguous_wild.io.ply import read_splat_ply, splat_count, write_splat_ply
 from ambiguous_wild.methods.external_process import LOGS, WORK, Produced, Program, Task
-from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.splat.rendered import Rendered
+from ambiguous_wild.viewing.model import gaussians_of
 
 
 def run_program(cell: Cell, folder: Path) -> RunResult:
@@ -52,13 +52,9 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
     )
     produced, time_cost = _timed(program, task)
     truth = evaluate.load_test_photos(cell.scene)
-    drawn: evaluate.Renderable
-    if produced.drawn_by_us:
-        drawn = _Splats(produced, cell.device)
-    else:
-        drawn = _Files(truth, produced.renders)
+    draw = _splats(produced, cell.device) if produced.drawn_by_us else partial(_written, produced.renders)
     per_image, missing = evaluate.render_and_measure(
-        drawn, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
+        draw, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
     )
     evaluate.refuse_empty(truth, folder / "renders" / "test")
     return cell.result(
@@ -91,7 +87,7 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
     The cost is empty where the program's training ended before this call, or where the calibration kernel
     cannot run: a program needs none of our packages.
     """
-    meter, begin, before = Meter(task.device, cores()), time.perf_counter(), own_s()
+    meter, begin, before = Meter(task.device, len(allowed_cores())), time.perf_counter(), own_s()
     try:
         meter.begin(0.0)
     except AwError:
@@ -108,47 +104,27 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
     return produced, {**meter.cost(trained), "cpu_s": own_s() - before}
 
 
-@dataclass(frozen=True)
-class _Picture:
-    image: torch.Tensor  # [H, W, 3] float32 in [0, 1]
+def _written(renders: Mapping[str, Path], test: evaluate.TestPhoto) -> torch.Tensor:
+    """Return the picture that the program wrote; effects of a program cannot be fitted here."""
+    path = renders[test.view.name]
+    _check_picture(test.view, path, "render")
+    return torch.from_numpy(read_png_rgb(path).astype(np.float32) / 255.0)
 
 
-class _Files:
-    """The pictures that the program wrote."""
+def _splats(produced: Produced, device: str) -> evaluate.Draw:
+    """Return how our renderer draws the program's splats: on a black background, without colour effects.
 
-    def __init__(self, truth: list[evaluate.TestPhoto], renders: Mapping[str, Path]) -> None:
-        # every view has its own camera object, which identifies the view
-        self.paths = {id(t.view.camera): (t.view, renders[t.view.name]) for t in truth}
-
-    def render(self, camera: Camera) -> _Picture:
-        view, path = self.paths[id(camera)]
-        _check_picture(view, path, "render")
-        return _Picture(torch.from_numpy(read_png_rgb(path).astype(np.float32) / 255.0))
-
-    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
-        """Return the plain render: the effects of a program cannot be fitted here."""
-        return self.render(camera).image
-
-
-class _Splats:
-    """The program's splats, drawn by our renderer on a black background."""
-
-    def __init__(self, produced: Produced, device: str) -> None:
-        """
-        Raises:
-            AwError: the file of splats cannot be read.
-        """
-        assert produced.ply is not None
-        tensors = {name: torch.from_numpy(a) for name, a in read_splat_ply(produced.ply).items()}
-        self.gaussians = Gaussians(**tensors).to(device)  # type: ignore[arg-type]
+    Raises:
+        AwError: the file of splats cannot be read.
+    """
+    assert produced.ply is not None
+    gaussians = gaussians_of(read_splat_ply(produced.ply)).to(device)
 
     @torch.no_grad()
-    def render(self, camera: Camera) -> Rendered:
-        return render(self.gaussians, camera, sh_degree=self.gaussians.sh_degree)
+    def draw(test: evaluate.TestPhoto) -> torch.Tensor:
+        return render(gaussians, test.view.camera, sh_degree=gaussians.sh_degree).image
 
-    def render_fitted(self, camera: Camera, photo: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
-        """Return the plain render: splats have no colour effects that could be fitted."""
-        return self.render(camera).image
+    return draw
 
 
 def _check_picture(view: View, path: Path, what: str) -> None:

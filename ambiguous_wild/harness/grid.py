@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.harness.callbacks import Callbacks
 from ambiguous_wild.harness.cell import (
     Cell,
     CellReport,
@@ -20,7 +21,7 @@ from ambiguous_wild.harness.cell import (
 from ambiguous_wild.harness.chosen_effects import (
     Chosen,
     check_wanted,
-    chosen_by,
+    published_effects,
     scene_protocol,
     takes_effects,
 )
@@ -35,11 +36,10 @@ from ambiguous_wild.harness.run import (
 )
 from ambiguous_wild.harness.start import start_file, start_line, started
 from ambiguous_wild.harness.timing import LEAST, MOST, expected_s, slowness
-from ambiguous_wild.harness.training import Tick
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
-from ambiguous_wild.splat.effects import ALL
+from ambiguous_wild.splat.effects import ALL, check_effects
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.parts import Parts
 
@@ -201,28 +201,26 @@ def cell_folder(output: Path, cell: Cell) -> Path:
 def run_cells(
     cells: Sequence[Cell],
     output: Path,
-    *,
-    overwrite: Overwrite = "missing",
-    cache_dir: Path | None = None,
-    tick: Tick | None = None,
-    pictures: bool = True,
-    on_start: Callable[[Cell, Path], None] | None = None,
-    on_end: Callable[[Cell, CellReport], None] | None = None,
+    options: RunOptions | None = None,
+    callbacks: Callbacks | None = None,
 ) -> list[CellReport]:
     """Run the unfinished cells one after another; an error of one is its outcome and does not stop others.
+
+    Args:
+        cells: what to run.
+        output: folder of the runs.
+        options: how they are made and kept; None = the defaults, with the cache in OUTPUT/.cache.
+        callbacks: told when a run starts, ticks and ends.
 
     Raises:
         AwError: a run folder holds another configuration; checked before anything is trained.
     """
-    options = RunOptions(cache_dir or output / ".cache", overwrite, pictures)
+    options, callbacks = options or RunOptions(output / ".cache"), callbacks or Callbacks()
     reports = []
     for cell, folder in zip(cells, checked_folders(cells, output, options)):
-        if on_start is not None:
-            on_start(cell, folder)
-        report = run_cell(cell, folder, options, tick)
-        if on_end is not None:
-            on_end(cell, report)
-        reports.append(report)
+        callbacks.started(cell, folder)
+        reports.append(run_cell(cell, folder, options, callbacks.tick))
+        callbacks.ended(cell, reports[-1])
     return reports
 
 
@@ -265,13 +263,11 @@ def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = 
         for effects, members in planned.items():
             group = [f"budget-{seconds:g}s"] if len(lengths) > 1 else []
             group += [f"effects-{effects.replace(' ', '').replace(',', '+')}"] if len(planned) > 1 else []
-            cells += [_in_group(cell, seconds, "/".join(group)) for cell in members]
+            for cell in members:
+                budget = cell.train.budget_s if seconds is None else seconds
+                train = dataclasses.replace(cell.train, budget_s=budget)
+                cells.append(dataclasses.replace(cell, train=train, group="/".join(group)))
     return cells
-
-
-def _in_group(cell: Cell, seconds: float | None, group: str) -> Cell:
-    train = cell.train if seconds is None else dataclasses.replace(cell.train, budget_s=seconds)
-    return dataclasses.replace(cell, train=train, group=group)
 
 
 def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
@@ -332,8 +328,8 @@ def choose(
     if wanted != "auto":
         asked = Chosen(ALL if wanted == "all" else named, "" if wanted == "none" else wanted)
         return {m.name: asked if takes_effects(m) else Chosen() for m in methods}
-    if plan is None and any(map(takes_effects, methods)):
-        plan = plan_effects(scene)
-    effects = () if plan is None else plan.effects()
-    chosen = {m.name: chosen_by(effects, scene, m) for m in methods}
-    return {name: dataclasses.replace(c, plan=plan if c.asked else None) for name, c in chosen.items()}
+    if not any(map(takes_effects, methods)):
+        return {m.name: Chosen() for m in methods}
+    plan = plan_effects(scene) if plan is None else plan
+    auto = Chosen(check_effects([*plan.effects(), *published_effects(scene)]), "auto", plan)
+    return {m.name: auto if takes_effects(m) else Chosen() for m in methods}

@@ -11,21 +11,21 @@ blocks. They neither add nor remove Gaussians: with growth two seeds differ by 1
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
+import functools
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.ndimage import label, maximum_filter, uniform_filter
 from torch import Tensor
+from tqdm import tqdm
 
 from ambiguous_wild.core import Points, Scene
 from ambiguous_wild.harness.cell import scene_identity
@@ -334,12 +334,7 @@ class Pair:
 
 
 Bar = Callable[..., AbstractContextManager[Any]]
-
-
-@contextlib.contextmanager
-def no_bar(total: int) -> Iterator[Any]:
-    """A progress bar that shows nothing."""
-    yield SimpleNamespace(update=lambda: None)
+NO_BAR: Bar = functools.partial(tqdm, disable=True)
 
 
 @dataclass(frozen=True)
@@ -365,7 +360,7 @@ def plan(scene: Path | str) -> Plan:
     return with_masks(replace(plan_effects(loaded), scene_hash=scene_identity(loaded)), loaded)
 
 
-def with_masks(plan: Plan, scene: Scene, bar: Bar = no_bar) -> Plan:
+def with_masks(plan: Plan, scene: Scene, bar: Bar = NO_BAR) -> Plan:
     """Return the plan with its lines about masks, from probes.
 
     Args:

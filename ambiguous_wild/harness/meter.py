@@ -22,6 +22,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from ambiguous_wild.core.config import State
+from ambiguous_wild.harness.callbacks import allowed_cores
 from ambiguous_wild.harness.result_file import Cost, TimeRecord
 from ambiguous_wild.harness.timing import Verdict, in_reference_seconds
 from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration
@@ -31,17 +32,12 @@ _IDLE = (3, 4)  # fields of a line of /proc/stat: idle, waiting for a disk
 _GUEST = (8, 9)  # counted in user and nice already
 
 
-def cores() -> int:
-    """Return the number of processors that this process may use."""
-    return len(_allowed()) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def busy_s() -> float | None:
     """Return the seconds that the allowed processors have worked since the machine started; None = unknown.
 
     Time that a hypervisor gave to other machines is included.
     """
-    allowed = {f"cpu{k}" for k in _allowed()}
+    allowed = {f"cpu{k}" for k in allowed_cores()}
     try:
         lines = [line.split() for line in _STAT.read_text(encoding="ascii").splitlines()]
         rows = [[int(n) for n in line[1:]] for line in lines if line and line[0] in allowed]
@@ -115,12 +111,6 @@ def _is_held(path: Path) -> bool:
         path.unlink(missing_ok=True)
         lock.release()
     return False
-
-
-def _allowed() -> set[int]:
-    if hasattr(os, "sched_getaffinity"):
-        return set(os.sched_getaffinity(0))
-    return set(range(os.cpu_count() or 1))
 
 
 def _gpu_name(device: str) -> str:
@@ -296,7 +286,7 @@ class Meter:
             where = "this GPU" if self.device.startswith("cuda") else "the machine"
             return "contended", f"{self.runs} runs shared {where}"
         others = self.others_s / self.wall_s if self.wall_s > 0.0 else 0.0
-        total = cores()
+        total = len(allowed_cores())
         needed = min(self.threads, total)
         if others - (total - needed) > OTHERS * needed:
             return "contended", f"other programs used {others:.1f} of {total} processors"

@@ -18,11 +18,11 @@ import numpy as np
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.harness import sheets
-from ambiguous_wild.harness.sheets import write_contact
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.palette import ADDED, MERGED, NEUTRAL, plot_colour, ramp
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.vision.sparse_surface import in_map, inside
 
 MOMENTS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)  # shares of the run
 VIEWS = 3
@@ -39,9 +39,7 @@ class Recorder:
     """
 
     def __init__(self, trainer: Trainer, folder: Path) -> None:
-        views = trainer.data.scene.train
-        chosen = np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)
-        self.views = [int(v) for v in np.unique(chosen)]
+        self.views = sheets.spread(range(len(trainer.data.scene.train)), VIEWS)
         self.folder = folder
         self.passed = self._passed(trainer)
 
@@ -115,7 +113,7 @@ def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
     written = recorder.finish(trainer)
     written += trainer.parts.mask.draw(pictures)
     written += draw_density(trainer, pictures / "density.png")
-    written += write_contact(trainer.data.scene, folder / "masks", pictures / "masks.jpg")
+    written += sheets.write_contact(trainer.data.scene, folder / "masks", pictures / "masks.jpg")
     return written
 
 
@@ -127,11 +125,9 @@ def draw_density(trainer: Trainer, path: Path) -> list[Path]:
     log = trainer.density.log
     if not log.rounds:
         return []
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, 4.6), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
     counts, top, view = figure.subplots(1, 3, width_ratios=[1.0, 1.1, 1.4])
     _counts(counts, trainer)
     _top_view(top, trainer)
@@ -187,7 +183,8 @@ def _top_view(axes: Any, trainer: Trainer) -> None:
         right = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     right /= np.linalg.norm(right)
     plane = np.stack([right, np.cross(up, right)])
-    everything = _thin(trainer.gaussians.means.detach().cpu().numpy()) @ plane.T
+    means = trainer.gaussians.means.detach().cpu().numpy()
+    everything = means[:: max(len(means) // SHOWN, 1)] @ plane.T
     centres = np.stack([camera.center for camera in trainer.data.cameras]) @ plane.T
     axes.scatter(everything[:, 0], everything[:, 1], 0.5, color=plot_colour(NEUTRAL), alpha=0.4, lw=0)
     for _, xyz, marker, colour, size in _kinds(trainer):
@@ -227,13 +224,9 @@ def _in_a_view(axes: Any, trainer: Trainer) -> None:
 
 def _pixels_in_view(xyz: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the pixels [n, 2] of the positions in front of the camera and inside its picture."""
-    local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    local = local[local[:, 2] > 1e-6]
-    u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-    v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return np.stack([u[inside], v[inside]], axis=1)
-
-
-def _thin(rows: np.ndarray) -> np.ndarray:
-    return rows[:: max(len(rows) // SHOWN, 1)]
+    local, shape = (
+        xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3],
+        (camera.height, camera.width),
+    )
+    x, y = in_map(camera, local, shape)
+    return np.stack([x, y], axis=1)[inside(x, y, shape)] + 0.5

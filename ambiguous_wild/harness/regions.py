@@ -11,7 +11,7 @@ its frame and not behind another static surface.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,37 +35,22 @@ COVERED_FROM = 0.5  # share of the train views that look at a pixel's surface
 SUPPORTED_FROM = 3  # number of train views that show it
 MOST_VIEWS = 64  # number of train views compared with a test view where there are no exact masks
 
-DistractorMask = Callable[[View], np.ndarray | None]  # [H, W] bool, True on distractors
+Visibility = tuple[np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Visibility:
-    """How often train views show the surface of each pixel of a test view."""
-
-    shown: np.ndarray  # [H, W] float32: number of views that show it
-    hidden: np.ndarray  # [H, W] float32: share of the views looking at it that show a distractor instead
-
-    @property
-    def covered(self) -> np.ndarray:
-        """[H, W] bool."""
-        return self.hidden >= COVERED_FROM
-
-    @property
-    def supported(self) -> np.ndarray:
-        """[H, W] bool."""
-        return self.shown >= SUPPORTED_FROM
-
-
-def train_visibility(scene: Scene, distractor: DistractorMask) -> dict[str, Visibility] | str:
-    """Compute the visibility in every test view, by its name; or return why that is impossible.
+def train_visibility(scene: Scene, masks: Sequence[np.ndarray | None]) -> dict[str, Visibility] | str:
+    """Compute how often train views show the surface of each pixel of a test view; or return why they cannot.
 
     If no train view has an exact mask, none shows distractors; otherwise views without a mask are left out.
 
     Args:
         scene: the scene; its sparse points give the surfaces.
-        distractor: returns the exact mask of a train view, or None.
+        masks: the exact mask of each train view, [H, W] bool, or None.
+
+    Returns:
+        By the name of the test view: the number of views that show the surface, [H, W] float32; and the share
+        of the views looking at it that show a distractor instead, [H, W] float32.
     """
-    masks = [distractor(view) for view in scene.train]
     exact = any(mask is not None for mask in masks)
     used = [(view, mask) for view, mask in zip(scene.train, masks) if mask is not None or not exact]
     xyz = some_points(scene.points.sure_xyz)
@@ -83,10 +68,11 @@ def train_visibility(scene: Scene, distractor: DistractorMask) -> dict[str, Visi
             looking += sees
             hidden += sees & distracted
         size = (view.camera.width, view.camera.height)
-        maps = (looking - hidden, hidden / np.maximum(looking, 1.0))
-        visibility[view.name] = Visibility(
-            *(cv2.resize(m, size, interpolation=cv2.INTER_LINEAR) for m in maps)
+        shown, share = (
+            cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)
+            for m in (looking - hidden, hidden / np.maximum(looking, 1.0))
         )
+        visibility[view.name] = shown, share
     return visibility
 
 
@@ -186,16 +172,16 @@ def _find_regions(scene: Scene) -> Regions:
         pixels[VALID] = kept
     else:
         missing[VALID] = "no test photo has a mask (masks/test/<stem>.png, white = measured)"
-    exact = {view.name: true_distractor(scene, view) for view in scene.train}
-    visibility = train_visibility(scene, lambda view: exact[view.name])
+    masks_of_train = [true_distractor(scene, view) for view in scene.train]
+    visibility = train_visibility(scene, masks_of_train)
     if isinstance(visibility, str):
         return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED, SUPPORTED), visibility))
-    pixels[SUPPORTED] = {name: seen.supported for name, seen in visibility.items()}
+    pixels[SUPPORTED] = {name: shown >= SUPPORTED_FROM for name, (shown, _) in visibility.items()}
     if not any(mask.any() for mask in pixels[SUPPORTED].values()):
         missing[SUPPORTED] = "no surface in a test view is shown by three train views"
         del pixels[SUPPORTED]
-    reason = why_nothing_covered(exact.values())
-    covered = {name: seen.covered for name, seen in visibility.items()}
+    reason = why_nothing_covered(masks_of_train)
+    covered = {name: hidden >= COVERED_FROM for name, (_, hidden) in visibility.items()}
     if not reason and not any(mask.any() for mask in covered.values()):
         reason = "no surface of a test view is hidden in half of the train views that look at it"
     if reason:

@@ -36,7 +36,7 @@ from ambiguous_wild.harness.result_file import (
     read_result,
     write_result,
 )
-from ambiguous_wild.harness.store import read_config
+from ambiguous_wild.harness.store import CONFIG, read_config
 from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
 from ambiguous_wild.harness.training import STOPPED, Tick, train_and_measure
 from ambiguous_wild.io import plain_yaml
@@ -45,7 +45,6 @@ from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
 from ambiguous_wild.methods.references import place_of
 from ambiguous_wild.splat.watchdog import FOLDER as NONFINITE
 
-CONFIG = "config.yaml"
 ENVIRONMENT = "env.json"
 TRACEBACK = "traceback.txt"
 LOG_FILE = "log.txt"

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ambiguous_wild.harness.callbacks import Callbacks, Engine
+from ambiguous_wild.harness.callbacks import Callbacks, Engine, allowed_cores
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions
@@ -92,7 +92,9 @@ class Session:
         engine, say = self.engine, self.callbacks.say
         cluster = self._connected() if engine.engine == "ray" else None
         threads = self.threads or (
-            max(1, int(engine.cpus_per_cell or 1)) if cluster else max(1, _cores() // (engine.jobs or 1))
+            max(1, int(engine.cpus_per_cell or 1))
+            if cluster
+            else max(1, len(allowed_cores()) // (engine.jobs or 1))
         )
         folders = checked_folders(cells, output, options)
         jobs = [make_job(cell, folder, options, sources, threads) for cell, folder in zip(cells, folders)]
@@ -125,10 +127,6 @@ class Session:
 
             self.cluster = RayCluster(self.engine, self.engine.cpus_per_cell or float(self.threads or 1))
         return self.cluster
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def visible_gpus(count: int) -> list[str]:

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
-from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.harness.regions import true_distractor
 from ambiguous_wild.harness.store import Runs
@@ -29,6 +28,7 @@ NAME = "sheet.jpg"
 WIDTH = 320  # px of a photo on the sheets of a capture and of masks
 CAPTURE_COLUMNS, MASK_COLUMNS = 4, 5  # photos in a row
 MOST_MASKS = 20  # photos on a sheet of masks
+VIEWS = 3  # test photos, and train photos, on the sheet of runs
 
 
 def cell(caption: str, image: np.ndarray, width: int | None = None) -> np.ndarray:
@@ -140,34 +140,22 @@ def _truth(raw: Path, name: str) -> list[np.ndarray]:
     ]
 
 
-def write_contact(
-    scene: Scene, masks: Path, path: Path, *, names: Sequence[str] = (), most: int = MOST_MASKS
-) -> list[Path]:
+def write_contact(scene: Scene, masks: Path, path: Path) -> list[Path]:
     """Write a JPEG of train photos, the masked region tinted, each with its masked share.
 
     Args:
         scene: the scene with the train photos.
         masks: RUN/masks, keep maps by the photo's name, white = keep.
-        path: JPEG to write.
-        names: photos to show; empty: up to `most`, evenly spaced among those with a mask.
-        most: largest number of photos.
+        path: JPEG to write; it shows up to `MOST_MASKS` photos, evenly spaced among those with a mask.
 
     Returns:
         The path written; empty if no photo has a mask.
-
-    Raises:
-        AwError: a name is no train photo.
     """
-    by_name = {view.name: view for view in scene.train}
-    for name in names:
-        if name not in by_name:
-            raise unknown("train photo", name, by_name)
-    views = [by_name[name] for name in names] or list(scene.train)
-    views = [view for view in views if _mask(masks, view).is_file()]
+    views = [view for view in scene.train if _mask(masks, view).is_file()]
     if not views:
         return []
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_jpeg(path, grid([_tinted(scene, view, masks) for view in spread(views, most)], MASK_COLUMNS))
+    write_jpeg(path, grid([_tinted(scene, view, masks) for view in spread(views, MOST_MASKS)], MASK_COLUMNS))
     return [path]
 
 
@@ -184,14 +172,13 @@ def _tinted(scene: Scene, view: View, masks: Path) -> np.ndarray:
     return cell(caption, tint(photo, masked, MASKED), WIDTH)
 
 
-def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int = 3) -> int:
-    """Write the sheet of one scene: a column for each method (first seed), `views` test and train rows.
+def write_sheet(runs: Runs, path: Path, *, scene: str | None = None) -> int:
+    """Write the sheet of one scene: a column for each method (first seed), `VIEWS` test and train rows.
 
     Args:
         runs: runs from `read_runs`.
         path: file to write, PNG or JPEG by its ending.
         scene: name of the scene; None if the runs are of a single scene.
-        views: number of test rows, and of train rows.
 
     Returns:
         The number of methods shown.
@@ -210,8 +197,8 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None, views: int 
     first = chosen.sort_values("seed").drop_duplicates("method").sort_values("method")
     folders = {str(row.method): Path(str(row.folder)) for row in first.itertuples()}
     source = open_scene(next(iter(folders.values())), verify=False)
-    rows = [_test_row(view, folders) for view in spread(source.test, views)]
-    rows += [_train_row(view, folders) for view in spread(source.train, views)]
+    rows = [_test_row(view, folders) for view in spread(source.test, VIEWS)]
+    rows += [_train_row(view, folders) for view in spread(source.train, VIEWS)]
     sheet = stack([stack(row, 1) for row in rows], 0)
     (write_jpeg if path.suffix.lower() == ".jpg" else write_png)(path, sheet)
     return len(folders)

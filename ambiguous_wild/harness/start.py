@@ -56,10 +56,7 @@ def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
     """
     if start is None:
         return parts
-    import torch
-
-    from ambiguous_wild.splat.gaussians import Gaussians
-    from ambiguous_wild.viewing.model import moved
+    from ambiguous_wild.viewing.model import gaussians_of, moved
 
     content, place = _read(start.path), scene.place
     if sha256_file(start.path) != start.sha256:
@@ -67,8 +64,7 @@ def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
     if isinstance(content, Splats):
         arrays = moved(content.gaussians, content.place, place)
         _refuse_unseen(start.path, arrays["means"], scene)
-        tensors = {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
-        return replace(parts, given=Gaussians(**tensors))  # type: ignore[arg-type]
+        return replace(parts, given=gaussians_of(arrays))
     xyz = (content[0] - place.centre) * place.scale
     _refuse_unseen(start.path, xyz, scene)
     return replace(parts, given=(xyz, content[1]))
@@ -101,13 +97,13 @@ def _read(path: Path) -> Splats | tuple[np.ndarray, np.ndarray]:
 
 def _refuse_unseen(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     """Raise AwError if no train camera sees any of the points [N, 3]."""
+    from ambiguous_wild.vision.sparse_surface import in_map, inside
+
     sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:_CHECKED_POINTS]].astype(np.float64)
     for view in scene.train:
-        camera = view.camera
-        x, y, z = (sample @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]).T
-        ahead = np.where(z > 0, z, np.nan)
-        u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
-        if ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).any():
+        camera, shape = view.camera, (view.camera.height, view.camera.width)
+        local = sample @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        if inside(*in_map(camera, local, shape), shape).any():
             return
     middle = np.median(sample, axis=0) / scene.place.scale + scene.place.centre
     coordinates = ", ".join(f"{c:.4g}" for c in middle)

@@ -209,11 +209,16 @@ def read_config(run: Path) -> ReadConfig:
         return {}
 
 
+def section(config: ReadConfig, name: str) -> ReadConfig:
+    """Return a part of config.yaml; empty where it is absent or no mapping."""
+    part = config.get(name)
+    return part if isinstance(part, dict) else {}
+
+
 def known_iterations(root: Path) -> int | None:
     """Return the iterations of the first run below a folder; None without a run that says them."""
     for run in run_folders(root):
-        train = read_config(run).get("train")
-        iterations = train.get("iterations") if isinstance(train, dict) else None
+        iterations = section(read_config(run), "train").get("iterations")
         if isinstance(iterations, int):
             return iterations
     return None
@@ -222,8 +227,7 @@ def known_iterations(root: Path) -> int | None:
 def _method_and_scene(run: Path) -> tuple[str, str]:
     """Return method and scene of a run without a result: from its settings, else from its path."""
     config, method_folder = read_config(run), run.absolute().parent
-    scene = config.get("scene")
-    name = scene.get("name") if isinstance(scene, dict) else None
+    name = section(config, "scene").get("name")
     return str(config.get("method") or method_folder.name), str(name or method_folder.parent.name)
 
 
@@ -308,8 +312,7 @@ def effects_of(facts: RunFacts) -> str:
 
 def _length(config: ReadConfig) -> str:
     """Return `asked_length` from config.yaml, for results of earlier versions; empty if it is not there."""
-    train = config.get("train")
-    settings = train if isinstance(train, dict) else {}
+    settings = section(config, "train")
     if settings.get("budget_s") is not None:
         return f"{settings['budget_s']:g} s"
     return f"{settings['iterations']} iterations" if "iterations" in settings else ""
@@ -321,11 +324,9 @@ BOOKKEEPING = ("seed", "iterations", "budget_s", "checkpoint_every_s", "probes",
 
 def _training(config: ReadConfig) -> str:
     """Return the other settings of training that config.yaml holds, as text."""
-    train = config.get("train")
-    settings = dict(train) if isinstance(train, dict) else {}
-    for key in (*BOOKKEEPING, "torch_threads"):
-        settings.pop(key, None)
-    return ", ".join(f"{key} {'auto' if value is None else value}" for key, value in sorted(settings.items()))
+    own = (*BOOKKEEPING, "torch_threads")
+    settings = sorted((key, value) for key, value in section(config, "train").items() if key not in own)
+    return ", ".join(f"{key} {'auto' if value is None else value}" for key, value in settings)
 
 
 def _features(options: Options) -> str:

@@ -14,13 +14,14 @@ from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
-from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders
+from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders, section
+from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import Model, RenderSettings, file_model
-from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, Page, check_page_folder, page_text, write_page
+from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, PAGE, Page, check_page_folder, page_text
 from ambiguous_wild.viewing.video import scene_around
 
 MASKS = "masks"
@@ -203,14 +204,13 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
     to is imported.
     """
     name = str(config.get("method", ""))
-    options = config.get("options")
     try:
         if is_reference(name):
             raise AwError(f"{name} is a file")
         entry = get_method(name)
         if entry.program is not None:
             return RenderSettings(), ""
-        chosen = from_plain(type(entry.options()), options if isinstance(options, dict) else {}, "options")
+        chosen = from_plain(type(entry.options()), section(config, "options"), "options")
         parts = entry.build(chosen)
     except AwError:
         advice = "it is drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
@@ -256,8 +256,7 @@ def view_runs(
     """
     shown = read_models(paths, scene=scene, scene_folder=scene_folder)
     check_page_folder(output)
-    return write_page(
-        output,
+    text, models_bytes = page_text(
         shown.scene,
         shown.models,
         title=shown.scene.name if title is None else title,
@@ -265,6 +264,8 @@ def view_runs(
         notes=shown.notes,
         say=say,
     )
+    write_text(output / PAGE, text)
+    return Page(output / PAGE, len(text.encode("utf-8")), models_bytes)
 
 
 class Viewer:
@@ -282,7 +283,7 @@ class Viewer:
         shown = read_models(paths)
         self.labels = tuple(model.label for model in shown.models)
         self.height = height
-        self.page, _, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
+        self.page, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
 
     def __repr__(self) -> str:
         return f"Viewer of {', '.join(self.labels)}; a notebook shows it, 'aw view' writes it to a file"

@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -18,15 +18,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core import AwError, Camera, View
 from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness import evaluate, pictures
 from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
+from ambiguous_wild.harness.measures import ImageRow
 from ambiguous_wild.harness.meter import Meter
 from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult, TimeRecord
 from ambiguous_wild.harness.start import started
 from ambiguous_wild.io.files import atomic_dir, write_json
-from ambiguous_wild.io.images import read_keep_map, write_png
+from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
 from ambiguous_wild.splat.data import load_train_data
@@ -225,14 +226,14 @@ def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | Non
     trainer.train(tick=tick)
     cost = cost_of(cell, trainer)
     shutil.rmtree(place / MASKS, ignore_errors=True)
-    with atomic_dir(place / MASKS) as temporary:
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for index, view in enumerate(cell.scene.train):
             step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
             keep = trainer.parts.mask.predict(step)
-            kept = np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
-            path = temporary / Path(view.name).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, kept.astype(np.uint8) * 255)
+            yield view, np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
+
+    evaluate.write_keeps(cell.scene, keeps(), place / MASKS)
     write_json(place / COST, cost)  # written last: this file marks the pass as finished
 
 
@@ -258,8 +259,14 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
         trainer = _make_trainer(cell, folder, options.cache_dir, truth, first)
         trainer.resume()
         recorder = pictures.Recorder(trainer, folder) if options.pictures else None
+        ticks = [call for call in (recorder, tick) if call is not None]
+
+        def after_iteration(trained: Trainer) -> None:
+            for call in ticks:
+                call(trained)
+
         try:
-            trainer.train(tick=_each(recorder, tick))
+            trainer.train(tick=after_iteration)
         except Stopped:
             raise Stopped(_keep_stopped(cell, trainer, truth)) from None
         return _measure(cell, trainer, truth, recorder, first)
@@ -311,17 +318,6 @@ def _make_trainer(
     return trainer
 
 
-def _each(*ticks: Tick | None) -> Tick:
-    """Return a tick that calls all of these that are given."""
-
-    def after_iteration(trainer: Trainer) -> None:
-        for tick in ticks:
-            if tick is not None:
-                tick(trainer)
-
-    return after_iteration
-
-
 def _measure(
     cell: Cell,
     trainer: Trainer,
@@ -342,9 +338,7 @@ def _measure(
         trainer.data.scene.place,
     )
     LOG.info("measuring %s", counted(len(truth), "test view"))
-    per_image, missing = evaluate.render_and_measure(
-        trainer, truth, folder / "renders" / "test", half=cell.protocol == "half", scene=cell.scene
-    )
+    per_image, missing = _measured_views(cell, trainer, truth, folder / "renders" / "test")
     evaluate.refuse_empty(truth, folder / "renders" / "test")
     LOG.info("drawing masks and pictures")
     masks = evaluate.write_masks(trainer, folder / "masks")
@@ -362,6 +356,14 @@ def _measure(
     )
 
 
+def _measured_views(
+    cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto], folder: Path
+) -> tuple[list[ImageRow], dict[str, str]]:
+    half = cell.protocol == "half"
+    draw = evaluate.drawn_by(trainer, half)
+    return evaluate.render_and_measure(draw, truth, folder, scene=cell.scene, half=half)
+
+
 def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto]) -> str:
     """Measure and save the model after Ctrl-C; return a message. A second Ctrl-C leaves that out."""
     folder, train = trainer.folder, cell.train
@@ -372,10 +374,7 @@ def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto])
         with atomic_dir(folder / STOPPED) as kept:
             model = {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
             write_splat_ply(kept / "point_cloud.ply", model, trainer.data.scene.place)
-            half = cell.protocol == "half"
-            rows, missing = evaluate.render_and_measure(
-                trainer, truth, kept / "renders", half=half, scene=cell.scene
-            )
+            rows, missing = _measured_views(cell, trainer, truth, kept / "renders")
             state = {"iteration": trainer.iteration, "train_s": trainer.clock.now()}
             write_json(kept / "measured.json", {**state, "per_image": rows, "missing": missing})
     except KeyboardInterrupt:

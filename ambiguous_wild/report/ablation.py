@@ -35,6 +35,7 @@ from ambiguous_wild.io.files import atomic_path, write_json, write_text
 from ambiguous_wild.methods.ablation import DEFAULT
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
+from ambiguous_wild.report.cost_plots import label_points, new_figure
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
 from ambiguous_wild.report.table import BLANK, Cell, Column, Row, Table, ranks
 
@@ -128,13 +129,8 @@ def csv_of(data: StudyReport) -> str:
     """Return one line for each variant; cells are empty where a value is missing."""
     lines = []
     for row in data["rows"]:
-        line: Facts = {
-            "group": row["group"],
-            "variant": row["variant"],
-            "status": row["status"],
-            "reason": row["reason"],
-            "same_as": row["same_as"],
-        }
+        line: Facts = {"group": row["group"], "variant": row["variant"], "status": row["status"]}
+        line |= {"reason": row["reason"], "same_as": row["same_as"]}
         line |= {"settings": " ".join(row["settings"]), "runs": len(row["runs"])}
         for key, entry in row["values"].items():
             line |= {key: entry["mean"], f"{key}_spread": entry["spread"]}
@@ -177,18 +173,9 @@ def draw(data: StudyReport, path: Path) -> bool:
     groups = [(g, points) for g, points in groups if len(points) > 1]  # one point compares nothing
     if not groups:
         return False
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    columns = min(3, len(groups))
-    rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(5.2 * columns, 3.9 * rows), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for panel, (group, points) in zip(axes.flat, groups, strict=False):
+    figure, axes = new_figure(len(groups))
+    for panel, (group, points) in zip(axes, groups):
         _panel(panel, group, points)
-    for panel in list(axes.flat)[len(groups) :]:
-        panel.set_axis_off()
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})
     return True
@@ -206,44 +193,18 @@ def _points(data: StudyReport, group: str) -> list[tuple[str, float, float, floa
 
 
 def _panel(axes: Any, group: GroupFacts, points: list[tuple[str, float, float, float]]) -> None:
+    ends = []
     for index, (name, ms, psnr, spread) in enumerate(points):
-        is_default = name.split(" = ")[0] == "default"
+        is_default = name.split(" = ")[0] == DEFAULT
         colour = "k" if is_default else f"C{index % 10}"
         axes.errorbar(ms, psnr, yerr=spread or None, fmt="*" if is_default else "o", color=colour,
                       ms=13 if is_default else 7, elinewidth=1, capsize=2)  # fmt: skip
-    _labels(axes, points)
+        ends.append((name, ms, psnr, colour))
+    axes.margins(0.12)
+    label_points(axes, ends)
     axes.set_title(f"{group['name']}: {group['title']}", fontsize=8)
     axes.set_xlabel("ms per iteration", fontsize=8)
     axes.set_ylabel("PSNR (dB)", fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.grid(alpha=0.25)
-
-
-def _labels(axes: Any, points: list[tuple[str, float, float, float]]) -> None:
-    """Write the name of every point, each at least one line from the next and inside the frame."""
-    axes.margins(0.12)
-    low, high = axes.get_ylim()
-    middle, line = sum(axes.get_xlim()) / 2, 0.05 * (high - low)
-    width = axes.get_xlim()[1] - axes.get_xlim()[0]
-    order = sorted(range(len(points)), key=lambda index: points[index][2])
-    heights, last = {}, -math.inf
-    for index in order:
-        last = heights[index] = max(points[index][2], last + line)
-    above = high + 0.4 * line
-    for index in reversed(order):  # labels above the frame are moved down
-        above = heights[index] = min(heights[index], above - line)
-    for index, (name, ms, psnr, _) in enumerate(points):
-        left = ms <= middle
-        axes.annotate(
-            name,
-            (ms, psnr),
-            xytext=(ms + (0.03 if left else -0.03) * width, heights[index]),
-            fontsize=7,
-            color="k" if name.split(" = ")[0] == "default" else f"C{index % 10}",
-            ha="left" if left else "right",
-            va="center",
-            arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "0.6"},
-        )
 
 
 SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "model_mb")

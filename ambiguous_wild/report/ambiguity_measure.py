@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.harness.sheets import spread
 from ambiguous_wild.io.images import load_image_float
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
@@ -183,7 +184,7 @@ def measure(
     points = read_motion_points(scene.root)
     moving, static, every, scores, evidence = [], [], [], [], []
     for index, view in enumerate(progress(views)):
-        photo, distractor = load_photo(view), masks.load(view)
+        photo, distractor = load_image_float(view.image_path), masks.load(view)
         behind, known = background.load(index, view)
         counts = am.colour_counts(photo, behind, distractor, known=known)
         use = distractor if known is None else distractor & known
@@ -239,11 +240,11 @@ def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
     backend = make_features(spec)
     views = list(scene.train)
     if isinstance(backend, SceneFeatures):
-        photos = [torch.from_numpy(seen_by(spec, load_photo(v))) for v in views]
+        photos = [torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in views]
         backend.fit_scene(photos, train_tracks(scene), cache)
         return backend
-    chosen = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(FIT_PHOTOS, len(views)))})
-    backend.fit([torch.from_numpy(seen_by(spec, load_photo(views[i]))) for i in chosen])
+    chosen = spread(views, FIT_PHOTOS)
+    backend.fit([torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in chosen])
     return backend
 
 
@@ -261,11 +262,6 @@ def cosine_map(look: SceneFeatures, index: int, photo: np.ndarray) -> np.ndarray
     if look.whitened:
         grid = (grid - look.mean) @ look.whiten
     return grid @ direction / np.maximum(np.linalg.norm(grid, axis=2), 1e-12)
-
-
-def load_photo(view: View) -> np.ndarray:  # [H, W, 3] float32 in [0, 1]
-    """Read the photo in the form that is measured."""
-    return load_image_float(view.image_path)
 
 
 def seen_by(features: str, photo: np.ndarray) -> np.ndarray:  # [h, w, 3]

@@ -10,13 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Scene
-from ambiguous_wild.io.files import atomic_dir, atomic_path, refuse_file, write_json, write_text
+from ambiguous_wild.core import Scene
+from ambiguous_wild.harness.sheets import spread
+from ambiguous_wild.io.files import (
+    atomic_dir,
+    atomic_path,
+    refuse_file,
+    refuse_files_there,
+    refuse_foreign_files,
+    write_json,
+    write_text,
+)
+from ambiguous_wild.io.images import load_image_float
 from ambiguous_wild.io.page_parts import data_uri, jpeg_bytes, narrowed
 from ambiguous_wild.io.palette import ADDED, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.report.ambiguity_measure import BINS, Measured, SceneFeatures, cosine_map, load_photo
+from ambiguous_wild.report.ambiguity_measure import BINS, Measured, SceneFeatures, cosine_map
 from ambiguous_wild.report.ambiguity_sources import Background, Masks
 from ambiguous_wild.report.ambiguity_summary import (
     NO_DISTRACTORS,
@@ -38,7 +48,7 @@ SIDE = 480  # px a picture in the figure at most
 def chosen(measured: list[Measured], most: int = PHOTOS) -> list[int]:
     """Return indices of photos spread evenly over the range of occlusion, from little to much."""
     order = sorted(range(len(measured)), key=lambda i: measured[i].counts.occlusion)
-    return [order[round(k)] for k in np.linspace(0, len(order) - 1, min(most, len(order)))]
+    return spread(order, most)
 
 
 def overlay(photo: np.ndarray, distractor: np.ndarray) -> np.ndarray:
@@ -47,14 +57,11 @@ def overlay(photo: np.ndarray, distractor: np.ndarray) -> np.ndarray:
 
 
 def residual_picture(
-    photo: np.ndarray, behind: np.ndarray | None, known: np.ndarray | None, distractor: np.ndarray
+    photo: np.ndarray, behind: np.ndarray, known: np.ndarray | None, distractor: np.ndarray
 ) -> np.ndarray:
     """Draw the residual of the distractors from 0 to 1 on the faded photo; dark grey = unknown."""
     shown = faded((255 * photo + 0.5).astype(np.uint8))
-    use = np.zeros_like(distractor) if behind is None else distractor & (True if known is None else known)
-    residual = np.full(distractor.shape, np.nan)
-    if behind is not None:
-        residual[use] = am.colour_residual(photo, behind)[use]
+    residual = np.where(True if known is None else known, am.colour_residual(photo, behind), np.nan)
     shown[distractor] = ramp(residual, 0.0, 1.0)[distractor]
     return shown
 
@@ -74,6 +81,18 @@ def cosine_picture(
     return np.asarray(cv2.drawContours(shown, edges, -1, (20, 20, 20), max(1, photo.shape[1] // 240)))
 
 
+def _maps(
+    scene: Scene, masks: Masks, background: Background, look: SceneFeatures, index: int
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray | None, ...]]:
+    """Return a photo, its mask, and three pictures of it: overlay, residual, cosine; None where unknown."""
+    view = scene.train[index]
+    photo, distractor = load_image_float(view.image_path), masks.load(view)
+    behind, known = background.load(index, view)
+    residual = None if behind is None else residual_picture(photo, behind, known, distractor)
+    cosine = cosine_picture(look, index, photo, distractor)
+    return photo, distractor, (overlay(photo, distractor), residual, cosine)
+
+
 def write_figure(
     scene: Scene,
     masks: Masks,
@@ -83,23 +102,15 @@ def write_figure(
     path: Path,
 ) -> None:
     """Write the figure with photos, maps and histograms as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     picks = chosen(measured)
     columns = max(len(picks), 3)
     figure = Figure(figsize=(3.6 * columns, 9.2), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(4, 12)
     for column, index in enumerate(picks):
         view = scene.train[index]
-        photo, distractor = load_photo(view), masks.load(view)
-        behind, known = background.load(index, view)
-        pictures = [
-            overlay(photo, distractor),
-            residual_picture(photo, behind, known, distractor) if behind is not None else None,
-            cosine_picture(look, index, photo, distractor),
-        ]
+        _, distractor, pictures = _maps(scene, masks, background, look, index)
         name = view.name if len(view.name) <= 28 else f"…{view.name[-27:]}"
         captions = [
             f"{name}: {100 * distractor.mean():.0f} % covered",
@@ -180,14 +191,10 @@ WIDTH = 420  # px of a picture on the page
 def check_folder(folder: Path) -> None:
     """Raise AwError if the path is a file, or a folder with other files than a report."""
     refuse_file(folder)
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    strange = sorted(p.name for p in folder.iterdir() if p.name not in FILES)
-    if strange or not (folder / FILES[0]).is_file():
-        raise AwError(
-            f"{folder} holds {strange[0] if strange else 'an incomplete report'} and cannot be replaced; "
-            "choose another -o"
-        )
+    if folder.is_dir():
+        refuse_foreign_files(folder, FILES)
+        if not (folder / FILES[0]).is_file():
+            refuse_files_there(folder, FILES)
 
 
 def write_report(
@@ -216,19 +223,13 @@ def _pictures(
     scene: Scene, masks: Masks, background: Background, measured: list[Measured], look: SceneFeatures
 ) -> Iterator[tuple[str, list[tuple[str, bytes]]]]:
     """Yield the name and JPEGs (photo, overlay, residual, cosine) of each photo on the page."""
+    captions = ("photo", "distractors", "difference in colour to the background",
+                "similarity to the largest distractor")  # fmt: skip
     for index in sorted(chosen(measured, SHOWN)):
-        view = scene.train[index]
-        photo, distractor = load_photo(view), masks.load(view)
-        behind, known = background.load(index, view)
-        plain = (255 * photo + 0.5).astype(np.uint8)
-        images = [("photo", plain), ("distractors", overlay(photo, distractor))]
-        if behind is not None:
-            residual = residual_picture(photo, behind, known, distractor)
-            images.append(("difference in colour to the background", residual))
-        cosine = cosine_picture(look, index, photo, distractor)
-        if cosine is not None:
-            images.append(("similarity to the largest distractor", cosine))
-        yield view.name, [(caption, jpeg_bytes(narrowed(image, WIDTH), 85)) for caption, image in images]
+        photo, _, maps = _maps(scene, masks, background, look, index)
+        images = zip(captions, ((255 * photo + 0.5).astype(np.uint8), *maps))
+        jpegs = [(caption, jpeg_bytes(narrowed(i, WIDTH), 85)) for caption, i in images if i is not None]
+        yield scene.train[index].name, jpegs
 
 
 _STYLE = """

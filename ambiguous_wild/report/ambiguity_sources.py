@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.result_file import MODEL
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.images import load_image_float, read_mask
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.io.ply import read_splat_ply
+from ambiguous_wild.viewing.model import gaussians_of
 
 # limits for a background that a run renders
 OPAQUE = 0.9  # accumulated alpha of a surface
@@ -115,41 +116,35 @@ def load_mask(path: Path, view: View) -> np.ndarray:
     return mask >= 128
 
 
-class Background(Protocol):
+Seen = tuple[np.ndarray | None, np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class Background:
     """The background behind the distractors."""
 
-    source: str
-
-    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Return the background of train photo `index`, [H, W, 3] float32 in [0, 1] or None, and where it is
-        known, [H, W] bool (None: everywhere)."""
-        ...
+    source: str  # clean, run or none; kept in the report
+    # returns the background of train photo `index`, [H, W, 3] float32 in [0, 1] or None, and where it is
+    # known, [H, W] bool (None: everywhere)
+    load: Callable[[int, View], Seen]
 
 
-class CleanBackground:
-    """The clean versions of the photos; a photo without one has an unknown background."""
+def clean_background(index: int, view: View, *, folder: Path) -> Seen:
+    """Load the clean version of a photo; a photo without one has an unknown background.
 
-    source = "clean"
-
-    def __init__(self, scene: Scene) -> None:
-        self.folder = scene.root / "truth" / "clean"
-
-    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """See `Background`.
-
-        Raises:
-            AwError: the clean version differs from the photo in size.
-        """
-        path = self.folder / f"{stem(view)}.png"
-        if not path.is_file():
-            return None, None
-        image = load_image_float(path)
-        if image.shape[:2] != (view.camera.height, view.camera.width):
-            raise AwError(
-                f"{path} is {image.shape[1]}x{image.shape[0]}, its photo {view.camera.width}x"
-                f"{view.camera.height}; load the factor it was built for, or build it again"
-            )
-        return image, None
+    Raises:
+        AwError: the clean version differs from the photo in size.
+    """
+    path = folder / f"{stem(view)}.png"
+    if not path.is_file():
+        return None, None
+    image = load_image_float(path)
+    if image.shape[:2] != (view.camera.height, view.camera.width):
+        raise AwError(
+            f"{path} is {image.shape[1]}x{image.shape[0]}, its photo {view.camera.width}x"
+            f"{view.camera.height}; load the factor it was built for, or build it again"
+        )
+    return image, None
 
 
 class RunBackground:
@@ -159,8 +154,6 @@ class RunBackground:
     render is opaque and two other photos see its surface outside of their masks.
     """
 
-    source = "run"
-
     def __init__(self, scene: Scene, run: Path, masks: Masks) -> None:
         """
         Raises:
@@ -168,10 +161,10 @@ class RunBackground:
         """
         check_run(scene, run)
         self.views, self.masks = list(scene.train), masks
-        self._gaussians = _load(run)
+        self._gaussians = gaussians_of(read_splat_ply(run / MODEL))
         self._depth: dict[int, tuple[Camera, np.ndarray, np.ndarray]] = {}  # of the other photos, coarse
 
-    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
+    def load(self, index: int, view: View) -> Seen:
         """See `Background`."""
         if not self._depth:
             self._depth = {k: self._coarse(v) for k, v in enumerate(self.views)}
@@ -207,16 +200,6 @@ class RunBackground:
         return camera, depth, static & (alpha >= OPAQUE)
 
 
-class NoBackground:
-    """An unknown background: colour has no score."""
-
-    source = "none"
-
-    def load(self, index: int, view: View) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """See `Background`."""
-        return None, None
-
-
 def find_background(scene: Scene, choice: str | None, run: Path | None, masks: Masks) -> Background:
     """Find the background to compare with: clean versions if there are any, else the render of a run.
 
@@ -228,11 +211,11 @@ def find_background(scene: Scene, choice: str | None, run: Path | None, masks: M
     if choice is None:
         choice = "clean" if has_clean else "run" if run is not None else ""
     if choice == "clean" and has_clean:
-        return CleanBackground(scene)
+        return Background("clean", partial(clean_background, folder=clean))
     if choice == "run" and run is not None:
-        return RunBackground(scene, run, masks)
+        return Background("run", RunBackground(scene, run, masks).load)
     if choice == "none":
-        return NoBackground()
+        return Background("none", lambda index, view: (None, None))  # colour has no score
     if choice == "run":
         raise AwError("--background run needs --run RUN, a folder of 'aw bench'")
     raise AwError(
@@ -255,7 +238,7 @@ def check_run(scene: Scene, run: Path) -> None:
     from ambiguous_wild.harness.cell import scene_identity
 
     path = run / "config.yaml"
-    if not path.is_file() or not (run / "point_cloud.ply").is_file():
+    if not path.is_file() or not (run / MODEL).is_file():
         raise AwError(
             f"{run} is no finished run (config.yaml and point_cloud.ply); give a folder of 'aw bench', "
             "RUNS/SCENE/METHOD/seed0"
@@ -299,14 +282,3 @@ def sees(
     inside = (local[:, 2] > 1e-6) & (cols >= 0) & (cols < camera.width) & (rows >= 0) & (rows < camera.height)
     r, c = rows.clip(0, camera.height - 1), cols.clip(0, camera.width - 1)
     return inside & static[r, c] & (np.abs(depth[r, c] - z) <= DEPTH_SLACK * z)
-
-
-def _load(run: Path) -> Gaussians:
-    import torch
-
-    from ambiguous_wild.io.ply import read_splat_ply
-    from ambiguous_wild.splat.gaussians import Gaussians
-
-    arrays = read_splat_ply(run / "point_cloud.ply")
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
-    return Gaussians(**tensors)  # type: ignore[arg-type]

@@ -54,17 +54,8 @@ class ColourScore(Scored):
     unknown_px: int  # with an unknown background
 
 
-class EvidenceCounts(TypedDict):
-    """Number of distractors that each kind of evidence reveals; None = the evidence is not available."""
-
-    distractors: int
-    colour: int | None
-    structure: int | None
-    features: int | None
-    motion: int | None
-    nothing: int  # number that no evidence reveals
-
-
+# Number of distractors, of those that a kind of evidence reveals (None = not available), and of the others.
+EvidenceCounts = dict[str, int | None]
 # The content of ambiguity.json. Two keys are names of metrics, so that the type cannot list them.
 Summary = dict[str, Any]
 PhotoRow = dict[str, str | float | None]  # a row of photos.csv, by column
@@ -206,18 +197,12 @@ def _count_evidence(measured: list[Measured]) -> EvidenceCounts:
         answers = [answer for d in every if (answer := getattr(d, kind)) is not None]
         return sum(answers) if answers else None
 
-    return {
-        "distractors": len(every),
-        "colour": count("colour"),
-        "structure": count("structure"),
-        "features": count("features"),
-        "motion": count("motion"),
-        "nothing": sum(not d.told_by for d in every),
-    }
+    nothing = sum(not d.told_by for d in every)
+    return {"distractors": len(every), **{kind: count(kind) for kind in KINDS}, "nothing": nothing}
 
 
 def _evidence_line(counts: EvidenceCounts) -> str:
-    known = {kind: counts[kind] for kind in KINDS if counts[kind] is not None}  # type: ignore[literal-required]
+    known = {kind: counts[kind] for kind in KINDS if counts[kind] is not None}
     parts = ", ".join(f"{kind} reveals {count}" for kind, count in known.items())
     text = f"distractors: {counts['distractors']}; {parts or 'no evidence is available'}; "
     text += f"no evidence reveals {counts['nothing']}"
@@ -290,7 +275,7 @@ def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
             f"(limit {100 * sem.LOOKALIKE_ABOVE:.0f} %)"
         )
     return (
-        f"semantic: cosine {_value(look)} of a photo's most similar distractor to the "
+        f"semantic: cosine {_with_interval(look, 1, 3, '')} of a photo's most similar distractor to the "
         f"{look['compared_with']}: {_word(look)} (limit {sem.AMBIGUOUS_ABOVE})"
     )
 
@@ -300,25 +285,18 @@ def _one(look: SemanticScore) -> str:
 
 
 def _percent(score: Scored) -> str:
-    if score["value"] is None:
-        return "missing"
-    text = f"{100 * score['value']:.1f} %"
-    return (
-        text
-        if score["low"] is None or score["high"] is None
-        else f"{text} [{100 * score['low']:.1f}, {100 * score['high']:.1f}]"
-    )
+    return _with_interval(score, 100, 1, " %")
 
 
-def _value(score: Scored) -> str:
-    if score["value"] is None:
-        return "missing"
-    text = f"{score['value']:.3f}"
-    return (
-        text
-        if score["low"] is None or score["high"] is None
-        else f"{text} [{score['low']:.3f}, {score['high']:.3f}]"
+def _with_interval(score: Scored, times: int, digits: int, unit: str) -> str:
+    """Return the score as text, behind it its interval, both multiplied by `times`."""
+    value, low, high = (
+        None if x is None else f"{times * x:.{digits}f}"
+        for x in (score["value"], score["low"], score["high"])
     )
+    if value is None:
+        return "missing"
+    return value + unit + ("" if low is None or high is None else f" [{low}, {high}]")
 
 
 def _word(score: ColourScore | SemanticScore) -> str:

@@ -210,23 +210,26 @@ def audit(numbers: list[Number]) -> list[Finding]:
     return sorted(findings, key=lambda f: order.index(f.kind))
 
 
+def _by_kind(findings: list[Finding]) -> Iterator[tuple[str, str, list[str]]]:
+    """Yield (kind, its meaning, texts of its findings) for each kind that was found."""
+    for kind, meaning in KINDS.items():
+        if texts := [f.text for f in findings if f.kind == kind]:
+            yield kind, meaning, texts
+
+
 def text_of(findings: list[Finding]) -> str:
     """Return the findings by kind, as text for a terminal."""
     lines = []
-    for kind, meaning in KINDS.items():
-        of_kind = [f for f in findings if f.kind == kind]
-        if of_kind:
-            lines += [f"{kind}: {meaning} ({len(of_kind)})", *(f"  {plain(f.text)}" for f in of_kind), ""]
+    for kind, meaning, texts in _by_kind(findings):
+        lines += [f"{kind}: {meaning} ({len(texts)})", *(f"  {plain(text)}" for text in texts), ""]
     return "\n".join(lines)
 
 
 def markdown_of(findings: list[Finding]) -> str:
     """Return the findings by kind, as Markdown lists."""
     lines = []
-    for kind, meaning in KINDS.items():
-        of_kind = [f for f in findings if f.kind == kind]
-        if of_kind:
-            lines += [f"**{kind}** ({meaning}):", "", *(f"- {markdown_text(f.text)}" for f in of_kind), ""]
+    for kind, meaning, texts in _by_kind(findings):
+        lines += [f"**{kind}** ({meaning}):", "", *(f"- {markdown_text(text)}" for text in texts), ""]
     return "\n".join(lines)
 
 

@@ -117,16 +117,10 @@ def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
         cell["metric"],
         cell["variant"] or UNKNOWN,
         float(cell["value"]),
-        _digits(cell["value"]),
+        6 if "e" in cell["value"].lower() else len(cell["value"].partition(".")[2]),
         int(cell["mark"]) if cell["mark"] else None,
         where,
     )
-
-
-def _digits(text: str) -> int:
-    if "e" in text.lower():
-        return 6
-    return len(text.partition(".")[2])
 
 
 # kind -> its meaning, in the order of the report
@@ -297,11 +291,9 @@ def _entry(a: dict[str, Number], b: dict[str, Number], shared: list[str]) -> Fin
     values = " / ".join(a[m].text for m in a if m in shared)
     left = f"{method_name(first)} on {place_name(first)}"
     right = f"{method_name(second)} on {place_name(second)}"
-    return finding("repeated", f"{left} and {right}: the same {values}", [*_of(a, shared), *_of(b, shared)])
-
-
-def _of(entry: dict[str, Number], metrics: Iterable[str]) -> list[Number]:
-    return [entry[m] for m in metrics]
+    return finding(
+        "repeated", f"{left} and {right}: the same {values}", [entry[m] for entry in (a, b) for m in shared]
+    )
 
 
 def _may_be_one(a: Number, b: Number) -> bool:

@@ -16,6 +16,7 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.report import plain_formats
@@ -24,7 +25,6 @@ from ambiguous_wild.report.plain_formats import shortest
 FORMULA = ("=", "+", "-", "@")
 LARGEST = 200_000_000  # bytes
 LONGEST = 200  # characters of a name
-HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # Unicode categories of invisible characters
 CsvValue = str | int | float | None
 
 
@@ -89,13 +89,18 @@ def to_number(cell: str, where: str) -> float:
     return float(cell)
 
 
+def hidden_in(text: str) -> str | None:
+    """Return the first invisible character; None without any."""
+    return next((c for c in text if plain(c) != c), None)
+
+
 def check_text(kind: str, text: str) -> str:
     """Return the text if it is fit for a table: names may hold everything that can be printed.
 
     Raises:
         AwError: it is empty, too long, or has control characters or text-direction marks.
     """
-    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    hidden = hidden_in(text)
     if not text.strip() or len(text) > LONGEST or hidden is not None:
         shown = text if len(text) <= 40 else text[:37] + "..."
         why = "is empty" if not text.strip() else f"holds {hidden!a}" if hidden else "is too long"
@@ -170,9 +175,9 @@ class Entry:
     @property
     def row_hash(self) -> str:
         """sha256 over the cells of the row, which reveals changes by hand or by a spreadsheet."""
-        plain = {k: getattr(self, k) for k in (*FIRST, *LAST) if k != "row_hash"}
+        cells = {k: getattr(self, k) for k in (*FIRST, *LAST) if k != "row_hash"}
         values = {k: {m: number(v) for m, v in getattr(self, k).items()} for k in ("quality", "cost")}
-        return config_hash(plain | values)
+        return config_hash(cells | values)
 
 
 def in_order(names: Iterable[str]) -> list[str]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.harness.trained_models import MASKS
 from ambiguous_wild.io.files import atomic_path, sha256_file, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import jpeg_bytes
@@ -43,7 +44,6 @@ TEST, TRAIN, EXACT = KINDS = ("test", "train", "exact")
 SIDE = 1600  # px of the longer side, at most
 QUALITY = 90  # of the JPEG
 PREDICTED_RGBA, EXACT_RGBA = (255, 40, 40, 140), (0, 200, 255, 140)
-MASKS = "masks"  # folder of a run: keep maps of train photos
 Row = dict[str, str]  # by column; method is empty for photos and exact masks
 
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypedDict
 from urllib.parse import quote
 
 from ambiguous_wild import __version__
@@ -82,38 +81,13 @@ PAPERS = {
 }
 
 
-class ReportedData(TypedDict):
-    """Reported numbers, as the page's scripts read them."""
-
-    reported: list[dict[str, CsvValue]]  # by `REPORTED_COLUMNS`, and "where"
-    findings: list[dict[str, str | list[str]]]  # kind, text, where
-    sources: dict[str, dict[str, str]]  # table -> title, venue, url, caption
-
-
-class PageData(ReportedData):
-    """What the page's scripts read."""
-
-    date: str
-    version: str
-    order: list[str]  # of the metrics
-    partial: list[str]  # metrics that some images or scenes lack
-    times: list[str]
-    references: list[str]
-    methods: dict[str, dict[str, str]]  # name -> summary, paper, links
-    measures: dict[str, dict[str, str | int | None]]  # key -> label, better, digits
-    runs: list[Facts]  # by `COLUMNS`, and quality, cost, alone
-    models: dict[str, str]
-    images: list[Facts]  # rows of the index of pictures
-    files: list[str]
-
-
 def facts(
     entries: Sequence[Entry],
     index: Iterable[Mapping[str, str]],
     reported: Reported,
     files: list[str],
     models: Mapping[str, str] = MappingProxyType({}),
-) -> PageData:
+) -> Facts:
     """Return the page's data, ready for JSON.
 
     Args:
@@ -138,9 +112,11 @@ def facts(
         "date": datetime.now(UTC).date().isoformat(),
         "version": __version__,
         "order": order,
+        # metrics that some images or scenes lack
         "partial": [*(k for k in (*order, *sorted(missing)) if measure(k).partial), *MASKS],
         "times": list(TIMES),
         "references": sorted({e.method for e in entries if knows_truth(e.method)}),
+        # name -> summary, paper, links
         "methods": {name: _method(name) for name in sorted({e.method for e in entries})},
         "measures": measures,
         "runs": [_run(e) for e in entries],
@@ -197,7 +173,7 @@ class Reported:
     findings: tuple[Finding, ...] = ()
     sources: dict[str, dict[str, str]] = field(default_factory=dict)  # table -> title, venue, url, caption
 
-    def plain(self) -> ReportedData:
+    def plain(self) -> Facts:
         """Return the data for the page, which finds a number's findings by its place ("where")."""
         return {
             "reported": [
@@ -255,12 +231,6 @@ def _link(url: object) -> str:
     """Return an address that a page may link to; empty for anything else, such as javascript:."""
     text = str(url or "")
     return text if re.fullmatch(r"https?://[^\s\"'<>]+", text) else ""
-
-
-def reported_csv(numbers: Sequence[Number]) -> str:
-    """Return CSV with one number per row, each marked as reported, with its value and as printed."""
-    rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in numbers)
-    return board_csv(REPORTED_COLUMNS, rows)
 
 
 def _plain(number: Number, column: str) -> CsvValue:
@@ -338,8 +308,8 @@ def publish(
                     folder / "images" / row["file"],
                     row["sha256"],
                 )
-            pages = write_model_pages(entries, models, folder, say) if models else ModelPages({}, 0)
-            text = page(title, facts(entries, index, printed, names, pages.links))
+            links, pages = write_model_pages(entries, models, folder, say) if models else ({}, 0)
+            text = page(title, facts(entries, index, printed, names, links))
             (folder / "index.html").write_text(text, encoding="utf-8")
             write_json(folder / MANIFEST, list_names(folder))
     return Published(
@@ -348,7 +318,7 @@ def publish(
         images=len(index),
         reported=len(printed.numbers),
         reported_from=None if source is None else str(source),
-        model_pages=pages.pages,
+        model_pages=pages,
     )
 
 
@@ -393,7 +363,8 @@ def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Se
     folder.mkdir()
     files = {path.name: text for path, text in files_of(board, entries).items()}
     if printed:
-        files["reported.csv"] = reported_csv(printed)
+        rows = ([SOURCE, *(_plain(n, column) for column in REPORTED_COLUMNS[1:])] for n in printed)
+        files["reported.csv"] = board_csv(REPORTED_COLUMNS, rows)
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8")
     return list(files)
@@ -409,7 +380,7 @@ def _copy_picture(source: Path, target: Path, digest: str) -> None:
     shutil.copyfile(source, target)
 
 
-def page(title: str, data: PageData) -> str:
+def page(title: str, data: Facts) -> str:
     """Return the page; data and title remain text, whatever they hold."""
     # a picture beside a file:// page is not 'self' in every browser
     template = Path(__file__).resolve().parent / "page"
@@ -420,15 +391,9 @@ MODELS = "models"
 Say = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class ModelPages:
-    """The pages of models that were written."""
-
-    links: dict[str, str]  # link to a run's entry, relative to index.html, by the hash of its result
-    pages: int
-
-
-def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path, say: Say) -> ModelPages:
+def write_model_pages(
+    entries: Sequence[Entry], runs: Sequence[Path], out: Path, say: Say
+) -> tuple[dict[str, str], int]:
     """Write OUT/models/*.html from run folders whose results are on the board.
 
     A method with its setting is shown by the lowest seed that has a model below `runs`.
@@ -438,6 +403,9 @@ def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path,
         runs: run folders, or folders of them.
         out: folder of the published page.
         say: gets a line for each method without a model.
+
+    Returns:
+        The link to each run's entry, relative to index.html, by the hash of its result; and how many pages.
 
     Raises:
         AwError: no run with a model below `runs`, or a scene is not where its run says.
@@ -459,21 +427,20 @@ def write_model_pages(entries: Sequence[Entry], runs: Sequence[Path], out: Path,
             if not at_hand:
                 say(f"no model of {label} on {scene}: its run is not below the given folders")
                 continue
-            chosen = at_hand[0]
-            shown.append((label, by_hash[chosen.result_hash]))
+            shown.append((label, by_hash[at_hand[0].result_hash]))
         if not shown:
             continue
         if len({f.scene_hash for _, f in shown}) > 1:
             raise AwError(f"runs on scene {scene!r} of {dataset!r} used different photos: publish them apart")
         name = _page_name(dataset, scene, names)
         models = [replace(f.model, label=label) for label, f in shown]
-        text, _, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
+        text, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
         (out / MODELS).mkdir(exist_ok=True)
         (out / MODELS / name).write_text(text, encoding="utf-8")
         for label, _ in shown:
             for entry in groups[label]:
                 links[entry.result_hash] = f"{MODELS}/{name}#left={quote(label, safe='')}"
-    return ModelPages(links, len(names))
+    return links, len(names)
 
 
 def _page_name(dataset: str, scene: str, taken: set[str]) -> str:

@@ -5,21 +5,20 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
+from ambiguous_wild.harness.cell import option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import own_json
-from ambiguous_wild.report.board import HIDDEN, Entry
+from ambiguous_wild.report.board import Entry, hidden_in
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
 
@@ -97,7 +96,7 @@ def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -
         words += ["--set", f"{key}={value}"]
     words += ["--device", config.get("device", "cpu"), "-o", "runs"]
     text = " && ".join([*before, shlex.join(str(w) for w in words)])
-    hidden = next((c for c in text if unicodedata.category(c) in HIDDEN), None)
+    hidden = hidden_in(text)
     if hidden is not None:
         raise AwError(f"config.yaml holds the invisible character {hidden!a}: run again without it")
     return text
@@ -133,11 +132,13 @@ def _changed(config: RunConfig) -> dict[str, str]:
     options, name = flatten(config["options"]), config["method"]
     if "@" in name:
         kept = {f"{member}.{k}": options.get(f"{place}.{k}") for place, member, k in _chosen(name)}
-        return {key: _word(value) for key, value in kept.items() if value is not None}
+        return {key: option_text(value) for key, value in kept.items() if value is not None}
     usual = {} if config["source"] else _defaults(name)
     if usual is None:
         return {}
-    return {f"{name}.{k}": _word(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v}
+    return {
+        f"{name}.{k}": option_text(v) for k, v in sorted(options.items()) if k not in usual or usual[k] != v
+    }
 
 
 def _chosen(method: str) -> list[tuple[str, str, str]]:
@@ -162,13 +163,6 @@ def _defaults(method: str) -> Options | None:
     except (AwError, ImportError):
         return None
     return {k: v for k, v in options.items() if k not in entry.by_machine()}
-
-
-def _word(value: Any) -> str:
-    """Return the value as `--set` reads it."""
-    if isinstance(value, (list, tuple)):
-        return ",".join(map(_word, value))
-    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def hardware(path: Path, result: RunResult) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -30,10 +28,10 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.run import EFFECTS
+from ambiguous_wild.harness.run import EFFECTS, ENVIRONMENT
 from ambiguous_wild.harness.store import impossible_values, read_config
 from ambiguous_wild.harness.timing import timing_of
-from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.report.board import ALONE, COST, FIRST, LAST, Entry, check_text
 from ambiguous_wild.report.board_reproduce import (
@@ -45,7 +43,6 @@ from ambiguous_wild.report.board_reproduce import (
     setting,
 )
 
-ENVIRONMENT = "env.json"
 RENDERS = Path("renders") / "test"
 REQUIRED = ("psnr", "ssim", "ssim_inria")  # always measurable: they need only the two pictures
 
@@ -170,9 +167,7 @@ def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tu
 
 def _planned(run: Path) -> bool:
     """Return whether the plan of the scene chose the run's effects."""
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-        return bool(json.loads((run / EFFECTS).read_text(encoding="utf-8"))["asked"] == "auto")
-    return False
+    return bool(own_json(run / EFFECTS).get("asked") == "auto")
 
 
 def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:

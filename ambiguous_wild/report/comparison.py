@@ -314,7 +314,9 @@ def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ())
     Raises:
         AwError: no run has such a metric or scene.
     """
-    frame = pd.concat([_images(runs), _missing(runs), _whole(runs), _failed(runs)], ignore_index=True)
+    parts = [_images(runs), _missing(runs)]
+    parts += [_whole(runs), _failed(runs)] if len(runs.runs) else []
+    frame = pd.concat(parts, ignore_index=True)
     frame = _only(_only(frame, "metric", metrics), "scene", scenes)
     frame["better"] = frame["metric"].map(lambda key: measure(str(key)).better or "")
     if len(runs.runs):  # without a finished run there are neither rows nor hashes
@@ -342,8 +344,6 @@ def _missing(runs: Runs) -> pd.DataFrame:
 
 
 def _whole(runs: Runs) -> pd.DataFrame:
-    if not len(runs.runs):
-        return pd.DataFrame()
     done = runs.runs[runs.runs["status"] == "ok"]
     numbers = [name for name in done.columns if name not in _NO_NUMBER]
     frame = done.melt(_KEYS, numbers, "metric", "value")
@@ -353,7 +353,5 @@ def _whole(runs: Runs) -> pd.DataFrame:
 
 
 def _failed(runs: Runs) -> pd.DataFrame:
-    if not len(runs.runs):
-        return pd.DataFrame()
     lost = runs.runs[runs.runs["status"] == "failed"]
     return lost[_KEYS].assign(image="", metric="failed", value=math.nan, reason=lost["error"])

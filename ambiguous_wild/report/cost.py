@@ -200,7 +200,8 @@ def to_text(report: CostReport) -> str:
     """Return every table of the report as aligned text, with the notes below."""
     parts = [plain_formats.to_text(tables_of(report))]
     parts += [f"{plain(answer.text)}" for answer in report.answers]
-    parts += ["±: sample standard deviation over seeds"] if _has_spread(report) else []
+    spread = any(not math.isnan(p.psnr.spread) for p in report.points)
+    parts += ["±: sample standard deviation over seeds"] if spread else []
     parts += [TIMES[report.reference]]
     parts += [plain(note) for note in report.notes]
     parts += [f"command: {plain(report.made_by)}"] if report.made_by else []
@@ -337,7 +338,3 @@ def number(value: Summary, digits: int, *, sign: bool = False, spread: bool = Tr
         return MISSING
     text = f"{value.mean:{'+' if sign else ''},.{digits}f}"
     return text if math.isnan(value.spread) or not spread else f"{text} ± {value.spread:.{digits}f}"
-
-
-def _has_spread(report: CostReport) -> bool:
-    return any(not math.isnan(p.psnr.spread) for p in report.points)

@@ -82,11 +82,8 @@ def changes(runs: Sequence[CostRun]) -> list[Change]:
 
 
 def _kind(option: str) -> Kind:
-    if option == "resolution":
-        return "resolution"
-    if option == "max_gaussians":
-        return "gaussians"
-    return "interval" if option.rpartition(".")[2].endswith("_every") else "option"
+    own: dict[str, Kind] = {"resolution": "resolution", "max_gaussians": "gaussians"}
+    return own.get(option, "interval" if option.rpartition(".")[2].endswith("_every") else "option")
 
 
 Key = tuple[str, ...]  # name, method, length, and for options the two values

@@ -28,13 +28,11 @@ def new_figure(
     panels: int, *, panel: tuple[float, float] = PANEL, reading: str = ""
 ) -> tuple[Any, list[Any]]:
     """Make a figure without a screen; return it with the axes of its panels. `reading` is a line below it."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = 2 if panels == 4 else min(MOST_COLUMNS, panels)
     rows = -(-panels // columns)
     figure = Figure(figsize=(panel[0] * columns, panel[1] * rows), layout="constrained", dpi=DPI)
-    FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     if reading:
         figure.supxlabel(reading, fontsize=8, color=GREY)
@@ -78,33 +76,22 @@ def line_styles(names: Sequence[str]) -> dict[str, LineStyle]:
     }
 
 
-def text(axes: Any, what: str, **kw: Any) -> None:
-    """Set a title or label that may hold any name, without formulas and control characters."""
-    getattr(axes, f"set_{what}")(plain(kw.pop("label")), parse_math=False, **kw)
-
-
 def spread_out(heights: Sequence[float], gap: float) -> list[float]:
     """Return heights for labels at least `gap` apart, near the given ones; overlapping labels are centred."""
     order = sorted(range(len(heights)), key=lambda i: heights[i])
     pools: list[tuple[float, list[int]]] = []  # (middle, members)
     for i in order:
         pools.append((heights[i], [i]))
-        while len(pools) > 1 and _top(pools[-2], gap) > _bottom(pools[-1], gap):
+        while len(pools) > 1:
             (a, one), (b, two) = pools[-2:]
+            if b - a >= (len(one) + len(two)) * gap / 2:
+                break
             pools[-2:] = [((a * len(one) + b * len(two)) / (len(one) + len(two)), one + two)]
     placed = [0.0] * len(heights)
     for pool in pools:
         for k, i in enumerate(pool[1]):
             placed[i] = pool[0] + (k - (len(pool[1]) - 1) / 2) * gap
     return placed
-
-
-def _top(pool: tuple[float, list[int]], gap: float) -> float:
-    return pool[0] + len(pool[1]) * gap / 2
-
-
-def _bottom(pool: tuple[float, list[int]], gap: float) -> float:
-    return pool[0] - len(pool[1]) * gap / 2
 
 
 def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> None:
@@ -155,7 +142,6 @@ AXES = (
     ("model_mb", "model size (MB)", True),
     ("fps", "frames a second", False),
 )
-KINDS = {kind: k for k, kind in enumerate(CHANGES)}
 
 
 def draw_all(report: CostReport, folder: Path) -> list[Path]:
@@ -203,14 +189,10 @@ def _timeline(axes: Any, curve: Curve, scenes: tuple[str, ...], style: LineStyle
     if finite(x.mean, y.mean) and len(seconds) and x.mean >= seconds[-1]:  # the dot belongs to its curve
         seconds, psnr = np.append(seconds, x.mean), np.append(psnr, y.mean)
     axes.plot(seconds, psnr, **style, linewidth=2.0)
-    return _end(axes, curve.name, x, y, style)
-
-
-def _end(axes: Any, name: str, x: Summary, y: Summary, style: LineStyle) -> Any | None:
     if not finite(x.mean, y.mean):
         return None
     _dot(axes, x, y, style["color"])
-    return name, x.mean, y.mean, style["color"]
+    return curve.name, x.mean, y.mean, style["color"]
 
 
 def _dot(axes: Any, x: Summary, y: Summary, colour: Any, *, hollow: bool = False) -> None:
@@ -326,7 +308,7 @@ def draw_changes(report: CostReport) -> Any | None:
     unit = time_unit(report)
     figure, (axes,) = new_figure(1, panel=(8.6, 1.1 + 0.36 * len(rows)))
     for height, change in enumerate(reversed(rows)):
-        colour = plot_colour(CATEGORIES[KINDS[change.kind]])
+        colour = plot_colour(CATEGORIES[CHANGES.index(change.kind)])
         if finite(change.low, change.high):
             axes.plot([change.low, change.high], [height, height], color=colour, linewidth=2.0)
         axes.plot([change.db.mean], [height], "o", color=colour, markersize=6)
@@ -356,6 +338,7 @@ def _price(change: Change, unit: Unit) -> str:
 
 
 def _finish(axes: Any, title: str, x_label: str) -> None:
-    text(axes, "title", label=title, fontsize=9, loc="left")
-    text(axes, "xlabel", label=x_label, fontsize=8)
-    text(axes, "ylabel", label="test PSNR (dB)", fontsize=8)
+    # names may hold formulas and control characters
+    axes.set_title(plain(title), fontsize=9, loc="left", parse_math=False)
+    axes.set_xlabel(plain(x_label), fontsize=8, parse_math=False)
+    axes.set_ylabel("test PSNR (dB)", fontsize=8)

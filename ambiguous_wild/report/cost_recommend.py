@@ -171,9 +171,8 @@ def _choice(
     name, run = nearest.name, nearest.runs[0]
     own = [value for (setting, _), value in values.items() if setting == name]
 
-    def mean(key: str) -> float:
-        return stats.mean([run.numbers[key] for run in nearest.runs])
-
+    keys = ("ms_per_iteration", "gaussians", "model_mb")
+    ms, gaussians, model_mb = (stats.mean([run.numbers[key] for run in nearest.runs]) for key in keys)
     longest = max(curve.trained_s for curve in curves)
     return Choice(
         name,
@@ -184,9 +183,9 @@ def _choice(
         len(own),
         min(seconds, longest),
         stats.mean([run.setup_s for run in nearest.runs]),
-        mean("ms_per_iteration"),
-        mean("gaussians"),
-        mean("model_mb"),
+        ms,
+        gaussians,
+        model_mb,
         words_of(run),
     )
 

@@ -18,7 +18,7 @@ import numpy as np
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, Options, RunResult, mean_of, read_result
-from ambiguous_wild.harness.store import BOOKKEEPING, ReadConfig, check_names, find_runs, read_config
+from ambiguous_wild.harness.store import BOOKKEEPING, ReadConfig, check_names, find_runs, read_config, section
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.io.files import own_json
 from ambiguous_wild.metrics import stats
@@ -167,8 +167,8 @@ def why_unranked(runs: Iterable[CostRun]) -> str:
 
 def _run(folder: Path, result: RunResult) -> CostRun:
     config = read_config(folder)
-    train, scene = _mapping(config.get("train")), _mapping(config.get("scene"))
-    cost, record = result["cost"], _mapping(result["cost"].get("timing"))
+    train, scene = section(config, "train"), section(config, "scene")
+    cost, record = result["cost"], section(dict(result["cost"]), "timing")
     images = {row["name"]: _number(row.get("psnr")) for row in result["per_image"]}
     psnr, train_s = stats.mean(list(images.values())), _number(cost.get("train_s"))
     effects = config.get("effects") or result["facts"].get("effects") or []
@@ -178,7 +178,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         "train": {k: v for k, v in train.items() if k not in (*BOOKKEEPING, *SETTINGS)},
         "device": config.get("device", cost.get("device")),
         "protocol": config.get("protocol", "full"),
-        "start": _mapping(config.get("start")).get("sha256"),
+        "start": section(config, "start").get("sha256"),
         "code": [config.get("source"), result["version"]],
         "images": sorted(images),
     }
@@ -265,10 +265,6 @@ def _refuse_twice(runs: Iterable[CostRun]) -> None:
                 f"{seen[key]} and {run.folder}; leave one of them out"
             )
         seen[key] = run.folder
-
-
-def _mapping(value: object) -> ReadConfig:
-    return value if isinstance(value, dict) else {}
 
 
 def _number(value: Any) -> float:

@@ -180,16 +180,12 @@ class Answer:
     def text(self) -> str:
         """For example "on yard 90 % of the best PSNR (28.4 dB) takes 41 s (3dgs), the last dB 6 min"."""
         spread = "" if math.isnan(self.most_spread_s) else f" ± {self.most_spread_s:.1f} s"
-        most = (
-            "not measured" if math.isnan(self.most_s) else f"takes {self._most}{spread} ({self.most_curve})"
-        )
+        bound = "at most " if self.bound else ""
+        most = f"takes {bound}{duration(self.most_s)}{spread} ({self.most_curve})"
+        most = "not measured" if math.isnan(self.most_s) else most
         last = "not measured" if math.isnan(self.last_s) else f"{duration(self.last_s)} ({self.best_curve})"
         line = f"on {self.scene} 90 % of the best PSNR ({self.best:.1f} dB) {most}, the last dB {last}"
         return line if self.ranked else f"{line}; not all of these runs were alone on their machine"
-
-    @property
-    def _most(self) -> str:
-        return f"{'at most ' if self.bound else ''}{duration(self.most_s)}"
 
 
 def duration(seconds: float) -> str:

@@ -233,9 +233,6 @@ class ShowInView(Callbacks):
     def say(self, text: str) -> None:
         self._say(text)
 
-    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
-        assert one_by_one, "tick is called only in this process"
-
     def started(self, cell: Cell, folder: Path) -> None:
         self._say(f"{run_name(cell)} -> {folder}")
 

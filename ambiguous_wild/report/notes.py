@@ -13,7 +13,7 @@ from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.harness.result_file import Options
-from ambiguous_wild.harness.store import Runs, read_config
+from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
@@ -63,13 +63,11 @@ def unequal(frame: pd.DataFrame) -> list[str]:
     done = frame[frame["status"] == "ok"]
     lines = []
     for column, what in CONDITIONS.items():
-        if column not in done:
-            continue
         given = done[done[column].astype(str) != ""]  # a method without features is not another condition
         apart = [scene for scene, of in given.groupby("scene") if of[column].astype(str).nunique() > 1]
         if apart:
             rows = given[given["scene"].isin(apart)].groupby("method")[column]
-            each = [f"{method}: {_shared(values)}" for method, values in rows]
+            each = [f"{method}: {' or '.join(dict.fromkeys(map(str, values)))}" for method, values in rows]
             lines.append(
                 f"{UNEQUAL}: {what} differ on {shortlist(map(str, apart))}: {shortlist(each, limit=12)}; a "
                 "rank may be due to this and not to the method"
@@ -86,10 +84,6 @@ def _mixed(frame: pd.DataFrame) -> list[str]:
     """Return a line for each reason to doubt test photos, with the scenes."""
     rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
     return [f"{reason} ({shortlist(sorted(set(of['scene'])))})" for reason, of in rows.groupby("test_photos")]
-
-
-def _shared(values: pd.Series) -> str:
-    return " or ".join(dict.fromkeys(map(str, values)))
 
 
 def _failed(runs: Runs) -> list[str]:
@@ -137,7 +131,7 @@ FITTED = {
 def _fitted(runs: Runs) -> list[str]:
     """Return what each method used of test photos; no lines if all runs were measured on whole photos."""
     ok = runs.runs[runs.runs["status"] == "ok"]
-    if "fit" not in ok or not len(ok) or set(ok["fit"]) == {"full"}:
+    if not len(ok) or set(ok["fit"]) == {"full"}:
         return []
     lines = []
     for kind, text in FITTED.items():
@@ -150,8 +144,6 @@ def _fitted(runs: Runs) -> list[str]:
 def _unfitted(runs: Runs) -> list[str]:
     """Return a line where colour effects were learnt and whole test photos are measured without any fit."""
     ok = runs.runs[runs.runs["status"] == "ok"]
-    if "fit" not in ok or "effects" not in ok:
-        return []
     concerned = ok[(ok["fit"] == "full") & ok["effects"].str.contains("appearance|exposure")]
     scenes = shortlist(sorted(set(concerned["scene"])))
     why = "renders have the mean look of the train photos; PSNR affine or --protocol half compares without"
@@ -174,14 +166,12 @@ def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
 def _options_of(folder: Path, name: str) -> Options:
     """Return the options of a method in a run, by dotted names; a graft has them below its places."""
     config = read_config(folder)
-    options = config.get("options")
-    if not isinstance(options, dict):
-        return {}
+    options = section(config, "options")
     written = str(config.get("method"))
     if "=" in written:
         host, _, rest = written.rpartition("@")
         places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
-        options = next((options.get(p) for p, member in places.items() if member == name), {})
+        options = next((section(options, p) for p, member in places.items() if member == name), {})
     elif "host" in options:  # a graft that is the variant of an ablation: the method is its donor
         options = next((value for place, value in options.items() if place != "host"), {})
     return flatten(options) if isinstance(options, dict) else {}
@@ -237,12 +227,12 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
-    for _, group in ok.groupby(["method", "scene"]) if "options_hash" in ok else ():
+    for _, group in ok.groupby(["method", "scene"]):
         if group["options_hash"].nunique() > 1:
             method, scene = group["method"].iloc[0], group["scene"].iloc[0]
             lines.append(f"{UNEQUAL}: runs of {method} on {scene} have different options")
     for method, group in ok.groupby("method"):
-        if "source" in ok and group["source"].nunique() > 1:
+        if group["source"].nunique() > 1:
             lines.append(
                 f"{UNEQUAL}: results of {method!s} come from {group['source'].nunique()} versions of its "
                 "file (source in config.yaml differs); run them again with one"
@@ -262,7 +252,7 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
             f"{UNEQUAL}: results of different versions of ambiguous_wild: "
             + ", ".join(sorted(set(ok["version"])))
         )
-    elif "code_hash" in ok and ok["code_hash"].nunique() > 1:
+    elif ok["code_hash"].nunique() > 1:
         lines.append(f"{UNEQUAL}: results of {ok['code_hash'].nunique()} states of ambiguous_wild's code")
     seeds = ok.groupby("method")["seed"].nunique()
     if seeds.nunique() > 1:

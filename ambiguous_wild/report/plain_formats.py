@@ -137,16 +137,13 @@ def _markdown_row(cells: Sequence[str]) -> str:
 def _markdown(cell: Cell, column: Column) -> str:
     if cell.markdown:
         return cell.markdown.replace("|", "\\|")
-    text = _markdown_cell(marked(cell, column.measure))
+    text = marked(cell, column.measure)
+    if not re.fullmatch(r"[-\d.,%\[\]{}— ]*", text):  # numbers and intervals stay as they are
+        text = markdown_text(text)
     if cell.rank != 1:
         return text
     value, _, mark = text.rpartition(" (")
     return f"**{value}** ({mark}"
-
-
-def _markdown_cell(text: str) -> str:
-    """Return numbers and intervals unchanged, everything else escaped."""
-    return text if re.fullmatch(r"[-\d.,%\[\]{}— ]*", text) else markdown_text(text)
 
 
 def csv_text(text: str) -> str:

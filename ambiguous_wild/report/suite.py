@@ -123,8 +123,11 @@ def suite_tables(prepared: PreparedSuite, runs: Path) -> list[Table]:
             tables.append(shown if whole else _without_reported_mean(shown))
     if not tables:
         raise AwError(f"{runs} has no finished run of {suite.name}")
-    note = _note(prepared)
-    return [table.with_notes(note) if note else table for table in tables]
+    if not prepared.absent:
+        return tables
+    absent = ", ".join(prepared.absent)
+    note = f"scenes not found: {absent}; our mean is over fewer scenes than the papers'"
+    return [table.with_notes(note) for table in tables]
 
 
 def _without_reported_mean(table: Table) -> Table:
@@ -139,9 +142,3 @@ def _without_reported_mean(table: Table) -> Table:
         for row in table.rows
     ]
     return dataclasses.replace(table, rows=tuple(rows))
-
-
-def _note(prepared: PreparedSuite) -> str:
-    if not prepared.absent:
-        return ""
-    return f"scenes not found: {', '.join(prepared.absent)}; our mean is over fewer scenes than the papers'"

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import convolve
 
 from ambiguous_wild.builder.screen import BLUR_RATIO, sharpness
-from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.effects_plan import (
     APPEARANCE,
@@ -118,7 +118,7 @@ def measure_likeness(scene: Scene) -> Likeness:
         test=len(scene.test),
         size=sizes.most_common(1)[0][0],
         factor=int(scene.info.get("loaded_factor", 1)),
-        focal=float(np.median([_focal(camera) for camera in cameras])),
+        focal=float(np.median([0.5 * (c.fx + c.fy) / math.hypot(c.width, c.height) for c in cameras])),
         arc_deg=arc_of(np.array([camera.cam_from_world[2, :3] for camera in cameras])),
         evidence=measure(scene, photos),
         noise=noise * float(np.median(smaller)) if noise >= NOISE else 0.0,
@@ -283,8 +283,3 @@ def _full_size(scene: Scene, view: View) -> Path:
     """Return the file of a photo before it was made smaller, if the scene has it."""
     path = scene.root / "images" / view.name
     return path if path.is_file() else view.image_path
-
-
-def _focal(camera: Camera) -> float:
-    """Return the focal length over the photo's diagonal."""
-    return 0.5 * (camera.fx + camera.fy) / math.hypot(camera.width, camera.height)

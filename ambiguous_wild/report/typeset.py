@@ -13,7 +13,6 @@ from ambiguous_wild.report.table import TIE, Cell, Row, Table
 
 NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}"
 COLORS = (("awfirst", "1,0.75,0.75"), ("awsecond", "1,0.87,0.72"), ("awthird", "1,0.98,0.72"))
-APPROX = r"$\approx$"
 WIDE = 3  # a table of more columns spans both columns of text
 FIT = "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%"  # shrunk only if too wide
 SPECIAL = {
@@ -28,6 +27,9 @@ SPECIAL = {
     # after the end of a row, LaTeX would read these two as options of the row end
     "[": "{[}",
     "*": "{*}",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    TIE: r"$\approx$",
     "–": "--",
     "—": "---",
 }
@@ -78,7 +80,8 @@ def _tabular(table: Table) -> list[str]:
                 f"\\multicolumn{{{span}}}{{l}}{{\\emph{{reported, not measured here}}}} \\\\",
             ]
             before = row.kind
-        lines.append(_latex_row(table, row))
+        cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
+        lines.append(" & ".join([latex_text(row.name), *cells]) + r" \\")
     # these notes are printed, as they limit what a rank means; the others are comments
     below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
     if not table.title and any(cell.tie for cell in table.cells):  # a bare tabular has no caption
@@ -86,10 +89,7 @@ def _tabular(table: Table) -> list[str]:
     width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
     lines += [
         "\\bottomrule",
-        *(
-            f"{width}{{\\footnotesize {latex_text(note).replace(latex_text(TIE), APPROX)}}} \\\\"
-            for note in below
-        ),
+        *(f"{width}{{\\footnotesize {latex_text(note)}}} \\\\" for note in below),
     ]
     return [*lines, "\\end{tabular}}"]
 
@@ -116,22 +116,10 @@ def _latex_head(table: Table) -> list[str]:
         rules.append(f"\\cmidrule(lr){{{begin}-{begin + count - 1}}}")
         begin += count
     head = table.head[:1].upper() + table.head[1:]
-    labels = (
-        " & ".join([latex_text(head), *(_latex_label(column.measure) for column in table.columns)]) + r" \\"
-    )
+    labels = " & ".join([latex_text(head), *(latex_text(column.label) for column in table.columns)]) + r" \\"
     if not any(title for title, _ in table.groups):
         return [labels]
     return [" & ".join(top) + r" \\", " ".join(rules), labels]
-
-
-def _latex_label(measure: Measure) -> str:
-    arrow = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", None: ""}[measure.better]
-    return latex_text(measure.label) + arrow
-
-
-def _latex_row(table: Table, row: Row) -> str:
-    cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
-    return " & ".join([latex_text(row.name), *cells]) + r" \\"
 
 
 def _latex_cell(cell: Cell, measure: Measure) -> str:

@@ -49,9 +49,7 @@ def read_key(path: Path) -> Key:
             f"cannot read the key {path}: {error.strerror}; 'aw study make' wrote it next to the page"
         ) from None
     except (ValueError, RecursionError) as error:
-        raise AwError(
-            f"the key {path} is damaged ({error}); use the one that 'aw study make' wrote"
-        ) from None
+        raise _damaged(path, str(error)) from None
     if not isinstance(data, dict) or data.get("format") != KEY_FORMAT:
         raise AwError(f"{path} is no key of a study; 'aw study make' wrote it next to the page (*.key.json)")
     if data.get("version") != KEY_VERSION:
@@ -67,12 +65,14 @@ def read_key(path: Path) -> Key:
         and all(_complete(entry) for entry in questions.values())
     )
     if not complete:
-        raise AwError(
-            f"the key {path} is damaged (a field is missing); use the one that 'aw study make' wrote"
-        )
+        raise _damaged(path, "a field is missing")
     if not is_text(json.dumps(data, ensure_ascii=False)):
-        raise AwError(f"the key {path} is damaged (half a character); use the one that 'aw study make' wrote")
+        raise _damaged(path, "half a character")
     return Key(data["study"], data["title"], data["questions"])
+
+
+def _damaged(path: Path, why: str) -> AwError:
+    return AwError(f"the key {path} is damaged ({why}); use the one that 'aw study make' wrote")
 
 
 def _complete(entry: Any) -> bool:
@@ -210,23 +210,16 @@ def _read(path: Path, key: Key) -> Rater:
     if isinstance(rater, str):
         rater = rater.strip()  # ignore blanks, so that a copy is recognised
     if not isinstance(rater, str) or not rater.strip() or len(rater) > LONGEST or not isinstance(name, str):
-        raise AwError(
-            f"{path} has no valid rater ({_short(rater)}): it was edited; ask the rater to save again"
-        )
+        raise _edited(path, f"has no valid rater ({_short(rater)})")
     if not is_text(rater) or not is_text(name):
-        raise AwError(
-            f"{path} has half a character in its rater or name: it was edited; ask the rater to save again"
-        )
+        raise _edited(path, "has half a character in its rater or name")
     answers = tuple(_answer(path, row, key) for row in data["answers"])
     if not answers:
         raise AwError(f"{path} contains no answer: leave it out")
     asked = [a.question for a in answers]
     if len(set(asked)) < len(asked):
         double = sorted({q for q in asked if asked.count(q) > 1})
-        raise AwError(
-            f"{path} answers a question twice ({shortlist(double)}): it was edited; ask the rater to save "
-            "again"
-        )
+        raise _edited(path, f"answers a question twice ({shortlist(double)})")
     return Rater(rater, name[:LONGEST], path, answers)
 
 
@@ -293,10 +286,7 @@ def _answer(path: Path, row: Any, key: Key) -> Answer:
         raise AwError(f"{path} answers {_short(answer)} to {question}; allowed: {', '.join(choices)}")
     left = row.get("left") or ""
     if left not in (("x", "y") if entry["kind"] == KIND_PAIR else ("",)):
-        raise AwError(
-            f"{path} has {_short(left)} as the left image of {question}: it was edited; ask the rater to "
-            "save again"
-        )
+        raise _edited(path, f"has {_short(left)} as the left image of {question}")
     try:
         seconds = -1.0 if isinstance(row.get("ms"), bool) else float(row.get("ms")) / 1000  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
@@ -305,10 +295,12 @@ def _answer(path: Path, row: Any, key: Key) -> Answer:
         raise AwError(f"{path} has no valid time for {question} ({_short(row.get('ms'))}): it was edited")
     shown = row.get("outline")
     if not isinstance(shown, (str, bool, type(None))) or shown not in OUTLINES:
-        raise AwError(
-            f"{path} has {_short(shown)} as outline of {question}: it was edited; ask the rater to save again"
-        )
+        raise _edited(path, f"has {_short(shown)} as outline of {question}")
     return Answer(str(question), answer, left, seconds, seconds < TOO_FAST_S[entry["kind"]], OUTLINES[shown])
+
+
+def _edited(path: Path, what: str) -> AwError:
+    return AwError(f"{path} {what}: it was edited; ask the rater to save again")
 
 
 def _short(value: Any) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePosixPath
@@ -312,15 +312,6 @@ class ShownQuestion(TypedDict):
     images: dict[str, str]  # "photo", "outline", or "x", "y", "truth" -> token of the image
 
 
-class PageData(TypedDict):
-    """What the page's script reads."""
-
-    study: str
-    title: str
-    questions: list[ShownQuestion]
-    images: dict[str, str]  # token -> data URI
-
-
 def _photo(question: PhotoQuestion, album: _Album) -> tuple[dict[str, str], dict[str, str]]:
     """Return tokens of the images that the page shows, and the entry of the key."""
     images = {"photo": album.add(str(question.photo), read_png_rgb(question.photo))}
@@ -343,6 +334,9 @@ def _pair(
     return images, entry
 
 
-def page_html(data: PageData) -> str:
-    """Return the HTML page with its data, escaped so that it cannot end its script element."""
+def page_html(data: Mapping[str, object]) -> str:
+    """Return the HTML page with its data, escaped so that it cannot end its script element.
+
+    `data`: study, title, the questions, and the data URI of each image by its token.
+    """
     return fill_page(Path(__file__).parent, data, ("page.js",))

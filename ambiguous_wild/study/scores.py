@@ -5,6 +5,7 @@ They are shares of preference, a Bradley-Terry ranking, ratings, and the agreeme
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -171,8 +172,11 @@ def agreement(
     if len({answer for _, _, answer in rows}) == 1:
         # alpha is 0/0 if all answers are equal
         return _score(None, equal, questions, "all answers are equal, so alpha is not defined")
-    task, nominal, interval = _nltk()
-    return _score(float(task(data=rows, distance=interval if ordered else nominal).alpha()), equal, questions)
+    nltk, distances = (
+        _needed(f"nltk.metrics.{m}", "scoring a study needs NLTK") for m in ("agreement", "distance")
+    )
+    distance = distances.interval_distance if ordered else distances.binary_distance
+    return _score(float(nltk.AnnotationTask(data=rows, distance=distance).alpha()), equal, questions)
 
 
 def _score(alpha: float | None, equal: float | None, questions: int, note: str = "") -> AgreementScore:
@@ -188,15 +192,12 @@ def _equal(rows: list[tuple[str, str, Any]]) -> float:
     return same / pairs
 
 
-def _nltk() -> tuple[Callable[..., Any], Callable[..., float], Callable[..., float]]:
+def _needed(module: str, why: str) -> Any:
+    """Import a module of the extra [study]; raise AwError with `why` if it is not installed."""
     try:
-        from nltk.metrics.agreement import AnnotationTask
-        from nltk.metrics.distance import binary_distance, interval_distance
+        return importlib.import_module(module)
     except ImportError as error:
-        raise AwError(
-            f"scoring a study needs NLTK ({error}); install it with: {install_command('study')}"
-        ) from None
-    return AnnotationTask, binary_distance, interval_distance
+        raise AwError(f"{why} ({error}); install it with: {install_command('study')}") from None
 
 
 # Regularisation, like this fraction of an extra answer for each side of every pair. It keeps the strength of
@@ -261,12 +262,7 @@ def bradley_terry(
 
 
 def _fit(wins: np.ndarray) -> np.ndarray:
-    try:
-        import choix
-    except ImportError as error:
-        raise AwError(
-            f"ranking a study needs choix ({error}); install it with: {install_command('study')}"
-        ) from None
+    choix = _needed("choix", "ranking a study needs choix")
     theta = choix.ilsr_pairwise_dense(wins, alpha=PRIOR, max_iter=1000)
     return theta - theta.mean()
 

@@ -18,6 +18,7 @@ from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.page_parts import narrowed
+from ambiguous_wild.io.palette import MASKED, tint
 from ambiguous_wild.viewing.model import space_of
 
 if TYPE_CHECKING:
@@ -27,20 +28,6 @@ _WIDTH = 480  # px of a picture that is sent
 _WAIT_S = 0.1  # between checks for requests while paused
 _POINTS = 20_000  # largest number of points of the sparse model
 _ROWS = 2000  # largest number of points of the loss curve
-_RED = np.array([255.0, 0.0, 0.0])
-
-
-def require_viser() -> Any:
-    """Import viser.
-
-    Raises:
-        AwError: it is not installed; the message gives the command.
-    """
-    try:
-        import viser
-    except ImportError:
-        raise AwError(f"a live view needs viser: {install_command('view')}") from None
-    return viser
 
 
 class LiveView:
@@ -57,7 +44,11 @@ class LiveView:
         Raises:
             AwError: viser is missing, or the port is taken.
         """
-        self._viser = require_viser()
+        try:
+            import viser
+        except ImportError:
+            raise AwError(f"a live view needs viser: {install_command('view')}") from None
+        self._viser: Any = viser
         self.port = _free_port(host, port)
         self._server = self._viser.ViserServer(
             host=host, port=self.port, label="aw view --live", verbose=False
@@ -120,10 +111,6 @@ class LiveView:
         with self._woken:
             self._stale = True
             self._woken.notify_all()
-
-    @property
-    def paused(self) -> bool:
-        return self._paused
 
     # -- called in the trainer's thread ------------------------------------------------------------
 
@@ -234,14 +221,13 @@ class LiveView:
         keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
         if keep is None:
             return photo
-        masked = (keep < 0.5).cpu().numpy()
-        photo = photo.copy()
-        photo[masked] = (0.45 * photo[masked] + 0.55 * _RED).astype(np.uint8)
-        return photo
+        return tint(photo, (keep < 0.5).cpu().numpy(), MASKED)
 
 
 def _camera_of(seen: Any) -> Camera | None:
     """Convert a browser's camera to ours; None if the browser has not sent it yet."""
+    from scipy.spatial.transform import Rotation
+
     wxyz, fov, aspect = np.asarray(seen.wxyz, np.float64), float(seen.fov), float(seen.aspect)
     size = np.linalg.norm(wxyz)
     position = np.asarray(seen.position, np.float64)
@@ -253,14 +239,7 @@ def _camera_of(seen: Any) -> Camera | None:
         and 0.05 < aspect < 20
     ):
         return None
-    w, x, y, z = wxyz / size
-    to_world = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    to_world = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = to_world.T, -to_world.T @ position
     height = max(16, min(_WIDTH, round(_WIDTH / aspect)))

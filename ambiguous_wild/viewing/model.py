@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_co
 from ambiguous_wild.io.splat_arrays import finite
 from ambiguous_wild.io.splat_files import Splats, read_splats
 from ambiguous_wild.metrics.image import psnr
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,15 @@ def _turned_harmonics(rest: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return turned.astype(np.float32)
 
 
+def gaussians_of(arrays: Arrays) -> Gaussians:
+    """Return raw parameters as float32 tensors on the CPU."""
+    import torch
+
+    from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
+
+    return Gaussians(**{name: torch.from_numpy(np.array(arrays[name], np.float32)) for name in PARAMETERS})  # type: ignore[arg-type]
+
+
 class Renderer:
     """Renders one model on the CPU, with the kernels it was trained with."""
 
@@ -174,16 +186,9 @@ class Renderer:
         Raises:
             AwError: there is no Gaussian.
         """
-        import torch
-
-        from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
-
         if not len(gaussians["means"]):
             raise AwError("the model has no Gaussian: there is nothing to draw")
-        tensors: dict[str, Any] = {
-            name: torch.from_numpy(np.array(gaussians[name], np.float32)) for name in PARAMETERS
-        }
-        self._gaussians = Gaussians(**tensors)
+        self._gaussians = gaussians_of(gaussians)
         self._render_settings = render_settings
 
     def __call__(self, camera: Camera) -> np.ndarray:  # [H, W, 3] uint8

@@ -12,7 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.core.scene import NO_PHOTO
-from ambiguous_wild.io.files import check_output, refuse_file, write_text
+from ambiguous_wild.io.files import check_output, refuse_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
@@ -38,7 +38,6 @@ class Page:
     path: Path
     bytes: int
     models_bytes: int  # text of the models, part of `bytes`
-    notes: tuple[str, ...]
 
 
 def check_page_folder(folder: Path) -> None:
@@ -56,38 +55,6 @@ def check_page_folder(folder: Path) -> None:
             raise AwError(f"{path} is no page of 'aw view'; choose another -o")
 
 
-def write_page(
-    folder: Path,
-    scene: Scene,
-    models: Sequence[Model],
-    *,
-    title: str,
-    most_gaussians: int = MOST_GAUSSIANS,
-    notes: Sequence[str] = (),
-    say: Callable[[str], None] = lambda text: None,
-) -> Page:
-    """Write FOLDER/index.html atomically.
-
-    Args:
-        folder: created if it does not exist; other files in it stay.
-        scene: scene of all the models.
-        models: at least one.
-        title: title of the page; any text.
-        most_gaussians: a larger model is reduced to this number, with a note.
-        notes: lines below the models.
-        say: called with a line for each model.
-
-    Raises:
-        AwError: the folder holds another page, or a model cannot be read.
-    """
-    check_page_folder(folder)
-    text, models_bytes, page_notes = page_text(
-        scene, models, title=title, most_gaussians=most_gaussians, notes=notes, say=say
-    )
-    write_text(folder / PAGE, text)
-    return Page(folder / PAGE, len(text.encode("utf-8")), models_bytes, page_notes)
-
-
 def page_text(
     scene: Scene,
     models: Sequence[Model],
@@ -96,8 +63,20 @@ def page_text(
     most_gaussians: int = MOST_GAUSSIANS,
     notes: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
-) -> tuple[str, int, tuple[str, ...]]:
-    """Return the page's text, the bytes of models in it, and its notes; arguments as in `write_page`."""
+) -> tuple[str, int]:
+    """Return the page's text, and the bytes of models in it.
+
+    Args:
+        scene: scene of all the models.
+        models: at least one.
+        title: title of the page; any text.
+        most_gaussians: a larger model is reduced to this number, with a note.
+        notes: lines below the models.
+        say: called with a line for each model.
+
+    Raises:
+        AwError: no model, or one that cannot be read.
+    """
     if not models:
         raise AwError("no model to show")
     views = (*scene.test, *scene.train)
@@ -143,7 +122,7 @@ def page_text(
         "models": facts,
         "notes": page_notes,
     }
-    return _fill(title, data, "\n".join(elements)), sum(map(len, elements)), tuple(page_notes)
+    return _fill(title, data, "\n".join(elements)), sum(map(len, elements))
 
 
 def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: bytes, camera: Camera) -> str:
@@ -200,12 +179,7 @@ def _view_facts(view: View, photo: str, points: list[int]) -> dict[str, object]:
     return {
         "name": view.name,
         "split": view.split if view.image_path != NO_PHOTO else "",
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
+        **{field: getattr(camera, field) for field in ("width", "height", "fx", "fy", "cx", "cy")},
         "cam_from_world": camera.cam_from_world.ravel().tolist(),
         "photo": photo,
         "points": points,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild import __version__
-from ambiguous_wild.cli.main import COMMANDS, SECTIONS
+from ambiguous_wild.cli.main import COMMANDS
 from ambiguous_wild.cli.options import say
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.weight_files import read_tensors
@@ -34,10 +34,6 @@ def test_help_lists_every_command_and_version_prints() -> None:
     assert __version__ in typed("--version").stdout
     wrong = typed("tabel")
     assert wrong.returncode == 2 and wrong.stderr.startswith("error: ") and wrong.stdout == ""
-
-
-def test_every_command_is_in_one_section() -> None:
-    assert sorted(name for names in SECTIONS.values() for name in names) == sorted(COMMANDS)
 
 
 @pytest.mark.parametrize("words", [(), ("study",), ("leaderboard",), ("weights",)])

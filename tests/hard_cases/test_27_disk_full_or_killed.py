@@ -20,7 +20,7 @@ SHORT = TrainConfig(iterations=40, probes=0, checkpoint_every_s=0.1)
 
 def bench(scene, output):
     cells = plan_cells(["3dgs"], [scene], [0], SHORT)
-    (report,) = run_cells(cells, output, cache_dir=output / ".cache")
+    (report,) = run_cells(cells, output)
     return report, cell_folder(output, cells[0])
 
 

@@ -5,6 +5,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import training
+from ambiguous_wild.harness.cell import RunOptions
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.harness.training import is_out_of_gpu_memory, out_of_gpu_memory
@@ -54,7 +55,9 @@ def test_the_cell_fails_with_one_line_and_the_next_one_runs(where, tmp_path, mon
         return real(*words, **options)
 
     monkeypatch.setattr(owner, where, full)
-    first, second = run_cells(cells, tmp_path / "runs", pictures=False)
+    first, second = run_cells(
+        cells, tmp_path / "runs", RunOptions(tmp_path / "runs" / ".cache", pictures=False)
+    )
     assert second.outcome == "trained" and first.outcome == "failed"
     gaussians = " with 400 Gaussians" if where == "step" else ""
     assert first.error.startswith(f"out of GPU memory{gaussians}, tried to allocate 2.50 GiB; what helps: ")
@@ -70,6 +73,6 @@ def test_any_other_error_keeps_its_traceback(tmp_path, monkeypatch):
         raise RuntimeError("shapes differ")
 
     monkeypatch.setattr(Trainer, "step", wrong)
-    (report,) = run_cells(cells, tmp_path / "runs", pictures=False)
+    (report,) = run_cells(cells, tmp_path / "runs", RunOptions(tmp_path / "runs" / ".cache", pictures=False))
     assert report.error.startswith("RuntimeError: shapes differ; traceback: ")
     assert "in wrong" in (report.folder / "traceback.txt").read_text()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import sheets
+from ambiguous_wild.harness.cell import RunOptions
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.harness.pictures import (
     CELL,
@@ -19,7 +19,6 @@ from ambiguous_wild.harness.pictures import (
     draw_density,
     strip,
 )
-from ambiguous_wild.harness.sheets import write_contact
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.palette import ramp
 from ambiguous_wild.io.scene_folder import load_scene
@@ -125,7 +124,7 @@ def test_pictures_grow_while_any_method_trains(scene, tmp_path):
 
 def test_pictures_can_be_left_away(scene, tmp_path):
     cells = plan_cells(["3dgs"], [scene.root], [0], TrainConfig(iterations=20, probes=0))
-    (report,) = run_cells(cells, tmp_path, pictures=False)
+    (report,) = run_cells(cells, tmp_path, RunOptions(tmp_path / ".cache", pictures=False))
     assert report.outcome == "trained"
     assert not (report.folder / "pictures").exists()
 
@@ -148,26 +147,22 @@ def test_nothing_grown_nothing_drawn(scene, tmp_path):
     assert draw_density(trainer, tmp_path / "density.png") == []
 
 
-def test_a_contact_sheet_shows_named_photos_tinted(scene, tmp_path):
+def test_a_contact_sheet_shows_photos_tinted(scene, tmp_path):
     keep = np.full((HEIGHT, WIDTH), 255, np.uint8)
     keep[:, : WIDTH // 2] = 0
     for name in TRAIN:
         write_png(tmp_path / "masks" / name, keep)
-    (path,) = write_contact(scene, tmp_path / "masks", tmp_path / "p" / "masks.jpg", names=["train_3.png"])
+    (path,) = sheets.write_contact(scene, tmp_path / "masks", tmp_path / "p" / "masks.jpg")
     sheet = cv2.imread(str(path))[:, :, ::-1].astype(float)
-    assert sheet.shape[1] == 320 + sheets.GAP
+    assert sheet.shape[1] == 5 * (320 + sheets.GAP)  # six photos, five in a row
     photo = read_png_rgb(scene.root / "images" / "train_3.png").astype(float)
-    inside = sheet[sheets.BAR : -sheets.GAP, : -sheets.GAP]
+    inside = sheet[sheets.BAR : sheet.shape[0] // 2 - sheets.GAP, 3 * (320 + sheets.GAP) :][:, :320]
     left, right = inside[:, :150].mean((0, 1)), inside[:, 170:].mean((0, 1))
     np.testing.assert_allclose(right, photo[:, 34:].mean((0, 1)), atol=4)
     np.testing.assert_allclose(
         left, 0.45 * photo[:, :30].mean((0, 1)) + 0.55 * np.array([255, 30, 30]), atol=4
     )
-    (path,) = write_contact(scene, tmp_path / "masks", tmp_path / "all.jpg", most=4)
-    assert cv2.imread(str(path)).shape[1] == 4 * (320 + sheets.GAP)
-    with pytest.raises(AwError, match="train photo"):
-        write_contact(scene, tmp_path / "masks", path, names=["train_9.png"])
-    assert write_contact(scene, tmp_path / "none", tmp_path / "none.jpg") == []
+    assert sheets.write_contact(scene, tmp_path / "none", tmp_path / "none.jpg") == []
 
 
 def test_the_ramp_is_monotone_from_green_to_red_and_nan_is_grey():

@@ -12,7 +12,7 @@ import pytest
 from ambiguous_wild.core import AwError, Camera, Points, Scene, View
 from ambiguous_wild.harness import effects_plan, mask_plan
 from ambiguous_wild.harness import effects_plan as decide_module
-from ambiguous_wild.harness.cell import scene_identity
+from ambiguous_wild.harness.cell import RunOptions, scene_identity
 from ambiguous_wild.harness.chosen_effects import check_wanted
 from ambiguous_wild.harness.effects_plan import (
     FEW_PHOTOS,
@@ -323,7 +323,7 @@ def test_a_plan_of_another_state_of_the_scene_is_refused(tmp_path):
 def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_path):
     plan = Plan("scene", decide("scene", measured(zoom=3.0)).decisions)
     cells = plan_cells(["3dgs"], [tiny], [0], SHORT, effects="auto", plan=plan, protocol="half")
-    (report,) = run_cells(cells, tmp_path, pictures=False)
+    (report,) = run_cells(cells, tmp_path, RunOptions(tmp_path / ".cache", pictures=False))
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
     assert said["asked"] == "auto" and said["effects"] == ["antialias", "skybox"]

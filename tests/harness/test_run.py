@@ -12,6 +12,7 @@ import torch
 import yaml
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.cell import RunOptions
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells, try_recipes
 from ambiguous_wild.harness.result_file import check_model, read_result
 from ambiguous_wild.harness.run import refuse_other_config
@@ -51,7 +52,7 @@ def _methods(monkeypatch):
 
 def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):
     cells = plan_cells(methods, [scene], kw.pop("seeds", [0]), train, **kw)
-    return cells, run_cells(cells, output, overwrite=overwrite)
+    return cells, run_cells(cells, output, RunOptions(output / ".cache", overwrite))
 
 
 class NothingKept(MaskPolicy):
@@ -182,7 +183,9 @@ def test_a_checkpoint_of_another_run_is_refused_by_name(scene, tmp_path):
     (report,) = run_cells([cell], tmp_path / "b")
     assert report.outcome == "failed"
     assert "is of another run (3dgs on scene, seed 1, 61 iterations" in report.error
-    (same,) = run_cells([dataclasses.replace(cell)], tmp_path / "b", overwrite="always")
+    (same,) = run_cells(
+        [dataclasses.replace(cell)], tmp_path / "b", RunOptions(tmp_path / "b" / ".cache", "always")
+    )
     assert same.outcome == "trained"
 
 

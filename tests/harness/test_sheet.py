@@ -24,9 +24,9 @@ def runs(tmp_path_factory):
 
 
 def test_a_column_for_the_photo_and_each_method_a_row_for_each_view(runs, tmp_path):
-    assert write_sheet(read_runs(runs), tmp_path / "sheet.png", views=2) == 1
+    assert write_sheet(read_runs(runs), tmp_path / "sheet.png") == 1
     sheet = read_png_rgb(tmp_path / "sheet.png")
-    assert sheet.shape == (4 * (HEIGHT + BAR + GAP), 2 * (WIDTH + GAP), 3)
+    assert sheet.shape == (5 * (HEIGHT + BAR + GAP), 2 * (WIDTH + GAP), 3)
     photo = read_png_rgb(runs.parent / "scene" / "images" / "test_0.png")
     render = read_png_rgb(runs / "scene" / "3dgs" / "seed0" / "renders" / "test" / "test_0.png")
     assert np.array_equal(sheet[BAR : BAR + HEIGHT, :WIDTH], photo)

@@ -58,6 +58,10 @@ const chosenScenes = () => scenesOf(state.dataset).filter((s) => !state.off.has(
 /** The datasets, the one with most runs first. */
 const measuredDatasets = () => unique(DATA.runs.map((r) => r.dataset)).sort((a, b) => runsOf(b).length - runsOf(a).length || byName(a, b));
 
+/** The options of a group's command without the method's name. */
+const changedOptions = (group) =>
+  [...group.runs[0].reproduce.matchAll(/--set [^\s.]+\.(\S+)/g)].map((match) => match[1]).join(", ") || "default options";
+
 /** Every group of runs of a dataset that differ in scene and seed alone. No filter: ranks count all of them. */
 function groups(dataset) {
   const found = new Map();
@@ -70,7 +74,9 @@ function groups(dataset) {
   for (const g of all) {
     // Options are named where methods and settings alone do not tell groups apart.
     const twins = all.filter((o) => o.method === g.method && o.setting === g.setting);
-    const about = twins.length > 1 && g.options ? `${g.setting}, options ${g.options}` : g.setting;
+    const set = changedOptions(g);
+    const alike = twins.some((o) => o !== g && changedOptions(o) === set);
+    const about = twins.length > 1 ? `${g.setting}, ${set}${alike ? ` (${g.options})` : ""}` : g.setting;
     g.about = about.replaceAll("+", " + "); // lines break between effects, not inside a word
   }
   return all;

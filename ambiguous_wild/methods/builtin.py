@@ -31,7 +31,7 @@ BUILTIN = (
         config="ambiguous_wild.methods.refinesplat.paper:PaperConfig",
         paper="Rectifying Mask via Entropy for Distractor-Free 3DGS in Ambiguous Scenarios",
         needs=PAPER_NETWORKS,
-        ablations="ambiguous_wild.methods.refinesplat.paper_ablations:ABLATIONS",
+        ablations="ambiguous_wild.methods.refinesplat.ablations:PAPER_ABLATIONS",
         note="all parts of the paper, repaired where the print degenerates (docs/fidelity.md); features "
         "{features}, instances {instances}",
     ),

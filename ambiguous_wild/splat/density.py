@@ -81,6 +81,9 @@ class DensityControl:
     # sums for each Gaussian since the last round: attribute name, and the shape after [N]
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}
 
+    # attributes with plain values that a checkpoint holds
+    saved: ClassVar[tuple[str, ...]] = ("last_growth", "last_reset", "resets_done")
+
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
         self.config = config
         self.extent = extent
@@ -307,19 +310,14 @@ class DensityControl:
 
     def state_dict(self) -> State:
         return {
-            **{name: getattr(self, name) for name in self.sums},
-            "last_growth": self.last_growth,
-            "last_reset": self.last_reset,
-            "resets_done": self.resets_done,
+            **{name: getattr(self, name) for name in (*self.sums, *self.saved)},
             "rng": self.rng.bit_generator.state,
             "log": self.log.state_dict(),
         }
 
     def load_state_dict(self, state: State) -> None:
-        for name in self.sums:
+        for name in (*self.sums, *self.saved):
             setattr(self, name, state[name])
-        self.last_growth, self.last_reset = state["last_growth"], state["last_reset"]
-        self.resets_done = state["resets_done"]
         self.rng.bit_generator.state = state["rng"]
         self.log.load_state_dict(state["log"])
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Scene
+from ambiguous_wild.methods.masking_common import nearest
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import (
     Identities,
@@ -81,7 +82,7 @@ class FrozenInputs:
         association = self._identities(phi)
         grid, identities = [], []
         for index, label in enumerate(self.labels):
-            cells = grid_labels(np.maximum(label, 0), *phi[index].shape[:2])
+            cells = nearest(torch.from_numpy(np.maximum(label, 0)), *phi[index].shape[:2]).numpy()
             grid.append(torch.from_numpy(cells.astype(np.int64)).to(data.device))
             ids = association.of_instance[index][cells].astype(np.int64)
             identities.append(torch.from_numpy(ids).to(data.device))
@@ -111,13 +112,6 @@ class FrozenInputs:
             min_similarity=config.identity_similarity,
             most=most,
         )
-
-
-def grid_labels(labels: np.ndarray, h: int, w: int) -> np.ndarray:
-    """Return the labels [h, w] at the centres of cells of labels [H, W]."""
-    rows = ((np.arange(h) * 2 + 1) * labels.shape[0]) // (2 * h)
-    columns = ((np.arange(w) * 2 + 1) * labels.shape[1]) // (2 * w)
-    return labels[rows[:, None], columns[None, :]]
 
 
 def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:

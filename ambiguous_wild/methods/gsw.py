@@ -177,11 +177,8 @@ class GswAppearance(Learnt):
         }
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        photo, means, intrinsic = (
-            self._seen(shot),
-            visible.means.detach(),
-            visible.attributes["gsw_intrinsic"],
-        )
+        photo, means = self._seen(shot), visible.means.detach()
+        intrinsic = visible.attributes["gsw_intrinsic"]
         maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
         places, box = visible.attributes["gsw_places"], visible.attributes["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
@@ -216,10 +213,8 @@ class GswAppearance(Learnt):
     def _maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> list[Tensor]:
         """Return maps of at most `MOST` train photos, evenly chosen; computed once an iteration."""
         if self._cached is None or self._cached[0] != shot.nominal:
-            self._cached = (
-                shot.nominal,
-                [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen],
-            )
+            maps = [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen]
+            self._cached = shot.nominal, maps
         return self._cached[1]
 
     @torch.no_grad()

@@ -107,12 +107,8 @@ def _hull() -> list[Shape]:
 def _window(name: str, left: float, right: float, bottom: float, top: float) -> list[Shape]:
     """Make frame, bars and sill of a window, and curtains on both sides."""
     frame: dict[str, Any] = {"tint": WHITE, "axes": WALL_AXES[name]}
-    middle, height, wide, high = (
-        (left + right) / 2,
-        (bottom + top) / 2,
-        (right - left) / 2,
-        (top - bottom) / 2,
-    )
+    middle, height = (left + right) / 2, (bottom + top) / 2
+    wide, high = (right - left) / 2, (top - bottom) / 2
     pieces = [
         (middle, bottom - 0.02, wide + 0.08, 0.03, 0.11),
         (middle, top, wide + 0.04, 0.035, 0.05),

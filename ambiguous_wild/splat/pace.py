@@ -142,9 +142,8 @@ class Pace:
         self.config, self.schedule = config, schedule
         self.extent = data.scene.extent
         self.views = len(data.photos)
-        self._order: tuple[int, np.ndarray] | None = (
-            None  # epoch and order of views of the last call of `view`
-        )
+        # epoch and order of views of the last call of `view`
+        self._order: tuple[int, np.ndarray] | None = None
         self.start = start
         self.short = config.budget_s is not None or config.iterations < schedule.short_below
         self.most = self._most(data, most)

@@ -114,15 +114,6 @@ def step_of(
     )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As the trainer has it: with two, load decides how a sum is split, and that its last bits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     clean = [background(12 * v) for v in range(VIEWS)]

@@ -23,23 +23,9 @@ from ambiguous_wild.methods.robustsplat import (
 from ambiguous_wild.vision import backends
 from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, step_of, trained
-from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
+from tests.tiny_scene import SQUARE, TRAIN, wall_colour
 
 EARLY = {"min_mask_start": "20"}
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Barriers between threads cost more than these small maps do."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def clean_photo(view: int) -> torch.Tensor:

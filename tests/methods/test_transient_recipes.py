@@ -18,12 +18,6 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.render import render
 from tests.methods.baselines import data_of, masked_more_inside, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def random(*shape, seed=0):

@@ -205,7 +205,7 @@ def _transfer(
         AwError: the server refuses, or announces another file than the first download.
     """
     have = part.stat().st_size if part.is_file() else 0
-    tag = _read_state(state) if have else ""
+    tag = str(own_json(state).get("etag", "")) if have else ""
     request = urllib.request.Request(data.url, headers={"User-Agent": f"ambiguous-wild/{__version__}"})
     request.add_header("Accept-Encoding", "identity")
     if have:
@@ -272,11 +272,6 @@ def _copy(
         tick(done, total)
     if total is not None and done < total:
         raise _Broken(f"broken off after {done} of {total} bytes")
-
-
-def _read_state(path: Path) -> str:
-    """Read the server's tag of the downloaded part; empty if it is not known."""
-    return str(own_json(path).get("etag", ""))
 
 
 def _read_record(folder: Path) -> dict[str, Download]:

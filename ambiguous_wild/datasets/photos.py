@@ -244,7 +244,7 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
     factor = 1 if plan.only_small else scene.factor
     pinhole = lens.pinhole
     if not plan.convert:
-        name = _stored_name(plan)
+        name = _as(plan.image.name, plan.source.suffix)
         link_file(plan.source, full / name)
         if factor > 1:
             if plan.small is not None:
@@ -289,11 +289,6 @@ def _placed(
 ) -> PlacedPhoto:
     source = plan.source.relative_to(scene.root).as_posix()
     return PlacedPhoto(image, camera, tuple(notes) or ("linked",), source)
-
-
-def _stored_name(plan: PhotoPlan) -> str:
-    """Return the photo's name with the extension of its file."""
-    return _as(plan.image.name, plan.source.suffix)
 
 
 def _as(name: str, suffix: str) -> str:

@@ -149,16 +149,12 @@ def trace(
         ),
         static.columns(),
         movers.columns(),
-        (_empty_table(static) if shadow_casters is None else shadow_casters).columns(),
+        tuple(c[:0] for c in static.columns()) if shadow_casters is None else shadow_casters.columns(),
         (atlas.texels, atlas.offset, atlas.width, atlas.height, atlas.levels),
         (light.sun, light.sun_colour, light.sky_colour, light.ground_colour),
         (clean, distracted, owner, depth, darkened),
     )
     return TracedPhoto(clean, distracted, None if shadow_casters is None else darkened, owner, depth)
-
-
-def _empty_table(table: ShapeTable) -> ShapeTable:
-    return ShapeTable(*(column[:0] for column in table.columns()))
 
 
 @kernel(inline="never")

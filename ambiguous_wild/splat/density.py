@@ -183,7 +183,8 @@ class DensityControl:
 
     def reset_opacity(self, gaussians: Gaussians) -> None:
         """Hook: lower the opacities, in place."""
-        gaussians.opacity_logits.clamp_(max=_logit(self.config.reset_opacity))
+        target = self.config.reset_opacity
+        gaussians.opacity_logits.clamp_(max=float(np.log(target / (1 - target))))
 
     def due(self, step: Step) -> bool:
         """Whether `refine` may change something now; classes that override `refine` extend it.
@@ -339,7 +340,3 @@ def shaped(noise: Tensor, gaussians: Gaussians) -> Tensor:
     """Turn normal draws [N, 3] into offsets from the means [N, 3] with the Gaussians' covariances."""
     local = noise * gaussians.log_scales.exp()
     return (rotation_matrices(gaussians.quats) @ local[:, :, None]).squeeze(2)
-
-
-def _logit(p: float) -> float:
-    return float(np.log(p / (1 - p)))

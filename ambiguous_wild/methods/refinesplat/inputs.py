@@ -16,7 +16,6 @@ from ambiguous_wild.methods.refinesplat.identity import (
     Identities,
     Psi,
     associate,
-    psi_arrays,
     psi_from_arrays,
     train_psi,
 )
@@ -242,7 +241,8 @@ def _psi(
     names = ["mean", "std", "first.weight", "first.bias", "last.weight", "last.bias"]
 
     def compute() -> dict[str, np.ndarray]:
-        return psi_arrays(train_psi(cells, ids, count, config.psi, config.mask.variant, data.seed))
+        psi = train_psi(cells, ids, count, config.psi, config.mask.variant, data.seed)
+        return {name: tensor.cpu().numpy() for name, tensor in psi.state_dict().items()}
 
     return psi_from_arrays(cached(data.cache_dir, key, dict.fromkeys(names, np.float32), compute)).to(
         data.device

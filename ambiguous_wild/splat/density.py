@@ -196,10 +196,10 @@ class DensityControl:
         return self._growth_due(step) or resets
 
     def _growth_due(self, step: Step) -> bool:
-        config = self.config
-        due = step.iteration - self.last_growth >= config.min_every
-        due = due and step.nominal >= config.start and step.nominal <= config.stop
-        return due and self._crossed(step, config.every)
+        config, since = self.config, step.iteration - self.last_growth
+        due = since >= config.min_every and config.start <= step.nominal <= config.stop
+        # in nominal iterations; in short runs `min_every` dominates
+        return due and since * (step.nominal / step.iteration) >= config.every - 1e-6
 
     def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         """Hook: change the set once more after growth and pruning, for example by merging."""
@@ -214,11 +214,6 @@ class DensityControl:
         if (width, height) not in self._halves:
             self._halves[width, height] = torch.tensor([width / 2, height / 2]).to(device)
         return self._halves[width, height]
-
-    def _crossed(self, step: Step, every: float) -> bool:
-        # `every` nominal iterations since the last round; in short runs `min_every` dominates.
-        scale = step.nominal / step.iteration
-        return (step.iteration - self.last_growth) * scale >= every - 1e-6
 
     def _reset_due(self, step: Step) -> bool:
         config = self.config

@@ -6,7 +6,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from ambiguous_wild.datasets.foreign import without_suffix
 from ambiguous_wild.datasets.photos import link_file
 from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.colmap_model import read_model, write_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.colmap_records import Model, ModelCamera
 from ambiguous_wild.io.files import atomic_dir, check_output
 from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.ply import write_point_ply
@@ -96,14 +96,8 @@ def _sized_model(scene: Scene) -> Model:
         if key not in cameras:
             cameras[key] = ModelCamera(len(cameras) + 1, "PINHOLE", c.width, c.height, params)
         scale = np.array([c.width / full.width, c.height / full.height])
-        images[number] = ModelImage(
-            number,
-            image.qvec,
-            image.tvec,
-            cameras[key].camera_id,
-            _stored(view),
-            image.xys * scale,
-            image.point_ids,
+        images[number] = replace(
+            image, camera_id=cameras[key].camera_id, name=_stored(view), xys=image.xys * scale
         )
     return Model({c.camera_id: c for c in cameras.values()}, images, model.points.seen_in(images))
 

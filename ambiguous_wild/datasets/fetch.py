@@ -142,9 +142,8 @@ def fetch(
             where = "the registry" if data.sha256 else f"{folder / RECORD}, from the first download,"
             raise AwError(
                 f"{data.name}: {archive.name} has sha256 {actual[:16]}..., but {where} states "
-                f"{digest[:16]}...: the "
-                "server serves another file, or it was changed here; it is kept as .refused, remove "
-                "it to try again"
+                f"{digest[:16]}...: the server serves another file, or it was changed here; it is kept as "
+                ".refused, remove it to try again"
             )
         if prior is None:
             first = not data.sha256
@@ -191,9 +190,8 @@ def _download(
             reason = str(error)
             say(f"{data.name}: {reason}; {now} bytes downloaded so far, try {attempt + 1} of {tries}")
     raise AwError(
-        f"{data.name}: {data.url} broke off {tries} times, last: {reason}; what came is kept: run the "
-        "same command "
-        "again to go on"
+        f"{data.name}: {data.url} broke off {tries} times, last: {reason}; what came is kept: run the same "
+        "command again to go on"
     )
 
 
@@ -207,7 +205,7 @@ def _transfer(
         AwError: the server refuses, or announces another file than the first download.
     """
     have = part.stat().st_size if part.is_file() else 0
-    tag = _read_state(state) if have else ""
+    tag = str(own_json(state).get("etag", "")) if have else ""
     request = urllib.request.Request(data.url, headers={"User-Agent": f"ambiguous-wild/{__version__}"})
     request.add_header("Accept-Encoding", "identity")
     if have:
@@ -223,8 +221,7 @@ def _transfer(
             if prior is not None and total is not None and total != prior["bytes"]:
                 raise AwError(
                     f"{data.name}: the server now announces {total} bytes, the first download had "
-                    f"{prior['bytes']}: "
-                    f"it is another file; remove the entry in {RECORD} if you trust it"
+                    f"{prior['bytes']}: it is another file; remove the entry in {RECORD} if you trust it"
                 )
             write_json(state, {"etag": "" if etag.startswith("W/") else etag})
             with open(part, "r+b" if start else "wb") as f:
@@ -275,11 +272,6 @@ def _copy(
         tick(done, total)
     if total is not None and done < total:
         raise _Broken(f"broken off after {done} of {total} bytes")
-
-
-def _read_state(path: Path) -> str:
-    """Read the server's tag of the downloaded part; empty if it is not known."""
-    return str(own_json(path).get("etag", ""))
 
 
 def _read_record(folder: Path) -> dict[str, Download]:

@@ -123,9 +123,8 @@ def split_by_lists(
         if side not in split.values():
             raise AwError(
                 f"{where}: none of the {len(listed[side])} {side} photos is in the model "
-                f"({shortlist(listed[side], 3)}; the model has {shortlist(sorted(in_model), 3)}): the "
-                "list belongs "
-                "to another scene"
+                f"({shortlist(listed[side], 3)}; the model has {shortlist(sorted(in_model), 3)}): the list "
+                "belongs to another scene"
             )
     return split, missing
 
@@ -178,21 +177,3 @@ def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ c2w[:3, 3]
     return pose
-
-
-def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Convert a rotation [3, 3] to (w, x, y, z) with w >= 0; source: Shepperd 1978."""
-    m = np.asarray(rotation, dtype=np.float64)
-    trace = np.trace(m)
-    choice = int(np.argmax([trace, m[0, 0], m[1, 1], m[2, 2]]))
-    if choice == 0:
-        q = np.array([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    else:
-        i, j, k = ((0, 1, 2), (1, 2, 0), (2, 0, 1))[choice - 1]
-        q = np.zeros(4)
-        q[0] = m[k, j] - m[j, k]
-        q[1 + i] = 1 + m[i, i] - m[j, j] - m[k, k]
-        q[1 + j] = m[j, i] + m[i, j]
-        q[1 + k] = m[k, i] + m[i, k]
-    q /= np.linalg.norm(q)
-    return q if q[0] >= 0 else -q

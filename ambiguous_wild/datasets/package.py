@@ -164,7 +164,7 @@ def _pack(
         for path in names:
             data = (root / path).read_bytes()
             photo = _photo_of(path, stems)
-            if not keep_metadata and _is_photo(path):
+            if not keep_metadata and path.lower().endswith(_PHOTO_KINDS):
                 data, dropped = strip_metadata(data, str(root / path))
                 if dropped and photo is not None:
                     removed.setdefault(photo, set()).update(dropped)
@@ -196,10 +196,6 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     entry = zipfile.ZipInfo(name, _TIME)
     entry.compress_type, entry.create_system, entry.external_attr = zipfile.ZIP_STORED, 3, 0o644 << 16
     archive.writestr(entry, data)
-
-
-def _is_photo(path: str) -> bool:
-    return path.lower().endswith(_PHOTO_KINDS)
 
 
 def _photo_of(path: str, stems: dict[str, str]) -> str | None:

@@ -128,9 +128,8 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
         )
     if wrong:
         raise AwError(
-            f"{len(wrong)} of {total} photos in {folder} do not fit the model: {shortlist(wrong, 3)}; "
-            "use the "
-            "photos that the model was built from"
+            f"{len(wrong)} of {total} photos in {folder} do not fit the model: {shortlist(wrong, 3)}; use "
+            "the photos that the model was built from"
         )
     return plans
 
@@ -193,9 +192,8 @@ def _plan(
         found = header_size(small) if small is not None else None
         if found is not None and not _same_shape(found, size):
             raise AwError(
-                f"{small} is {found[0]}x{found[1]}, another shape than {source} "
-                f"({size[0]}x{size[1]}): it is no "
-                f"copy of it; remove images_{scene.factor} to make it anew"
+                f"{small} is {found[0]}x{found[1]}, another shape than {source} ({size[0]}x{size[1]}): it is "
+                f"no copy of it; remove images_{scene.factor} to make it anew"
             )
     at_size = camera if not (convert or only_small) else resized(camera, *size)
     return PhotoPlan(image, source, at_size, small, only_small, convert, turn)
@@ -246,7 +244,7 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
     factor = 1 if plan.only_small else scene.factor
     pinhole = lens.pinhole
     if not plan.convert:
-        name = _stored_name(plan)
+        name = _as(plan.image.name, plan.source.suffix)
         link_file(plan.source, full / name)
         if factor > 1:
             if plan.small is not None:
@@ -291,11 +289,6 @@ def _placed(
 ) -> PlacedPhoto:
     source = plan.source.relative_to(scene.root).as_posix()
     return PlacedPhoto(image, camera, tuple(notes) or ("linked",), source)
-
-
-def _stored_name(plan: PhotoPlan) -> str:
-    """Return the photo's name with the extension of its file."""
-    return _as(plan.image.name, plan.source.suffix)
 
 
 def _as(name: str, suffix: str) -> str:

@@ -26,13 +26,10 @@ _PNG_KEPT = frozenset(b"IHDR PLTE IDAT IEND tRNS gAMA cHRM sRGB iCCP sBIT bKGD p
 _WEBP_DROPPED = (b"EXIF", b"XMP ")
 SIDE = 800  # px, longer side
 HOW_WEAK = (
-    "OpenCV's HOG detector finds upright people of at least 128 px from head to foot, and the LBP "
-    "cascade frontal "
-    "faces of at least 24 px, in photos reduced to 800 px. Both miss people who sit, turn away, are "
-    "cut off or "
-    "far, and both find people in trees and windows. Number plates are not looked for. A photo that "
-    "is not listed "
-    "may show people: look at every photo before release."
+    "OpenCV's HOG detector finds upright people of at least 128 px from head to foot, and the LBP cascade "
+    "frontal faces of at least 24 px, in photos reduced to 800 px. Both miss people who sit, turn away, are "
+    "cut off or far, and both find people in trees and windows. Number plates are not looked for. A photo "
+    "that is not listed may show people: look at every photo before release."
 )
 _LEAST_WEIGHT = 0.5  # smallest weight of the SVM; below, most detections are wrong
 

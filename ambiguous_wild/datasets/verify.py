@@ -6,21 +6,18 @@ import csv
 import json
 import re
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.datasets.foreign import read_text
 from ambiguous_wild.datasets.package import FILES, FIXED
 from ambiguous_wild.datasets.release_facts import NOT_FOR_RELEASE, VERSION
 from ambiguous_wild.io.archive import extract
 from ambiguous_wild.io.files import list_names, sha256_file
 from ambiguous_wild.io.images import image_size
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
-
-_LARGEST = 50_000_000  # bytes of a text file of a package
 
 
 @dataclass
@@ -81,7 +78,7 @@ def verify(path: Path, *, scratch: Path | None = None) -> Verified:
 
 def _checksums(path: Path, digits: int = 64) -> dict[str, str]:
     found = {}
-    for number, line in enumerate(_read(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         match = re.fullmatch(rf"([0-9a-f]{{{digits}}})  ([^/\\\x00-\x1f]+)", line)
         if match is None or match[2].startswith(".") or match[2] in found:
             raise AwError(
@@ -103,7 +100,7 @@ def _check_md5(path: Path) -> None:
 def _check_croissant(path: Path, sums: dict[str, str]) -> None:
     where = path / "croissant.json"
     try:
-        data: Any = json.loads(_read(where))
+        data: Any = json.loads(read_text(where))
     except (ValueError, RecursionError) as error:
         raise AwError(f"{where} is no JSON ({error})") from error
     if not isinstance(data, dict) or data.get("conformsTo") != VERSION:
@@ -123,7 +120,7 @@ def _check_croissant(path: Path, sums: dict[str, str]) -> None:
 
 def _rows(path: Path) -> list[dict[str, str]]:
     try:
-        reader = csv.DictReader(_read(path).splitlines(), strict=True)
+        reader = csv.DictReader(read_text(path).splitlines(), strict=True)
         rows = list(reader)
     except csv.Error as error:
         raise AwError(f"{path} is malformed: {error}") from error
@@ -132,27 +129,12 @@ def _rows(path: Path) -> list[dict[str, str]]:
     return rows
 
 
-def _read(path: Path) -> str:
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise AwError(f"{path} is larger than {_LARGEST // 10**6} MB")
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise AwError(f"{path} is no text in UTF-8") from error
-
-
-@contextmanager
-def _unpacked(archive: Path, scratch: Path | None) -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="aw-verify-", dir=scratch) as temporary:
-        folder = Path(temporary) / "scene"
-        extract(archive, folder)
-        yield folder
-
-
 def _scene(
     archive: Path, rows: dict[str, dict[str, str]] | None, found: Verified, scratch: Path | None
 ) -> None:
-    with _unpacked(archive, scratch) as folder:
+    with tempfile.TemporaryDirectory(prefix="aw-verify-", dir=scratch) as temporary:
+        folder = Path(temporary) / "scene"
+        extract(archive, folder)
         tops = sorted(p.name for p in folder.iterdir())
         if len(tops) != 1 or not (folder / tops[0] / "scene.json").is_file():
             raise AwError(f"{archive} does not hold one scene: {shortlist(tops) or 'nothing'}")

@@ -236,14 +236,11 @@ def _write_scene(
     notes = list(foreign.notes)
     model = _with_points(work, foreign, settings, jobs, bar, notes)
     foreign = dataclasses.replace(foreign, model=model)
-    by_name = {image.name: image for image in model.images.values()}
-    plans = [dataclasses.replace(plan, image=by_name[plan.image.name]) for plan in plans]
-    dropped = 0
     if settings.drop_test_only_points:
         model, dropped = drop_test_only(model, foreign.split)
-        by_name = {image.name: image for image in model.images.values()}
-        plans = [dataclasses.replace(plan, image=by_name[plan.image.name]) for plan in plans]
         notes.append(f"{dropped} points that no training photo sees are dropped")
+    by_name = {image.name: image for image in model.images.values()}
+    plans = [dataclasses.replace(plan, image=by_name[plan.image.name]) for plan in plans]
     bar.start("photos", len(plans))
 
     def one(plan: PhotoPlan) -> PlacedPhoto:

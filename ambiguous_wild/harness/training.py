@@ -387,11 +387,8 @@ def _effect_facts(cell: Cell, trainer: Trainer) -> RunFacts:
     """Return which effects were on and what they learnt; empty without any."""
     facts: RunFacts = {}
     if cell.protocol == "half":
-        nothing = {"effects": [], "steps": 0}
-        facts |= {
-            "protocol": "half",
-            "fitted": nothing if trainer.effects is None else trainer.effects.fitted(),
-        }
+        facts |= {"protocol": "half", "fitted": trainer.effects.fitted()}
     if cell.chosen.effects:
         facts["effects"] = list(cell.chosen.effects)
-    return facts if trainer.effects is None else facts | {"effect_facts": trainer.effects.facts()}
+    learnt = trainer.effects.facts()
+    return facts | {"effect_facts": learnt} if learnt else facts

@@ -42,6 +42,11 @@ class Group:
     source: str = ""  # table of the paper
 
 
+def values(name: str, key: str, *values: object) -> tuple[Variant, ...]:
+    """Return a variant NAME-VALUE for each value of an option."""
+    return tuple(Variant(f"{name}-{value}", (f"{key}={value}",)) for value in values)
+
+
 def folder_name(method: str, group: Group, variant: Variant) -> str:
     """Return the name of a variant's runs, such as refinesplat@masks-local."""
     return f"{method}@{group.name}-{variant.name}"

@@ -14,7 +14,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import State, check_limits
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
@@ -46,14 +46,13 @@ def build(options: AbsGsConfig) -> Parts:
     return Parts(density=AbsDensity, density_config=options)
 
 
-class AbsDensity(DensityControl):
-    """Small Gaussians grow by the signed gradient, large ones by the absolute."""
+class AbsoluteSums(DensityControl):
+    """Density control that also sums the absolute gradients."""
 
-    config: AbsGsConfig
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "abs_sum": (), "views_seen": ()}
-    abs_sum: Tensor  # [N] sum of the absolute gradient's norm over views that saw the row
-    last_clamp = 0  # iteration
+    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": (), "abs_sum": ()}
+    order = 2  # of the norm
+    abs_sum: Tensor  # [N] sum over views that saw the row of the norm of single pixels' |dL/du|, |dL/dv|
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
@@ -62,8 +61,16 @@ class AbsDensity(DensityControl):
             return
         assert gradients.screen_abs is not None
         scale = self._half(step.camera.width, step.camera.height, gradients.screen.device)
-        norms = torch.linalg.vector_norm(gradients.screen_abs * scale, dim=1)
+        norms = torch.linalg.vector_norm(gradients.screen_abs * scale, self.order, dim=1)
         self.abs_sum += torch.where(step.rendered.visible, norms, torch.zeros_like(norms))
+
+
+class AbsDensity(AbsoluteSums):
+    """Small Gaussians grow by the signed gradient, large ones by the absolute."""
+
+    config: AbsGsConfig
+    saved = (*DensityControl.saved, "last_clamp")
+    last_clamp = 0  # iteration
 
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
         """Choose clones and splits together: rows farthest above their threshold come first."""
@@ -90,10 +97,3 @@ class AbsDensity(DensityControl):
         config, since = self.config, step.iteration - self.last_clamp
         due = since >= config.min_clamp_every and since * step.nominal / step.iteration >= config.clamp_every
         return due and step.nominal <= config.stop and config.clamp_opacity < 1
-
-    def state_dict(self) -> State:
-        return super().state_dict() | {"last_clamp": self.last_clamp}
-
-    def load_state_dict(self, state: State) -> None:
-        super().load_state_dict(state)
-        self.last_clamp = int(state["last_clamp"])

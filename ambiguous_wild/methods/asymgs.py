@@ -25,8 +25,8 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
-from ambiguous_wild.methods.dronesplat import nearest, unit_range
-from ambiguous_wild.methods.masking_common import residual, resized
+from ambiguous_wild.methods.dronesplat import unit_range
+from ambiguous_wild.methods.masking_common import nearest, residual, resized
 from ambiguous_wild.splat.data import shrink, shrink_camera, shrink_keep
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect, RowAdam

@@ -37,6 +37,10 @@ class Traits:
     published: str = ""  # features or instances that the release uses
 
 
+_PAPER = Traits(
+    "entropy of features, by instance and pixel", "", "late; merging", "net of identities",
+    source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
+)  # fmt: skip
 BUILTIN_TRAITS = {
     "3dgs": Traits(source="code"),
     "3dgs+motion": Traits(masks="features that fit another motion than the place's"),
@@ -46,14 +50,8 @@ BUILTIN_TRAITS = {
         "structure of pixels and instances, other views", "", "late; merging; support", "",
         source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
     ),
-    "refinesplat-paper": Traits(
-        "entropy of features, by instance and pixel", "", "late; merging", "net of identities",
-        source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
-    ),
-    "refinesplat-printed": Traits(
-        "entropy of features, by instance and pixel", "", "late; merging", "net of identities",
-        source="summaries", published="DINOv2 ViT-S/14, instances with ids of a video",
-    ),
+    "refinesplat-paper": _PAPER,
+    "refinesplat-printed": _PAPER,
     "robustsplat": Traits(
         "net on features", "", "late", "mask net", source="code", published="DINOv2 ViT-S/14 with registers",
     ),

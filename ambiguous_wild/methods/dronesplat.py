@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
-from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask
+from ambiguous_wild.methods.masking_common import CountingMask, MaskedShares, WarmUpMask, nearest
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
@@ -96,7 +96,7 @@ def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> Tensor:
     return heat.mean() + heat.std(correction=0) * (1.0 + t_local * left)
 
 
-class DroneSplatMask(WarmUpMask):
+class DroneSplatMask(CountingMask, WarmUpMask):
     """Masks instances by statistics of the current render; nothing is learnt."""
 
     config: DroneSplatConfig
@@ -143,24 +143,7 @@ class DroneSplatMask(WarmUpMask):
         }
 
     def facts(self) -> Facts:
-        return {
-            "masked_share": self.shares.mean(),
+        return super().facts() | {
             "instances": self.instances.name,
             "instances_per_photo": float(np.mean([count - 1 for count in self.counts])),
         }
-
-    def state_dict(self) -> State:
-        return {"shares": self.shares.state_dict()}
-
-    def load_state_dict(self, state: State) -> None:
-        self.shares = MaskedShares.from_state(state["shares"])
-
-
-def nearest(labels: Tensor, height: int, width: int) -> Tensor:
-    """Return the labels [H, W] at the centres of the pixels of a smaller picture."""
-    if labels.shape == (height, width):
-        return labels
-    device = labels.device
-    rows = ((torch.arange(height, device=device) * 2 + 1) * labels.shape[0]) // (2 * height)
-    columns = ((torch.arange(width, device=device) * 2 + 1) * labels.shape[1]) // (2 * width)
-    return labels[rows[:, None], columns[None, :]]

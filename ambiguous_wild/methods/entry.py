@@ -30,8 +30,8 @@ class MethodEntry:
     """A method: its line in `aw methods`, and where its recipe and options are.
 
     `recipe` is "module:function" or a function; it takes the options and returns `Parts`. `config` is
-    "module:Class" or a frozen dataclass: the options of the method, all with defaults. Of a function it need
-    not be given: it is the type of the argument.
+    "module:Class" or a frozen dataclass: the options of the method, all with defaults. It need not be given
+    if it is the type of the function's argument.
     """
 
     name: str
@@ -63,7 +63,7 @@ class MethodEntry:
         Raises:
             AwError: an option has no default.
         """
-        cls = resolve(self.config) if self.config else NoOptions
+        cls = self.options_class()
         missing = [
             f.name
             for f in (dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ())
@@ -75,6 +75,13 @@ class MethodEntry:
                 f"{getattr(cls, '__name__', 'them')} has none: write {missing[0]}: ... = VALUE"
             )
         return cls()
+
+    def options_class(self) -> type:
+        """Return the dataclass of the options; that of a method without options is empty."""
+        config: Any = self.config
+        if config is None and isinstance(self.recipe, str):
+            config = config_of(resolve(self.recipe))
+        return resolve(config) or NoOptions
 
     def by_machine(self) -> frozenset[str]:
         """Return the options whose defaults depend on the machine's weights, see vision/backends.py."""

@@ -16,7 +16,7 @@ import shutil
 import string
 import subprocess
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -86,34 +86,52 @@ def fill_pattern(template: str, values: Mapping[str, object]) -> str:
     return fill(template, escaped)
 
 
+COMMANDS = ("train", "render", "resume")
 BEGUN = "begun.json"  # in the program's folder: the command that was started, which `resume` must match
 
 
 @dataclass(frozen=True)
 class CommandProgram:
-    """A described program. Fields are those of `Description`, with commands split and paths resolved."""
+    """A described program."""
 
-    name: str
-    train: tuple[str, ...]
-    render: tuple[str, ...]
-    resume: tuple[str, ...]
-    renders: str
-    masks: str
-    ply: str
-    cwd: Path
-    prefix: tuple[str, ...]
-    environment: tuple[tuple[str, str], ...]
-    scene_files: tuple[tuple[str, str], ...]
-    timeout_s: float | None
-    photos: Photos = "all"  # photos that the program gets, see `external_process.stage`
-    drawn_by_us: bool = False  # it writes splats, which our renderer draws
+    keys: Description
+    cwd: Path  # absolute
+
+    @property
+    def name(self) -> str:
+        return self.keys.name
+
+    @property
+    def drawn_by_us(self) -> bool:
+        """Whether it writes splats, which our renderer draws."""
+        return self.keys.drawn_by == "us"
+
+    def words(self, key: str) -> tuple[str, ...]:
+        """Return a command split as a shell splits it; empty if the file has none.
+
+        Raises:
+            AwError: a quotation has no end.
+        """
+        text = getattr(self.keys, key)
+        try:
+            return tuple(shlex.split(text)) if isinstance(text, str) else text
+        except ValueError as error:
+            raise AwError(f"command {text!r}: {error}") from None
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return {str(name): str(text) for name, text in self.keys.environment.items()}
+
+    @property
+    def scene_files(self) -> dict[str, str]:
+        return {str(name): str(text) for name, text in self.keys.scene_files.items()}
 
     def missing(self, options: Any) -> str:
         """Return the first program of the commands that this machine lacks; empty if it has all."""
         values = dataclasses.asdict(options)
-        commands = [self.prefix] if self.prefix else [self.train, self.render, self.resume]
+        commands = map(self.words, ("prefix",) if self.keys.prefix else COMMANDS)
         words = [command[0] for command in commands if command]
-        path = dict(self.environment).get("PATH")
+        path = self.environment.get("PATH")
         for word in dict.fromkeys(words):
             if placeholders(f"{word}{path or ''}", self.name) - values.keys():
                 continue  # its value is known only in a run
@@ -132,8 +150,8 @@ class CommandProgram:
         self._check_length(task)
         end_left_over(task.logs)
         lists = split_lists(task.scene)
-        files = {name: fill(text, lists) for name, text in self.scene_files}
-        staged = stage(task.scene, task.folder / ".scene", files, photos=self.photos)
+        files = {name: fill(text, lists) for name, text in self.scene_files.items()}
+        staged = stage(task.scene, task.folder / ".scene", files, photos=self.keys.photos)
         try:
             values = self._values(task, staged)
             state = task.work / DONE
@@ -144,12 +162,12 @@ class CommandProgram:
                 if not resuming:
                     shutil.rmtree(output, ignore_errors=True)
                 output.mkdir(parents=True, exist_ok=True)
-                command = self.resume if resuming else self.train
-                write_json(task.work / BEGUN, list(self.train))
+                command = "resume" if resuming else "train"
+                write_json(task.work / BEGUN, list(self.words("train")))
                 done["train_s"] = self._command("train", command, values, task)
                 write_json(state, done)
-            if self.render and "render_s" not in done:
-                done["render_s"] = self._command("render", self.render, values, task)
+            if self.keys.render and "render_s" not in done:
+                done["render_s"] = self._command("render", "render", values, task)
                 write_json(state, done)
             return self._collect(task, values, done)
         finally:
@@ -165,8 +183,8 @@ class CommandProgram:
             begun = json.loads((task.work / BEGUN).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
             return False
-        same = begun == list(self.train)
-        return bool(self.resume) and same and output.is_dir() and any(output.iterdir())
+        same = begun == list(self.words("train"))
+        return bool(self.keys.resume) and same and output.is_dir() and any(output.iterdir())
 
     def _check_length(self, task: Task) -> None:
         if task.budget_s is not None and "budget_s" not in self._used():
@@ -176,7 +194,7 @@ class CommandProgram:
             )
 
     def _used(self) -> set[str]:
-        texts = (*self.train, *self.render, *(value for _, value in self.environment))
+        texts = (*self.words("train"), *self.words("render"), *self.environment.values())
         return set().union(*(placeholders(text, self.name) for text in texts))
 
     def _values(self, task: Task, staged: Path) -> dict[str, object]:
@@ -184,41 +202,42 @@ class CommandProgram:
         return dataclasses.asdict(task.options) | {
             "scene": str(staged.absolute()),
             "source": str(task.scene.root.resolve()),
-            "images": "images" if factor == 1 or self.photos != "all" else f"images_{factor}",
+            "images": "images" if factor == 1 or self.keys.photos != "all" else f"images_{factor}",
             "output": str(self._output(task)),
             "seed": task.seed,
             "iterations": task.iterations,
             "budget_s": task.budget_s,
-            "factor": 1 if self.photos == "train" else factor,
+            "factor": 1 if self.keys.photos == "train" else factor,
             "device": task.device,
         }
 
-    def _command(self, step: str, command: Sequence[str], values: dict[str, object], task: Task) -> float:
+    def _command(self, step: str, key: str, values: dict[str, object], task: Task) -> float:
         return run_logged(
             f"{step} of {self.name}",
-            [*self.prefix, *(fill(argument, values) for argument in command)],
+            [*self.words("prefix"), *(fill(argument, values) for argument in self.words(key))],
             log=task.logs / f"{step}.log",
             cwd=self.cwd,
-            environment={name: fill(text, values) for name, text in self.environment},
-            timeout_s=self.timeout_s,
+            environment={name: fill(text, values) for name, text in self.environment.items()},
+            timeout_s=self.keys.timeout_h * 3600.0 or None,
         )
 
     def _collect(self, task: Task, values: dict[str, object], done: dict[str, float]) -> Produced:
         tests, trains = task.scene.test, task.scene.train
         drawn = [] if self.drawn_by_us else list(enumerate(tests))
-        renders = {view.name: self._find(self.renders, values, view, i) for i, view in drawn}
+        renders = {view.name: self._find(self.keys.renders, values, view, i) for i, view in drawn}
         missing = [name for name, path in renders.items() if path is None]
         if missing:
+            wanted = self._pattern(self.keys.renders, values, tests[0], 0)
             raise AwError(
                 f"{self.name} left no render of {len(missing)} of {len(tests)} test photos "
-                f"({shortlist(missing)}): {self._pattern(self.renders, values, tests[0], 0)} is not there"
+                f"({shortlist(missing)}): {wanted} is not there"
             )
         masks = {}
-        if self.masks:
-            masks = {view.name: self._find(self.masks, values, view, i) for i, view in enumerate(trains)}
-        ply = self._one(fill_pattern(self.ply, values)) if self.ply else None
-        if self.ply and ply is None:
-            raise AwError(f"{self.name} left no splats: {fill_pattern(self.ply, values)} is not there")
+        if self.keys.masks:
+            masks = {view.name: self._find(self.keys.masks, values, view, i) for i, view in enumerate(trains)}
+        ply = self._one(fill_pattern(self.keys.ply, values)) if self.keys.ply else None
+        if self.keys.ply and ply is None:
+            raise AwError(f"{self.name} left no splats: {fill_pattern(self.keys.ply, values)} is not there")
         cost: dict[str, float] = dict(done)
         if task.budget_s is None and "iterations" in self._used():
             cost |= {"iterations": task.iterations}
@@ -333,22 +352,8 @@ def load_description(path: Path) -> MethodEntry:
         raise AwError(f"no description {path}: {error.strerror}; write external:PATH.yaml") from None
     description = from_plain(Description, _parse(path, content), str(path))
     options = _options_class(description.options, path)
-    program = CommandProgram(
-        name=check_name(f"name in {path}", description.name),
-        train=_command(description.train),
-        render=_command(description.render),
-        resume=_command(description.resume),
-        renders=description.renders,
-        masks=description.masks,
-        ply=description.ply,
-        cwd=_folder(description.cwd, path),
-        prefix=_command(description.prefix),
-        environment=tuple((str(k), str(v)) for k, v in description.environment.items()),
-        scene_files=tuple((str(k), str(v)) for k, v in description.scene_files.items()),
-        timeout_s=description.timeout_h * 3600.0 or None,
-        photos=description.photos,
-        drawn_by_us=description.drawn_by == "us",
-    )
+    name = check_name(f"name in {path}", description.name)
+    program = CommandProgram(dataclasses.replace(description, name=name), _folder(description.cwd, path))
     _check(program, set(description.options), path)
     return MethodEntry(
         name=program.name,
@@ -380,7 +385,7 @@ def _decisive(description: Description) -> Facts:
 
 def _named_files(program: CommandProgram, folder: Path) -> Facts:
     """Return {"files": sha256 by word}: words of commands that are code below `folder` or `cwd`; or {}."""
-    words = {*program.prefix, *program.train, *program.render, *program.resume}
+    words = {word for key in ("prefix", *COMMANDS) for word in program.words(key)}
     paths = {word: (program.cwd / word).resolve() for word in words if word.endswith(_CODE)}
     files = {
         word: sha256_file(path)
@@ -401,13 +406,6 @@ def _parse(path: Path, content: bytes) -> Facts:
     return data
 
 
-def _command(text: str | tuple[str, ...]) -> tuple[str, ...]:
-    try:
-        return tuple(shlex.split(text)) if isinstance(text, str) else text
-    except ValueError as error:
-        raise AwError(f"command {text!r}: {error}") from None
-
-
 def _options_class(options: Facts, path: Path) -> type:
     """Make a frozen dataclass with the file's values as defaults, by which `--set` checks types."""
     if not options:
@@ -423,20 +421,21 @@ def _options_class(options: Facts, path: Path) -> type:
 
 def _check(program: CommandProgram, options: set[str], path: Path) -> None:
     needed = ("train", "ply" if program.drawn_by_us else "renders")
-    missing = [key for key in needed if not getattr(program, key)]
+    keys = program.keys
+    missing = [key for key in needed if not getattr(keys, key)]
     if missing:
         raise AwError(f"{path} does not say {' and '.join(missing)}; see docs/external-methods.md")
     run = {*RUN, *options}
-    for key in ("train", "render", "resume"):
-        for argument in getattr(program, key):
+    for key in COMMANDS:
+        for argument in program.words(key):
             check(argument, run, f"{path}, {key}")
-    for name, value in program.environment:
+    for name, value in program.environment.items():
         check(value, run, f"{path}, environment {name}")
-    for name, value in program.scene_files:
+    for name, value in program.scene_files.items():
         check(value, LISTS, f"{path}, scene_files {name}")
     for key, known in (("renders", run | {*VIEW}), ("masks", run | {*VIEW}), ("ply", run)):
-        check(getattr(program, key), known, f"{path}, {key}")
-    if program.renders and not {*VIEW} & placeholders(program.renders, "renders"):
+        check(getattr(keys, key), known, f"{path}, {key}")
+    if keys.renders and not {*VIEW} & placeholders(keys.renders, "renders"):
         raise AwError(f"{path}: renders must hold {{stem}}, {{name}} or {{index}}: one file a test photo")
     if not program.cwd.is_dir():
         raise AwError(f"{path}: cwd {program.cwd} is no folder")

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.dronesplat import label_means
-from ambiguous_wild.methods.masking_common import d_keep, resized
+from ambiguous_wild.methods.masking_common import EffectMask, d_keep, resized
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.base import Effect
@@ -34,7 +34,7 @@ from ambiguous_wild.splat.field import Rates
 from ambiguous_wild.splat.fields import STATIC, ComposePull, Fields, FieldStart
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Pull
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -230,17 +230,11 @@ class Forest(Fields):
         return {STATIC: Cotangents(image=d_static, own=own), TRANSIENT: Cotangents(image=d_transient)}
 
 
-class Mixed(MaskPolicy):
+class Mixed(EffectMask):
     """1 - M_f, for pictures and metrics: the loss uses the mixture instead."""
 
     def __init__(self, nets: Nets) -> None:
-        self.forest = Forest(nets)
-
-    def required_effect(self) -> Nets:
-        return self.forest.nets
-
-    def setup(self, data: TrainData) -> None:
-        self.forest.nets.require_setup()
+        self.effect, self.forest = nets, Forest(nets)
 
     def composed_keep(self, step: Step) -> Tensor | None:
         return self.predict(step)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.methods.entry import MethodEntry, NoOptions, resolve, trained_once
+from ambiguous_wild.methods.entry import MethodEntry, trained_once
 from ambiguous_wild.methods.references import is_program, is_reference, reference_file
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
     donors = {place: _donor(place, donor, methods) for place, donor in pairs}
     entries = {"host": host} | donors
     fields = [
-        (place, _options_class(entry), dataclasses.field(default_factory=entry.options))
+        (place, entry.options_class(), dataclasses.field(default_factory=entry.options))
         for place, entry in entries.items()
     ]
     hashes = [entry.source_hash for entry in entries.values()]
@@ -265,9 +265,3 @@ def _donor(place: str, name: str, methods: Mapping[str, MethodEntry]) -> MethodE
     if "@" in target or target not in methods:
         raise unknown(f"{place} donor", name, [*methods, *ALIASES], "'aw methods' lists them")
     return methods[target]
-
-
-def _options_class(entry: MethodEntry) -> type:
-    cls = resolve(entry.config) if entry.config else NoOptions
-    assert isinstance(cls, type)
-    return cls

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State, check_limits
-from ambiguous_wild.methods.masking_common import d_keep, hashed_uniform
+from ambiguous_wild.methods.masking_common import EffectMask, d_keep, hashed_uniform
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import (
@@ -39,7 +39,7 @@ from ambiguous_wild.splat.effects.placing import (
 )
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
+from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -177,11 +177,8 @@ class GswAppearance(Learnt):
         }
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
-        photo, means, intrinsic = (
-            self._seen(shot),
-            visible.means.detach(),
-            visible.attributes["gsw_intrinsic"],
-        )
+        photo, means = self._seen(shot), visible.means.detach()
+        intrinsic = visible.attributes["gsw_intrinsic"]
         maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
         places, box = visible.attributes["gsw_places"], visible.attributes["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
@@ -216,10 +213,8 @@ class GswAppearance(Learnt):
     def _maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> list[Tensor]:
         """Return maps of at most `MOST` train photos, evenly chosen; computed once an iteration."""
         if self._cached is None or self._cached[0] != shot.nominal:
-            self._cached = (
-                shot.nominal,
-                [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen],
-            )
+            maps = [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen]
+            self._cached = shot.nominal, maps
         return self._cached[1]
 
     @torch.no_grad()
@@ -269,19 +264,14 @@ def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tens
     return sample(maps, 2.0 * at - 1.0), inside
 
 
-class Visibility(MaskPolicy):
+class Visibility(EffectMask):
     """Masks by M, which learns from the weighted residual and the prior that nothing is masked."""
 
+    effect: GswAppearance
     learns_by_gradients = True
 
     def __init__(self, effect: GswAppearance) -> None:
         self.effect, self.config = effect, effect.config
-
-    def required_effect(self) -> GswAppearance:
-        return self.effect
-
-    def setup(self, data: TrainData) -> None:
-        self.effect.require_setup()
 
     def keep(self, step: Step) -> Tensor | None:
         return self.predict(step) if step.nominal > self.config.mask_start else None

@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import Facts, State, check_limits
-from ambiguous_wild.methods.masking_common import MaskedShares
+from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.masking_common import CountingMask, EffectMask, MaskedShares
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import Parts
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -89,19 +89,14 @@ def composed(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
     return (front + (1.0 - mask)[..., None] * back.clamp(0.0, 1.0)).clamp(0.0, 1.0)
 
 
-class Uncovered(MaskPolicy):
+class Uncovered(EffectMask, CountingMask):
     """1 - M, which weights the loss while both kinds learn separately; afterwards the picture contains M."""
 
+    effect: Plane
     learns_by_gradients = True
 
     def __init__(self, plane: Plane) -> None:
-        self.plane, self.config, self.shares = plane, plane.config, MaskedShares()
-
-    def required_effect(self) -> Plane:
-        return self.plane
-
-    def setup(self, data: TrainData) -> None:
-        self.plane.require_setup()
+        self.effect, self.config, self.shares = plane, plane.config, MaskedShares()
 
     def keep(self, step: Step) -> Tensor | None:
         keep = self.predict(step)
@@ -116,21 +111,21 @@ class Uncovered(MaskPolicy):
     def predict(self, step: Step) -> Tensor | None:
         if step.nominal < self.config.apart:
             return None
-        return 1.0 - self.plane.layer(self.plane._leaf(step)["planar"], step)[1]
+        return 1.0 - self.effect.layer(self.effect._leaf(step)["planar"], step)[1]
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
         if step.nominal < self.config.apart:
             return None
         with torch.enable_grad():
-            planar = self.plane._leaf(step)["planar"].requires_grad_()
-            front, mask = self.plane.layer(planar, step)
+            planar = self.effect._leaf(step)["planar"].requires_grad_()
+            front, mask = self.effect.layer(planar, step)
             outputs, pulls = [mask], [torch.full_like(mask, self.config.area / mask.numel())]
             if step.nominal < self.config.joint:
                 picture = composed(front, mask, step.rendered.image.detach())
                 outputs.append(picture)
                 pulls.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
             (d_planar,) = torch.autograd.grad(outputs, planar, pulls)
-        return Cotangents(own={self.plane.name: {"planar": d_planar}})
+        return Cotangents(own={self.effect.name: {"planar": d_planar}})
 
     @staticmethod
     def _user(keep: Tensor | None, mask: Tensor) -> Tensor | None:
@@ -138,15 +133,6 @@ class Uncovered(MaskPolicy):
         if keep is None:
             return None
         return ((keep > 0) | (mask.detach() >= 1.0)).float()
-
-    def facts(self) -> Facts:
-        return {"masked_share": self.shares.mean()}
-
-    def state_dict(self) -> State:
-        return {"shares": self.shares.state_dict()}
-
-    def load_state_dict(self, state: State) -> None:
-        self.shares = MaskedShares.from_state(state["shares"])
 
 
 def planar_sums(planar: Tensor, height: int, width: int, reach: int) -> Tensor:

@@ -13,11 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ambiguous_wild.core.config import State
+from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.backend import backend_of
+from ambiguous_wild.splat.effects.learnt import Learnt
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.parts import MaskPolicy
-from ambiguous_wild.splat.step import Step
+from ambiguous_wild.splat.step import Step, TrainData
 
 
 def cosine_target(cosine: Tensor) -> Tensor:
@@ -75,34 +76,23 @@ def bound(e: Tensor, threshold: float | Tensor) -> Tensor:
     return ((inlier > 0) | (near > 0.5)).float()
 
 
-def resized(grid: Tensor, height: int, width: int) -> Tensor:
-    """Resize a map [h, w] to [height, width], bilinear."""
-    if grid.shape == (height, width):
-        return grid
-    return F.interpolate(grid[None, None], size=(height, width), mode="bilinear", align_corners=False)[0, 0]
+def resized(x: Tensor, height: int, width: int) -> Tensor:
+    """Resize a map [h, w] or a picture [h, w, 3], bilinear; returns it unchanged if it has that size."""
+    if x.shape[:2] == (height, width):
+        return x
+    maps = x[None] if x.ndim == 2 else x.permute(2, 0, 1)
+    large = F.interpolate(maps[None], size=(height, width), mode="bilinear", align_corners=False)[0]
+    return large[0] if x.ndim == 2 else large.permute(1, 2, 0)
 
 
-def mask_loss(
-    mask: Tensor,  # [H, W] of the net, in (0, 1)
-    target: Tensor,  # [H, W] T_cos
-    lower: Tensor,  # [H, W] bound below
-    upper: Tensor,  # [H, W] bound above
-    nominal: float,
-    *,
-    lambda_cosine: float = 0.5,
-    lambda_residual: float = 0.5,
-    lambda_pull: float = 2.0,
-    beta: float = 2000.0,
-) -> Tensor:
-    """Return 0.5 mean|M - T_cos| + 0.5 mean(relu(M - u) + relu(l - M)) + 2 exp(-it / beta) mean(1 - M).
-
-    The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights, hence constant and left out.
-    """
-    pull = lambda_pull * math.exp(-nominal / beta)
-    bounds = (F.relu(mask - upper) + F.relu(lower - mask)).mean()
-    return (
-        lambda_cosine * (mask - target).abs().mean() + lambda_residual * bounds + pull * (1.0 - mask).mean()
-    )
+def nearest(labels: Tensor, height: int, width: int) -> Tensor:
+    """Return the labels [height, width] at the centres of the pixels of a smaller picture."""
+    if labels.shape == (height, width):
+        return labels
+    device = labels.device
+    rows = ((torch.arange(height, device=device) * 2 + 1) * labels.shape[0]) // (2 * height)
+    columns = ((torch.arange(width, device=device) * 2 + 1) * labels.shape[1]) // (2 * width)
+    return labels[rows[:, None], columns[None, :]]
 
 
 def keep_of(mask: Tensor, threshold: float, erosion: int) -> Tensor:
@@ -163,6 +153,18 @@ class PausingMask(WarmUpMask):
         return self.config.reset_pause / (step.nominal / step.iteration)
 
 
+class EffectMask(MaskPolicy):
+    """A mask policy that reads an effect, which the run must have."""
+
+    effect: Learnt
+
+    def required_effect(self) -> Learnt:
+        return self.effect
+
+    def setup(self, data: TrainData) -> None:
+        self.effect.require_setup()
+
+
 class MaskedShares(dict[int, float | Tensor]):
     """The share of each view's pixels that was masked when it was last seen."""
 
@@ -184,6 +186,21 @@ class MaskedShares(dict[int, float | Tensor]):
         return cls({int(view): float(share) for view, share in state.items()})
 
 
+class CountingMask(MaskPolicy):
+    """A mask policy that reports and saves the share that it masks of each view."""
+
+    shares: MaskedShares
+
+    def facts(self) -> Facts:
+        return {"masked_share": self.shares.mean()}
+
+    def state_dict(self) -> State:
+        return {"shares": self.shares.state_dict()}
+
+    def load_state_dict(self, state: State) -> None:
+        self.shares = MaskedShares.from_state(state["shares"])
+
+
 def d_keep(render: Tensor, photo: Tensor, keep: Tensor) -> Tensor:
     """Return dL/dkeep [H, W] of 0.8 |k R - k I| + 0.2 D-SSIM(k R, k I), for nets that learn masks by it.
 
@@ -192,14 +209,6 @@ def d_keep(render: Tensor, photo: Tensor, keep: Tensor) -> Tensor:
     one, other = keep[..., None] * render, keep[..., None] * photo
     mine, theirs = photometric(one, other).d_image, photometric(other, one).d_image
     return (mine * render + theirs * photo).sum(dim=2)
-
-
-def upsampled(image: Tensor, height: int, width: int) -> Tensor:
-    """Resize a render [h, w, 3] to [height, width, 3], bilinear; returns it unchanged if it has that size."""
-    if image.shape[:2] == (height, width):
-        return image
-    chw = image.permute(2, 0, 1)[None]
-    return F.interpolate(chw, size=(height, width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 
 
 def hashed_uniform(count: int, key: tuple[int, ...], device: torch.device) -> Tensor:

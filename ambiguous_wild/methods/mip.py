@@ -8,20 +8,19 @@ the tables. Ours: the principal point need not be the centre; the 2D factor is t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.absgs import AbsoluteSums
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 
 
@@ -64,21 +63,10 @@ class MipDensity(DensityControl):
         gaussians.opacity_logits.copy_(torch.logit((target / factor).clamp(1e-7, 1 - 1e-6)))
 
 
-class AbsoluteMipDensity(MipDensity):
+class AbsoluteMipDensity(AbsoluteSums, MipDensity):
     """Density control that also grows by the absolute gradient, as many Gaussians as by the signed one."""
 
-    needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": (), "abs_sum": ()}
-    abs_sum: Tensor  # [N] sum over views of |dL/du| + |dL/dv| of single pixels, times half the picture's size
-
-    @torch.no_grad()
-    def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
-        super().observe(step, gradients, keep)
-        if step.nominal <= self.config.stop:
-            assert gradients.screen_abs is not None
-            scale = self._half(step.camera.width, step.camera.height, gradients.screen.device)
-            norms = (gradients.screen_abs * scale).sum(dim=1)
-            self.abs_sum += torch.where(step.rendered.visible, norms, torch.zeros_like(norms))
+    order = 1
 
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
         seen, small = self.views_seen.clamp(min=1), self.small(gaussians)

@@ -23,8 +23,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core.config import Facts, State, check_limits
-from ambiguous_wild.methods.masking_common import MaskedShares, WarmUpMask, hashed_uniform
+from ambiguous_wild.core.config import Facts, check_limits
+from ambiguous_wild.methods.masking_common import (
+    CountingMask,
+    EffectMask,
+    MaskedShares,
+    WarmUpMask,
+    hashed_uniform,
+)
 from ambiguous_wild.methods.wildgaussians import FeatureDistance, fourier
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
@@ -136,24 +142,21 @@ class Codes(Learnt):
         return mlp(torch.cat([codes, photo], dim=1), leaf, "doubt")[:, 0]
 
 
-class Doubt(WarmUpMask):
+class Doubt(EffectMask, CountingMask, WarmUpMask):
     """Keeps pixels where the drawn uncertainty gives a weight above 1."""
 
     config: NexusSplatsConfig
-
+    effect: Codes
     learns_by_gradients = True
 
     def __init__(self, codes: Codes) -> None:
-        self.codes, self.config = codes, codes.config
+        self.effect, self.config = codes, codes.config
         self.distance = FeatureDistance(self.config.features, self.config.normal_units)
         self.shares = MaskedShares()
         self.pending: Gradients | None = None  # gradients of the current step, until `gradients` returns them
 
-    def required_effect(self) -> Codes:
-        return self.codes
-
     def setup(self, data: TrainData) -> None:
-        self.codes.require_setup()
+        super().setup(data)
         self.distance.setup(data)
 
     def keep(self, step: Step) -> Tensor | None:
@@ -175,9 +178,9 @@ class Doubt(WarmUpMask):
         """Return w = 1 / (2 sigma^2) [H, W] of the drawn uncertainty, and gradients of its loss."""
         g, seen = step.gaussians, self._seen(step)
         with torch.set_grad_enabled(learn):
-            leaf = {name: value.requires_grad_(learn) for name, value in self.codes._leaf(step).items()}
+            leaf = {name: value.requires_grad_(learn) for name, value in self.effect._leaf(step).items()}
             codes = g.attributes["nexus_doubt"][seen].detach().requires_grad_(learn)
-            doubts = self.codes.doubts(codes, leaf)
+            doubts = self.effect.doubts(codes, leaf)
         drawn = step.draw(gaussians=as_colour(g, seen, doubts.detach()), without=COLOURING)
         with torch.set_grad_enabled(learn):
             raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).detach().requires_grad_(learn)
@@ -207,7 +210,7 @@ class Doubt(WarmUpMask):
         gradients = replace(
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
             screen=torch.zeros_like(back.screen), attributes={"nexus_doubt": d_codes},
-            own={self.codes.name: own},
+            own={self.effect.name: own},
         )  # fmt: skip
         return judged, gradients
 
@@ -217,13 +220,7 @@ class Doubt(WarmUpMask):
         return backend_of(g.device).rows(lambda: in_picture(g.means, step.camera, margin=0.5))
 
     def facts(self) -> Facts:
-        return {"masked_share": self.shares.mean(), "features": self.distance.name}
-
-    def state_dict(self) -> State:
-        return {"shares": self.shares.state_dict()}
-
-    def load_state_dict(self, state: State) -> None:
-        self.shares = MaskedShares.from_state(state["shares"])
+        return super().facts() | {"features": self.distance.name}
 
 
 def kept(weight: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import State, check_limits
+from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -66,7 +66,8 @@ class PupDensity(DensityControl):
     """Grows as 3DGS; then the sensitivity of all train views decides which Gaussians are removed."""
 
     config: PupConfig
-    done = 0  # number of rounds that are done
+    saved = (*DensityControl.saved, "pruning_rounds")
+    pruning_rounds = 0  # number of rounds that are done
 
     def setup(self, data: TrainData) -> None:
         self.cameras = [shrink_camera(camera, self.config.divisor) for camera in data.cameras]
@@ -77,7 +78,7 @@ class PupDensity(DensityControl):
         config = self.config
         if events or not self._round_due(step):  # rows that changed cannot be drawn
             return gaussians, events
-        self.done += 1
+        self.pruning_rounds += 1
         share = 1.0 - (1.0 - config.share) ** (1.0 / config.rounds)
         score = log_det(self.blocks(step, gaussians))
         drop = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
@@ -97,7 +98,10 @@ class PupDensity(DensityControl):
 
     def _round_due(self, step: Step) -> bool:
         config = self.config
-        return self.done < config.rounds and step.nominal >= config.prune_at + self.done * config.between
+        return (
+            self.pruning_rounds < config.rounds
+            and step.nominal >= config.prune_at + self.pruning_rounds * config.between
+        )
 
     def blocks(self, step: Step, gaussians: Gaussians) -> Tensor:
         """Sum the mean g g^T over views, g = d(sum(signs picture))/d(mean, log s), [N, 6, 6] float64."""
@@ -110,10 +114,3 @@ class PupDensity(DensityControl):
                 both = torch.cat([g.means, g.log_scales], dim=1).double()
                 total += both[:, :, None] * both[:, None, :] / self.config.signs
         return total
-
-    def state_dict(self) -> State:
-        return super().state_dict() | {"pruning_rounds": self.done}
-
-    def load_state_dict(self, state: State) -> None:
-        super().load_state_dict(state)
-        self.done = state["pruning_rounds"]

@@ -12,6 +12,7 @@ else EfficientNet-Lite0, else hand-made features (Lab and HOG). Settings that de
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -31,7 +32,7 @@ from ambiguous_wild.methods.masking_common import (
     adam_of,
     adam_state,
     load_adam_state,
-    upsampled,
+    resized,
 )
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink, shrink_camera
@@ -159,6 +160,23 @@ class RobustSplatConfig:
         return round(size * self.coarse_share)
 
 
+def mask_loss(
+    mask: Tensor,  # [H, W] of the net, in (0, 1)
+    target: Tensor,  # [H, W] T_cos
+    lower: Tensor,  # [H, W] bound below
+    upper: Tensor,  # [H, W] bound above
+    nominal: float,
+    config: RobustSplatConfig,
+) -> Tensor:
+    """Return 0.5 mean|M - T_cos| + 0.5 mean(relu(M - u) + relu(l - M)) + 2 exp(-it / beta) mean(1 - M).
+
+    The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights, hence constant and left out.
+    """
+    pull = config.lambda_pull * math.exp(-nominal / config.beta) * (1.0 - mask).mean()
+    bounds = (F.relu(mask - upper) + F.relu(lower - mask)).mean()
+    return config.lambda_cosine * (mask - target).abs().mean() + config.lambda_residual * bounds + pull
+
+
 class RobustSplatMask(PausingMask):
     """The net learns every iteration from mask_start on; its map, thresholded and eroded, is the keep map."""
 
@@ -243,21 +261,10 @@ class RobustSplatMask(PausingMask):
         return masking_common.keep_of(mask.detach(), self.config.threshold, self.config.erosion)
 
     def _loss(self, mask: Tensor, step: Step) -> Tensor:
-        config = self.config
         with torch.no_grad():
             lower, upper = self._bounds(step)
             target = self._target(step, learning=True)
-        return masking_common.mask_loss(
-            mask,
-            target,
-            lower,
-            upper,
-            step.nominal,
-            lambda_cosine=config.lambda_cosine,
-            lambda_residual=config.lambda_residual,
-            lambda_pull=config.lambda_pull,
-            beta=config.beta,
-        )
+        return mask_loss(mask, target, lower, upper, step.nominal, self.config)
 
     # -- supervision ------------------------------------------------------------------------------
 
@@ -266,7 +273,7 @@ class RobustSplatMask(PausingMask):
         early = step.nominal < self.config.bootstrap
         features, phi = (self.coarse, self.phi_coarse) if early else (self.fine, self.phi)
         full = self.data.cameras[step.view]  # not the photo, which may not be on the device
-        image = upsampled(step.rendered.image.detach(), full.height, full.width)
+        image = resized(step.rendered.image.detach(), full.height, full.width)
         seen = features(self._coarse_picture(image) if early else image)
         cosine = F.cosine_similarity(phi[step.view], seen, dim=2)
         if self.config.cosine == "relative":
@@ -275,7 +282,7 @@ class RobustSplatMask(PausingMask):
             if self._calibrate:
                 cosine = masking_common.calibrated(cosine, features.unit, self.config.normal_units)
             target = masking_common.cosine_target(cosine)
-        return masking_common.resized(target, *step.photo.shape[:2])
+        return resized(target, *step.photo.shape[:2])
 
     def _relative_target(self, cosine: Tensor, stage: int, learning: bool) -> Tensor:
         """Return the target relative to the distances that renders of this stage lately had."""
@@ -297,9 +304,7 @@ class RobustSplatMask(PausingMask):
         self.histogram = masking_common.update_histogram(self.histogram, e, config.decay)
         size = step.photo.shape[:2]
         lower, upper = (
-            masking_common.resized(
-                masking_common.bound(e, masking_common.percentile(self.histogram, share)), *size
-            )
+            resized(masking_common.bound(e, masking_common.percentile(self.histogram, share)), *size)
             for share in (config.lower, config.upper)
         )
         return lower, upper
@@ -400,9 +405,6 @@ def coarse_spec(config: RobustSplatConfig) -> str:
     spec = parse(config.features)
     head = f"{spec.name}@{config.coarse_size}"
     return head + "".join(f",{key}={value}" for key, value in spec.options.items())
-
-
-Config = RobustSplatConfig
 
 
 def build(options: RobustSplatConfig) -> Parts:

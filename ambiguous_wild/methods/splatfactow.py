@@ -19,14 +19,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import State, check_limits
-from ambiguous_wild.methods.masking_common import enlarged
+from ambiguous_wild.methods.masking_common import EffectMask, enlarged
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import directions, harmonics, ray_directions
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
+from ambiguous_wild.splat.parts import Parts, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Shot, Step, TrainData
 
@@ -136,20 +136,16 @@ def _up_to(basis: Tensor, degree: float) -> Tensor:
     return torch.cat([basis[:, :count], torch.zeros_like(basis[:, count:])], dim=1)
 
 
-class TrimmedLoss(MaskPolicy):
+class TrimmedLoss(EffectMask):
     """Masks the largest residuals: the more, the larger the photo's loss among all so far."""
+
+    effect: SplatfactoColours
 
     def __init__(self, effect: SplatfactoColours) -> None:
         self.effect, self.config = effect, effect.config
         self.high: float | Tensor = 0.0  # largest mean residual since the last multiple of 6000
         self.low: float | Tensor = 1.0
         self.rounds = 0
-
-    def required_effect(self) -> SplatfactoColours:
-        return self.effect
-
-    def setup(self, data: TrainData) -> None:
-        self.effect.require_setup()
 
     def keep(self, step: Step) -> Tensor | None:
         if step.nominal < self.config.mask_start:

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State, check_limits
-from ambiguous_wild.methods.dronesplat import label_means, nearest
+from ambiguous_wild.methods.dronesplat import label_means
 from ambiguous_wild.methods.masking_common import (
     MaskedShares,
     MaskNet,
@@ -28,6 +28,7 @@ from ambiguous_wild.methods.masking_common import (
     bound,
     enlarged,
     load_adam_state,
+    nearest,
     percentile,
     residual,
     sampled,
@@ -59,6 +60,7 @@ class SpotLessDensity(DensityControl):
     """Clones, splits and prunes as 3DGS, and cuts the higher harmonics once."""
 
     config: SpotLessDensityConfig
+    saved = (*DensityControl.saved, "cut")
     cut = False  # whether the higher harmonics were cut
 
     @torch.no_grad()
@@ -76,13 +78,6 @@ class SpotLessDensity(DensityControl):
 
     def _cut_due(self, step: Step) -> bool:
         return not self.cut and step.nominal >= self.config.free_colour
-
-    def state_dict(self) -> State:
-        return super().state_dict() | {"cut": self.cut}
-
-    def load_state_dict(self, state: State) -> None:
-        super().load_state_dict(state)
-        self.cut = bool(state["cut"])
 
 
 class PruningDensity(SpotLessDensity):

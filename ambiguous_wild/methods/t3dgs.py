@@ -29,7 +29,6 @@ from ambiguous_wild.methods.masking_common import (
     load_adam_state,
     resized,
     sampled,
-    upsampled,
 )
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
@@ -161,7 +160,7 @@ class Divergence(PausingMask):
         size, render = step.photo.shape[:2], step.rendered.image.detach()
         full = self.cameras[step.view]
         with torch.no_grad():
-            seen = self.features(upsampled(render, full.height, full.width))
+            seen = self.features(resized(render, full.height, full.width))
         both = torch.stack([self.phi[step.view], seen])
         with torch.set_grad_enabled(learn):
             photo, other = self.head(both, *size)

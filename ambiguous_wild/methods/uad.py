@@ -10,7 +10,6 @@ the keep map masks. Without masks u is 0 everywhere.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -23,12 +22,7 @@ from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
 
 
-@dataclass(frozen=True)
-class UadConfig(DensityConfig):
-    """Options of 3DGS's density control; `grow_grad` is the threshold of the weighted mean."""
-
-
-def build(options: UadConfig) -> Parts:
+def build(options: DensityConfig) -> Parts:
     """Return 3DGS with this density control; graft it onto methods with masks: METHOD@density=uad."""
     return Parts(density=UncertaintyAware, density_config=options)
 
@@ -36,10 +30,10 @@ def build(options: UadConfig) -> Parts:
 class UncertaintyAware(DensityControl):
     """Grows by the ratio of `grad_sum`, a sum of weighted gradients, to `seen`, the sum of weights.
 
-    A Gaussian whose weights sum to less than one pixel does not grow.
+    A Gaussian whose weights sum to less than one pixel does not grow. `grow_grad` is the threshold of
+    the ratio.
     """
 
-    config: UadConfig
     needs: ClassVar[frozenset[str]] = frozenset({"count"})
     reads_keep: ClassVar[bool] = True
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}

@@ -36,7 +36,6 @@ from ambiguous_wild.methods.masking_common import (
     hashed_uniform,
     load_adam_state,
     resized,
-    upsampled,
 )
 from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
@@ -76,7 +75,7 @@ class FeatureDistance:
     def __call__(self, step: Step) -> Tensor:
         """Return the distance [H, W] at the size of the step's photo."""
         full = self.cameras[step.view]  # not the photo, which may not be on the device
-        seen = self.features(upsampled(step.rendered.image.detach(), full.height, full.width))
+        seen = self.features(resized(step.rendered.image.detach(), full.height, full.width))
         cosine = F.cosine_similarity(self.photos[step.view], seen, dim=2)
         if self.normal_units is not None:
             cosine = calibrated(cosine, self.features.unit, self.normal_units)
@@ -120,9 +119,6 @@ def build(options: WildGaussiansConfig) -> Parts:
     """Return 3DGS with the masks, the appearance, or both."""
     effects = (WildAppearance(options),) if options.appearance else ()
     return Parts(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
-
-
-Config = WildGaussiansConfig
 
 
 class WildAppearance(Learnt):

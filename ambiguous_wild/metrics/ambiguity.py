@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -33,15 +33,6 @@ class ColourCounts:
     known: int  # distractor pixels with a known background
     close: int  # known ones that differ from the background by less than the threshold
     residual_sum: float  # sum of colour differences over the known pixels
-
-    def __add__(self, other: ColourCounts) -> ColourCounts:
-        return ColourCounts(
-            self.pixels + other.pixels,
-            self.distractor + other.distractor,
-            self.known + other.known,
-            self.close + other.close,
-            self.residual_sum + other.residual_sum,
-        )
 
     @property
     def unknown(self) -> int:
@@ -117,7 +108,8 @@ def colour_counts(
 
 def pooled(counts: Sequence[ColourCounts]) -> ColourCounts:
     """Sum the counts of several photos, so that each weighs by its distractor pixels."""
-    return sum(counts, ColourCounts(0, 0, 0, 0, 0.0))
+    nothing = ColourCounts(0, 0, 0, 0, 0.0)
+    return ColourCounts(*map(sum, zip(*map(astuple, (nothing, *counts)))))
 
 
 def ratio_interval(

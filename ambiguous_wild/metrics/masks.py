@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -25,14 +25,6 @@ class Confusion:
     false_positive: int = 0  # static but masked
     false_negative: int = 0  # transient but kept
     true_negative: int = 0  # static and kept
-
-    def __add__(self, other: Confusion) -> Confusion:
-        return Confusion(
-            self.true_positive + other.true_positive,
-            self.false_positive + other.false_positive,
-            self.false_negative + other.false_negative,
-            self.true_negative + other.true_negative,
-        )
 
     @property
     def iou(self) -> float:
@@ -71,7 +63,7 @@ def confusion(
 
 def pooled(counts: Iterable[Confusion]) -> Confusion:
     """Sum the counts of several photos."""
-    return sum(counts, Confusion())
+    return Confusion(*map(sum, zip(*map(astuple, counts))))
 
 
 def psnr_valid(

@@ -158,9 +158,7 @@ _PLACES = {"courtyard": courtyard, "room": room, "yard": yard}
 PhotoProgress = Callable[[list[PlannedPhoto]], Iterable[PlannedPhoto]]
 
 
-def build_world(
-    rng: np.random.Generator, detail_px_per_m: float, samples: int = 4, what: WorldSpec | None = None
-) -> World:
+def build_world(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
     """Build the place of the spec; positions and textures vary with the generator.
 
     Objects that are left out still use up their random numbers, so the others do not change.
@@ -169,9 +167,8 @@ def build_world(
         rng: source of randomness.
         detail_px_per_m: resolution of the textures, px per m.
         samples: rays a pixel, a square number.
-        what: the place and its objects; None: the courtyard.
+        what: the place and its objects.
     """
-    what = WorldSpec() if what is None else what
     return _PLACES[what.place](rng, detail_px_per_m, samples, what)
 
 
@@ -393,15 +390,8 @@ def _code_hash() -> str:
 
 
 def _camera_json(spec: CaptureSpec, camera: Camera) -> CameraRecord:
-    record: CameraRecord = {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "cam_from_world": camera.cam_from_world.tolist(),
-    }
+    fields = asdict(camera) | {"cam_from_world": camera.cam_from_world.tolist()}
+    record = cast(CameraRecord, fields)
     lens = spec.effects.lens_distortion
     if lens is not None:
         record["distortion"] = {"k1": lens.k1, "k2": lens.k2}

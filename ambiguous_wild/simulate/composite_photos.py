@@ -24,7 +24,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES, Exif, UnreadablePhoto, read_photo
-from ambiguous_wild.simulate.composite_scene import check_folders
+from ambiguous_wild.simulate.composite_scene import check_request
 from ambiguous_wild.simulate.cutouts import (
     SMALLEST_PX,
     TRUTH_COVER,
@@ -122,11 +122,8 @@ def composite_photos(
     Raises:
         AwError: too few or unreadable photos, bad cut-outs or settings, or an output that exists.
     """
-    config.check()
     root, target = Path(source), Path(output)
-    check_folders(root, target)
-    if cutouts is None and not config.patches:
-        raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
+    check_request(root, target, config, cutouts)
     mean = config.coverage / config.presence  # mean coverage of photos with distractors
     if mean > _MOST_COVER:
         raise AwError(

@@ -125,12 +125,9 @@ def composite(
     Raises:
         AwError: a bad scene, bad cut-outs, a coverage that cannot be reached, or an output that exists.
     """
-    config.check()
     root, target = Path(source), Path(output)
     name = check_name("scene name (the folder's)", target.resolve().name)
-    check_folders(root, target)
-    if cutouts is None and not config.patches:
-        raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
+    check_request(root, target, config, cutouts)
     shape_rng, place_rng, patch_rng = (
         np.random.default_rng(s) for s in np.random.SeedSequence(config.seed).spawn(3)
     )
@@ -147,12 +144,15 @@ def composite(
     return facts
 
 
-def check_folders(root: Path, target: Path) -> None:
-    """Raise AwError if source and output lie inside each other, or the output exists."""
+def check_request(root: Path, target: Path, config: CompositeConfig, cutouts: Path | str | None) -> None:
+    """Raise AwError for bad settings, no distractors, folders inside each other, or an output that exists."""
+    config.check()
     if target.resolve().is_relative_to(root.resolve()) or root.resolve().is_relative_to(target.resolve()):
         raise AwError(f"{target} and {root} lie inside each other; choose another folder for -o")
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise AwError(f"{target} exists; remove it or choose another folder for -o")
+    if cutouts is None and not config.patches:
+        raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
 
 
 def _check_scene(scene: Scene) -> None:

@@ -8,7 +8,6 @@ from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import CYLINDER, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
@@ -19,9 +18,9 @@ from ambiguous_wild.simulate.world import (
     parts_of,
     poster,
     shade_feet,
-    shapes_of_thing,
     sunlight,
     surface,
+    world_of,
 )
 
 PLAN = PLANS["courtyard"]
@@ -87,20 +86,8 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float,
     return shapes, circles
 
 
-def courtyard(
-    rng: np.random.Generator, detail_px_per_m: float, samples: int = 4, what: WorldSpec | None = None
-) -> World:
-    """Build the courtyard; positions and textures vary with the generator.
-
-    Objects that are left out still use up their random numbers, so the others do not change.
-
-    Args:
-        rng: source of randomness.
-        detail_px_per_m: resolution of the textures, px per m.
-        samples: rays a pixel, a square number.
-        what: objects of the courtyard; None: furniture and statue.
-    """
-    what = WorldSpec() if what is None else what
+def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
+    """Build the courtyard; arguments as in `capture.build_world`."""
     d = detail_px_per_m
     depth = BACK_M - FRONT_M
     statue = (float(rng.uniform(-0.15, 0.35)), float(rng.uniform(1.2, 1.5)), 0.95)
@@ -122,14 +109,8 @@ def courtyard(
         "sky": tx.sky(rng),
         **sheets(),
     }
-    shapes = [
-        *ground_and_sky(PLAN),
-        *_walls(rng),
-        *furniture,
-    ]
+    shapes = [*ground_and_sky(PLAN), *_walls(rng), *furniture]
     if what.statue:
         shapes += placed(parts_of("courtyard plinth"), (statue[0], statue[1], 0), yaw)
         shapes += placed(figure("stone", "stone", 0.07, 0.8), statue, yaw)
-    shapes += [s for thing in what.things for s in shapes_of_thing(thing, PLAN)]
-    keep_out = np.array(circles, float).reshape(-1, 3)
-    return World(tuple(shapes), build_atlas(textures), sunlight(rng, samples), keep_out, statue, PLAN)
+    return world_of(PLAN, what, shapes, circles, textures, sunlight(rng, samples), statue)

@@ -32,9 +32,8 @@ class Cutout:
     """One distractor image."""
 
     name: str
-    light: (
-        np.ndarray
-    )  # [h, w, 4] float32: linear RGB times alpha, and alpha in [0, 1]; transparent rim of 1 px
+    # [h, w, 4] float32: linear RGB times alpha, and alpha in [0, 1]; transparent rim of 1 px
+    light: np.ndarray
     source: str = ""  # sha256 of its file; "" without a file
 
     @property

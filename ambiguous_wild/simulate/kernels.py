@@ -7,6 +7,8 @@ Arguments: a table is `ShapeTable.columns()`, an atlas `(texels, offset, width, 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numba
 
@@ -19,8 +21,13 @@ _STEPS = 128
 _NEAR_M = 4e-4  # distance at which a ray has reached the surface
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles with these options of Numba; the result is kept on disk."""
+    compiled: Any = numba.njit(cache=True, error_model="numpy", **options)
+    return lambda function: rebuild_damaged_cache(compiled(function))
+
+
+@kernel(inline="never")
 def distance(volume, x, y, z):
     """Interpolate `volume` [N, N, N] trilinearly at a point of the cube [-1, 1]^3, clamped to it."""
     n = volume.shape[0]
@@ -38,8 +45,7 @@ def distance(volume, x, y, z):
     return (1 - c) * low + c * high
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def sphere_trace(volume, o, d, size, far):
     """Return the distance along the local ray o + t d, |d| = 1, to the volume's surface, or `far`."""
     start, end = 1e-6, far
@@ -64,8 +70,7 @@ def sphere_trace(volume, o, d, size, far):
     return far
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def surface_normal(volume, p, size, d):
     """Return the unit normal at the local point by central differences, turned against the ray."""
     x, y, z = p[0] / size, p[1] / size, p[2] / size
@@ -79,8 +84,7 @@ def surface_normal(volume, p, size, d):
     return nx * scale, ny * scale, nz * scale
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _intersect(kind, o, d, h, far):
     """Return the distance along the local ray o + t d, or `far`; an ellipsoid is also hit from inside."""
     ox, oy, oz = o
@@ -149,8 +153,7 @@ def _intersect(kind, o, d, h, far):
     return best
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _local(table, s, px, py, pz, shift):
     r, c = table[1], table[2]
     if shift:
@@ -162,8 +165,7 @@ def _local(table, s, px, py, pz, shift):
     )
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def nearest(table, which, count, o, d, far):
     """Return the nearest hit among the listed shapes: (distance, shape or -1)."""
     best, hit = far, -1
@@ -187,8 +189,7 @@ def nearest(table, which, count, o, d, far):
     return best, hit
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _shadowed(table, o, d):
     center, radius, half, kind, casts = table[2], table[4], table[3], table[0], table[9]
     for s in range(len(kind)):
@@ -208,8 +209,7 @@ def _shadowed(table, o, d):
     return False
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _normal(kind, p, h, d):
     """Return the unit normal at the local point, turned against the local ray."""
     x, y, z = p
@@ -238,8 +238,7 @@ def _normal(kind, p, h, d):
     return nx * scale, ny * scale, nz * scale
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _fold(u, size):
     """Map a texture coordinate to a texel, mirrored at the borders without a seam."""
     u = u - 2.0 * math.floor(0.5 * u)
@@ -247,8 +246,7 @@ def _fold(u, size):
     return min(max(u * size - 0.5, 0.0), size - 1.0)
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _bilinear(atlas, t, level, u, v):
     texels, offset, width, height = atlas[0], atlas[1], atlas[2], atlas[3]
     w, h, base = width[t, level], height[t, level], offset[t, level]
@@ -265,8 +263,7 @@ def _bilinear(atlas, t, level, u, v):
     )
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _sample(atlas, t, u, v, lod):
     """Look a texture up trilinearly: blend the two mip levels around `lod`."""
     top = atlas[4][t] - 1
@@ -280,8 +277,7 @@ def _sample(atlas, t, u, v, lod):
     return r0 + f * (r1 - r0), g0 + f * (g1 - g0), b0 + f * (b1 - b0)
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _gloss(strength, sharpness, n, d, sun, sunlit, light):
     """Compute specular light of a polished surface: the sun's highlight (Blinn), the sky's (Schlick)."""
     facing = -(n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
@@ -300,8 +296,7 @@ def _gloss(strength, sharpness, n, d, sun, sunlit, light):
     )
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others, shadow_casters):
     """Compute the colour of shape s at distance t: texture, sun with shadow, sky light from above and below.
 
@@ -356,8 +351,7 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
     return bright, bright
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _lit(base, tone, polish, n, d, sun, lit, light):
     """Compute the colour of a surface under the share `lit` of the sun and the whole sky."""
     up = 0.5 + 0.5 * n[2]

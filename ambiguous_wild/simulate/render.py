@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
@@ -111,16 +112,13 @@ def finish_photo(
 
 def depth_m(world: World, camera: Camera) -> np.ndarray:
     """Return z of the static surface in the pinhole camera, [H, W] float32, m."""
-    return trace(camera, world.table(), _no_shapes(world), world.atlas, world.light).depth_m
+    nothing = shape_table((), world.atlas)
+    return trace(camera, world.table(), nothing, world.atlas, world.light).depth_m
 
 
 def _lasting(effects: Effects) -> Effects:
     """Return the effects that are the same in all photos, which test photos get too."""
     return Effects(specular=effects.specular, lens_distortion=effects.lens_distortion)
-
-
-def _no_shapes(world: World) -> ShapeTable:
-    return shape_table((), world.atlas)
 
 
 def _lit(effects: Effects, world: World, random: PhotoRandom, drawn: DrawnEffects) -> _LitScene:
@@ -170,12 +168,11 @@ def _optics(
     if not steps:
         return None, traced, light
 
-    def move(image: np.ndarray) -> np.ndarray:
-        for step in steps:
-            image = step(image)
-        return image
+    return _chained(steps), traced, light
 
-    return move, traced, light
+
+def _chained(steps: list[ImageFilter]) -> ImageFilter:
+    return lambda image: reduce(lambda changed, step: step(changed), steps, image)
 
 
 def _sources(
@@ -256,12 +253,7 @@ def _sensor(effects: Effects, camera: Camera, random: PhotoRandom, drawn: DrawnE
         drawn["iso_noise"] = {"iso": iso}
         steps.append(lambda image: fx.iso_noise(image, normal, iso))
 
-    def develop(image: np.ndarray) -> np.ndarray:
-        for step in steps:
-            image = step(image)
-        return image
-
-    return develop
+    return _chained(steps)
 
 
 def _to_uint8(linear: np.ndarray) -> np.ndarray:

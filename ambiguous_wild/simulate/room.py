@@ -11,7 +11,6 @@ from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID, PLANAR, QUAD
 from ambiguous_wild.simulate.shapes import Shape, between, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
@@ -23,10 +22,10 @@ from ambiguous_wild.simulate.world import (
     parts_of,
     poster,
     shade_feet,
-    shapes_of_thing,
     statue,
     sunlight,
     wall,
+    world_of,
 )
 
 PLAN = PLANS["room"]
@@ -69,11 +68,9 @@ def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     if what.statue:
         pedestal = [*parts_of("room pedestal"), *placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0)]
         shapes += placed(pedestal, hub, float(rng.uniform(-20, 20)))
-    shapes += [s for thing in what.things for s in shapes_of_thing(thing, PLAN)]
     # The sun comes in through the windows; light reflected by walls is part of the sky light.
     light = sunlight(rng, samples, (-178.0, -165.0), (26.0, 34.0), sky=1.4)
-    keep_out = np.array(circles, float).reshape(-1, 3)
-    return World(tuple(shapes), build_atlas(textures), light, keep_out, hub, PLAN)
+    return world_of(PLAN, what, shapes, circles, textures, light, hub)
 
 
 def _hull() -> list[Shape]:
@@ -110,12 +107,8 @@ def _hull() -> list[Shape]:
 def _window(name: str, left: float, right: float, bottom: float, top: float) -> list[Shape]:
     """Make frame, bars and sill of a window, and curtains on both sides."""
     frame: dict[str, Any] = {"tint": WHITE, "axes": WALL_AXES[name]}
-    middle, height, wide, high = (
-        (left + right) / 2,
-        (bottom + top) / 2,
-        (right - left) / 2,
-        (top - bottom) / 2,
-    )
+    middle, height = (left + right) / 2, (bottom + top) / 2
+    wide, high = (right - left) / 2, (top - bottom) / 2
     pieces = [
         (middle, bottom - 0.02, wide + 0.08, 0.03, 0.11),
         (middle, top, wide + 0.04, 0.035, 0.05),

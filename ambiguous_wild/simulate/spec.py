@@ -56,14 +56,12 @@ class Distractor:
     # layouts drawn, from which `occlusion` chooses.
     presence: float = 0.85
     distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; for a walker only the minimum counts
-    size: float = (
-        1.0  # factor on the natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m, car 4.1 m
-    )
+    # factor on the natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m, car 4.1 m
+    size: float = 1.0
     lift_m: float = 0.0  # greatest height above the ground
     tint: Colour = (1.0, 1.0, 1.0)  # factor on the texture, in linear light
-    path: Literal["elsewhere", "walk"] = (
-        "elsewhere"  # elsewhere: a new place in every photo; walk: along `waypoints`
-    )
+    # elsewhere: a new place in every photo; walk: along `waypoints`
+    path: Literal["elsewhere", "walk"] = "elsewhere"
     waypoints: tuple[tuple[float, float], ...] = ()  # m: x and y of the corners of its walk
     laps: float = 1.0  # times it walks there and back during the capture
 
@@ -86,9 +84,8 @@ class WorldSpec:
     """A place, with its ground and walls, and the objects in it."""
 
     place: Place = "courtyard"
-    furniture: bool = (
-        True  # courtyard: planters, crates, bench, ball; room: all that stands; yard: cars, trees
-    )
+    # courtyard: planters, crates, bench, ball; room: all that stands; yard: cars, trees
+    furniture: bool = True
     statue: bool = True  # on its plinth
     things: tuple[Thing, ...] = ()
 

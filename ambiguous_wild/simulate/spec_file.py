@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from ambiguous_wild.simulate.spec import (
     LensDistortion,
     Thing,
 )
+from ambiguous_wild.simulate.world import POSTERS, SHEETS
 
 
 class _Dumper(yaml.SafeDumper):
@@ -121,25 +122,7 @@ def plain_spec(spec: CaptureSpec) -> dict[str, Any]:
     return data
 
 
-# Textures that `world.py` bakes; a test compares the two lists.
-SHEET_NAMES = (
-    "stone",
-    "foliage",
-    "timber",
-    "clay",
-    "skin",
-    "brick",
-    "gravel",
-    "vivid",
-    "cloth",
-    "plaster",
-    "asphalt",
-    "enamel",
-)
-PICTURES = tuple(
-    f"poster_{name}" for name in ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
-)
-
+PICTURES = tuple(f"poster_{name}" for name in POSTERS)
 MOST = 255  # largest number of distractors, as the ray caster stores a pixel's distractor in a byte
 
 # Least and greatest value of each number; in pairs the smaller number comes first.
@@ -212,7 +195,7 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
         if not spec.effects.specular.textures:
             raise AwError("effects.specular.textures: name at least one, or leave the effect out")
         for name in spec.effects.specular.textures:
-            _texture("effects.specular.textures", name, (*SHEET_NAMES, *plan.surfaces))
+            _texture("effects.specular.textures", name, (*SHEETS, *plan.surfaces))
     if spec.effects.lens_distortion is not None:
         _lens(spec, spec.effects.lens_distortion)
     return spec
@@ -232,12 +215,12 @@ def _lens(spec: CaptureSpec, lens: LensDistortion) -> None:
 
 
 def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
-    known = (*SHEET_NAMES, *PICTURES, *plan.surfaces) if d.kind == "placard" else SHEET_NAMES
+    known = (*SHEETS, *PICTURES, *plan.surfaces) if d.kind == "placard" else SHEETS
     _texture(f"{where}texture", d.texture, known)
     if d.head:
         if d.kind != "visitor":
             raise AwError(f"{where}head: only a visitor has one, not a {d.kind}")
-        _texture(f"{where}head", d.head, SHEET_NAMES)
+        _texture(f"{where}head", d.head, SHEETS)
     _within(where, d, _DISTRACTOR)
     if d.path == "walk" and len(d.waypoints) < 2:
         raise AwError(f"{where}waypoints: a walk needs two corners or more, [[x, y], [x, y]] in metres")
@@ -251,7 +234,7 @@ def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
 
 
 def _thing(where: str, thing: Thing, plan: GroundPlan) -> None:
-    known = (*SHEET_NAMES, *PICTURES, *plan.surfaces) if thing.kind == "board" else SHEET_NAMES
+    known = (*SHEETS, *PICTURES, *plan.surfaces) if thing.kind == "board" else SHEETS
     _texture(f"{where}texture", thing.texture, known)
     _within(where, thing, _THING)
     for axis, value, limits in zip("xyz", thing.at_m, (plan.x_m, plan.y_m, (0.0, 4.0))):
@@ -277,6 +260,6 @@ def _between(where: str, value: float, low: float, high: float) -> None:
         raise AwError(f"{where}: between {low:g} and {high:g}, got {text}")
 
 
-def _texture(where: str, name: str, textures: Sequence[str]) -> None:
+def _texture(where: str, name: str, textures: Collection[str]) -> None:
     if name not in textures:
         raise unknown(f"texture in {where}", name, textures)

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numba
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.io.numba_cache import rebuild_damaged_cache
-from ambiguous_wild.simulate.kernels import FAR, nearest, shade
+from ambiguous_wild.simulate.kernels import FAR, kernel, nearest, shade
 
 _TILE = 16
 _MAX_LEVELS = 12
@@ -94,22 +93,7 @@ class ShapeTable:
 
     def columns(self) -> tuple[np.ndarray, ...]:
         """Return the arrays in the order of the kernel's arguments."""
-        return (
-            self.kind,
-            self.rotation,
-            self.center,
-            self.half,
-            self.radius,
-            self.texture,
-            self.mapping,
-            self.uv,
-            self.tint,
-            self.casts,
-            self.owner,
-            self.gloss,
-            self.volume,
-            self.grids,
-        )
+        return tuple(getattr(self, column.name) for column in fields(self))
 
 
 @dataclass(frozen=True)
@@ -165,7 +149,7 @@ def trace(
         ),
         static.columns(),
         movers.columns(),
-        (_empty_table(static) if shadow_casters is None else shadow_casters).columns(),
+        tuple(c[:0] for c in static.columns()) if shadow_casters is None else shadow_casters.columns(),
         (atlas.texels, atlas.offset, atlas.width, atlas.height, atlas.levels),
         (light.sun, light.sun_colour, light.sky_colour, light.ground_colour),
         (clean, distracted, owner, depth, darkened),
@@ -173,12 +157,7 @@ def trace(
     return TracedPhoto(clean, distracted, None if shadow_casters is None else darkened, owner, depth)
 
 
-def _empty_table(table: ShapeTable) -> ShapeTable:
-    return ShapeTable(*(column[:0] for column in table.columns()))
-
-
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _cull(table, o, axis, spread, keep):
     """List the shapes whose bounding sphere meets the cone around `axis`, and return their number."""
     center, radius = table[2], table[4]
@@ -198,8 +177,7 @@ def _cull(table, o, axis, spread, keep):
     return count
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _ray(rotation, k, u, v):
     x, y = (u - k[2]) / k[0], (v - k[3]) / k[1]
     scale = 1.0 / math.sqrt(x * x + y * y + 1.0)
@@ -211,8 +189,7 @@ def _ray(rotation, k, u, v):
     ), z
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@kernel(parallel=True)
 def _trace(view, static, movers, shadow_casters, atlas, light, frame):
     height, width = frame[2].shape
     across = (width + _TILE - 1) // _TILE
@@ -223,8 +200,7 @@ def _trace(view, static, movers, shadow_casters, atlas, light, frame):
         _tile(view, (x0, y0, x1, y1), static, movers, shadow_casters, atlas, light, frame)
 
 
-@rebuild_damaged_cache
-@numba.njit(cache=True, error_model="numpy", inline="never")
+@kernel(inline="never")
 def _tile(view, box, static, movers, shadow_casters, atlas, light, frame):
     rotation, eye, k, side = view
     x0, y0, x1, y1 = box

@@ -29,8 +29,8 @@ from ambiguous_wild.simulate.kernels import (
     VOLUME,
 )
 from ambiguous_wild.simulate.shapes import SHEET_M, Axes, Shape, between, figure, placed, shape_table, vector
-from ambiguous_wild.simulate.spec import STATUES, GroundPlan, Thing
-from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable
+from ambiguous_wild.simulate.spec import STATUES, GroundPlan, Thing, WorldSpec
+from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable, build_atlas
 
 
 def statue(name: str, texture: str, height_m: float) -> Shape:
@@ -176,6 +176,21 @@ class World:
         return shape_table(self.shapes, self.atlas)
 
 
+def world_of(
+    plan: GroundPlan,
+    what: WorldSpec,
+    shapes: Sequence[Shape],  # of the place itself
+    circles: Sequence[tuple[float, float, float]],  # x, y, radius in m in which no distractor may stand
+    textures: Mapping[str, np.ndarray],
+    light: Light,
+    hub: tuple[float, float, float],
+) -> World:
+    """Make the world of a place and of the things that the spec adds to it."""
+    things = [s for thing in what.things for s in shapes_of_thing(thing, plan)]
+    keep_out = np.array(circles, float).reshape(-1, 3)
+    return World((*shapes, *things), build_atlas(textures), light, keep_out, hub, plan)
+
+
 def baked_sheets(rng: np.random.Generator, detail_px_per_m: float) -> Callable[[], dict[str, np.ndarray]]:
     """Draw the random streams of the later sheets now, and return a function that bakes all sheets."""
     later = dict(zip(_LATER_SHEETS, rng.spawn(len(_LATER_SHEETS))))
@@ -229,10 +244,8 @@ def wall(
     across, up = plan.surfaces[name]
     along, _, inwards = (np.array(a, float) for a in WALL_AXES[name])
     x, y = plan.middle
-    depth = (plan.y_m if "back" in name or "front" in name else plan.x_m)[1] - (
-        plan.y_m if "back" in name or "front" in name else plan.x_m
-    )[0]
-    middle = np.array([x, y, 0.0]) - inwards * depth / 2
+    near, far = plan.y_m if name in ("wall_back", "wall_front") else plan.x_m
+    middle = np.array([x, y, 0.0]) - inwards * (far - near) / 2
     pieces: list[tuple[float, float, float, float]] = []
     start = -across / 2
     for left, right, bottom, top in sorted(openings):

@@ -12,7 +12,6 @@ from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID
 from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
-from ambiguous_wild.simulate.tracer import build_atlas
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
@@ -25,9 +24,9 @@ from ambiguous_wild.simulate.world import (
     parts_of,
     poster,
     shade_feet,
-    shapes_of_thing,
     sunlight,
     wall,
+    world_of,
 )
 
 PLAN = PLANS["yard"]
@@ -79,10 +78,8 @@ def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     if what.statue:
         plinth = [*parts_of("yard plinth"), *placed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0)]
         shapes += placed(plinth, foot, float(rng.uniform(-110, -70)))
-    shapes += [s for thing in what.things for s in shapes_of_thing(thing, PLAN)]
-    keep_out = np.array(circles, float).reshape(-1, 3)
     light = sunlight(rng, samples, (-150.0, -120.0), (48.0, 58.0))
-    return World(tuple(shapes), build_atlas(textures), light, keep_out, hub, PLAN)
+    return world_of(PLAN, what, shapes, circles, textures, light, hub)
 
 
 def _fronts(rng: np.random.Generator) -> list[Shape]:

@@ -81,6 +81,9 @@ class DensityControl:
     # sums for each Gaussian since the last round: attribute name, and the shape after [N]
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}
 
+    # attributes with plain values that a checkpoint holds
+    saved: ClassVar[tuple[str, ...]] = ("last_growth", "last_reset", "resets_done")
+
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
         self.config = config
         self.extent = extent
@@ -180,7 +183,8 @@ class DensityControl:
 
     def reset_opacity(self, gaussians: Gaussians) -> None:
         """Hook: lower the opacities, in place."""
-        gaussians.opacity_logits.clamp_(max=_logit(self.config.reset_opacity))
+        target = self.config.reset_opacity
+        gaussians.opacity_logits.clamp_(max=float(np.log(target / (1 - target))))
 
     def due(self, step: Step) -> bool:
         """Whether `refine` may change something now; classes that override `refine` extend it.
@@ -192,10 +196,10 @@ class DensityControl:
         return self._growth_due(step) or resets
 
     def _growth_due(self, step: Step) -> bool:
-        config = self.config
-        due = step.iteration - self.last_growth >= config.min_every
-        due = due and step.nominal >= config.start and step.nominal <= config.stop
-        return due and self._crossed(step, config.every)
+        config, since = self.config, step.iteration - self.last_growth
+        due = since >= config.min_every and config.start <= step.nominal <= config.stop
+        # in nominal iterations; in short runs `min_every` dominates
+        return due and since * (step.nominal / step.iteration) >= config.every - 1e-6
 
     def after_growth(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         """Hook: change the set once more after growth and pruning, for example by merging."""
@@ -210,11 +214,6 @@ class DensityControl:
         if (width, height) not in self._halves:
             self._halves[width, height] = torch.tensor([width / 2, height / 2]).to(device)
         return self._halves[width, height]
-
-    def _crossed(self, step: Step, every: float) -> bool:
-        # `every` nominal iterations since the last round; in short runs `min_every` dominates.
-        scale = step.nominal / step.iteration
-        return (step.iteration - self.last_growth) * scale >= every - 1e-6
 
     def _reset_due(self, step: Step) -> bool:
         config = self.config
@@ -307,19 +306,14 @@ class DensityControl:
 
     def state_dict(self) -> State:
         return {
-            **{name: getattr(self, name) for name in self.sums},
-            "last_growth": self.last_growth,
-            "last_reset": self.last_reset,
-            "resets_done": self.resets_done,
+            **{name: getattr(self, name) for name in (*self.sums, *self.saved)},
             "rng": self.rng.bit_generator.state,
             "log": self.log.state_dict(),
         }
 
     def load_state_dict(self, state: State) -> None:
-        for name in self.sums:
+        for name in (*self.sums, *self.saved):
             setattr(self, name, state[name])
-        self.last_growth, self.last_reset = state["last_growth"], state["last_reset"]
-        self.resets_done = state["resets_done"]
         self.rng.bit_generator.state = state["rng"]
         self.log.load_state_dict(state["log"])
 
@@ -341,7 +335,3 @@ def shaped(noise: Tensor, gaussians: Gaussians) -> Tensor:
     """Turn normal draws [N, 3] into offsets from the means [N, 3] with the Gaussians' covariances."""
     local = noise * gaussians.log_scales.exp()
     return (rotation_matrices(gaussians.quats) @ local[:, :, None]).squeeze(2)
-
-
-def _logit(p: float) -> float:
-    return float(np.log(p / (1 - p)))

@@ -23,13 +23,13 @@ from ambiguous_wild.splat.step import Shot, Step, TrainData
 class SceneRenderer:
     """Draws the pictures of one run, and holds its fields beside the static one."""
 
-    def __init__(self, data: TrainData, parts: Parts, static: Field, effects: Chain | None) -> None:
+    def __init__(self, data: TrainData, parts: Parts, static: Field, effects: Chain) -> None:
         """
         Args:
             data: the training side.
             parts: the method.
             static: the first field.
-            effects: the run's effects; None = it has none.
+            effects: the run's effects.
 
         Raises:
             AwError: a field has the name of the static one.
@@ -54,14 +54,12 @@ class SceneRenderer:
         if start.density is not None:
             check_needs(start.density.needs, data.backend.statistics)
             start.density.setup(data)
-            start.density.protected = None if self.effects is None else self.effects.protected()
+            start.density.protected = self.effects.protected()
 
     # -- pictures ---------------------------------------------------------------------------------
 
     def __call__(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
         """Draw the model; effects have already changed the shot's camera."""
-        if self.effects is None:
-            return self._compose(gaussians, shot, None)
         return self.effects.render(gaussians, shot, self._compose, without)
 
     def again(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
@@ -69,20 +67,14 @@ class SceneRenderer:
         if gaussians is self.static.gaussians:
             return self(gaussians, shot, without)
         shot = replace(shot, other_gaussians=True)
-        if self.effects is None:
-            return self._draw(gaussians, shot, None)
         return self.effects.render(gaussians, shot, self._draw, without)
 
     def fit(self, gaussians: Gaussians, shot: Shot, photo: Tensor, keep: Tensor) -> Tensor:
         """Draw a picture in the colours of its photo, see `Chain.fit_view`."""
-        if self.effects is None:
-            return self(gaussians, shot).image
         return self.effects.fit_view(gaussians, shot, photo, keep, self._draw)
 
     def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
         """Return the Gaussians as they are drawn when the picture belongs to no photo."""
-        if self.effects is None:
-            return gaussians
         return self.effects.neutral_model(gaussians, iteration)
 
     def _draw(self, gaussians: Gaussians, shot: Shot, shade: Shade | None) -> Rendered:

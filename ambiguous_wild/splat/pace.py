@@ -19,6 +19,9 @@ from ambiguous_wild.splat.parts import Schedule
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData
 from ambiguous_wild.splat.watchdog import OnNonFinite
 
+# share of the run at which full resolution is reached at the latest; measured on simulated captures, see
+# docs/training.md
+COARSE_UNTIL = 0.4
 SMALLEST_SIDE = 96  # px; smaller photos are too small for SSIM's 11-tap window and a 16 px tile
 
 
@@ -33,12 +36,11 @@ class Level:
 FULL = (Level(0.0, 1),)
 
 
-def coarse_to_fine(photos: list[np.ndarray], until: float = 0.4) -> tuple[Level, ...]:
+def coarse_to_fine(photos: list[np.ndarray]) -> tuple[Level, ...]:
     """Choose when divisors 4, 2 and 1 begin, from the photos' mean spectrum.
 
     Args:
         photos: a sample of the training photos, [H, W, 3] float.
-        until: share of the run at which full resolution is reached at the latest.
 
     Returns:
         Levels by rising begin; the first begins at 0.
@@ -54,10 +56,10 @@ def coarse_to_fine(photos: list[np.ndarray], until: float = 0.4) -> tuple[Level,
         return FULL  # flat photos carry no frequencies to wait for
     levels = [Level(0.0, divisors[0])]
     for previous, divisor in itertools.pairwise(divisors):
-        # Dash: begin = until * ln(E / E_min) / ln(E_total / E_min), with E of the level that ends.
+        # Dash: begin = COARSE_UNTIL * ln(E / E_min) / ln(E_total / E_min), with E of the level that ends.
         share = np.log(energies[divisor] / start) / np.log(total / start)
         before = np.log(energies[previous] / start) / np.log(total / start)
-        levels.append(Level(float(until * (before + share) / 2), divisor))
+        levels.append(Level(float(COARSE_UNTIL * (before + share) / 2), divisor))
     return tuple(levels)
 
 
@@ -70,14 +72,14 @@ def divisor_at(levels: tuple[Level, ...], progress: float) -> int:
     return current
 
 
-def ceiling_at(start: int, most: int, divisor: int, progress: float, until: float) -> int:
+def ceiling_at(start: int, most: int, divisor: int, progress: float) -> int:
     """Return how many Gaussians the current resolution can use (Dash's count schedule).
 
-    This is N0 + (Nmax - N0) / r^(2 - progress / until); at full resolution Nmax.
+    This is N0 + (Nmax - N0) / r^(2 - progress / COARSE_UNTIL); at full resolution Nmax.
     """
     if divisor == 1 or start >= most:
         return most
-    power = 2.0 - min(progress / until, 1.0)
+    power = 2.0 - min(progress / COARSE_UNTIL, 1.0)
     return int(start + (most - start) / divisor**power)
 
 
@@ -88,9 +90,6 @@ def _spectrum_share(photo: np.ndarray, divisor: int) -> float:
     height, width = spectrum.shape
     h, w = max(height // (2 * divisor), 1), max(width // (2 * divisor), 1)
     return float(spectrum[height // 2 - h : height // 2 + h, width // 2 - w : width // 2 + w].sum())
-
-
-COARSE_UNTIL = 0.4  # share of the run; measured on simulated captures, see docs/training.md
 
 
 @dataclass(frozen=True)
@@ -142,9 +141,8 @@ class Pace:
         self.config, self.schedule = config, schedule
         self.extent = data.scene.extent
         self.views = len(data.photos)
-        self._order: tuple[int, np.ndarray] | None = (
-            None  # epoch and order of views of the last call of `view`
-        )
+        # epoch and order of views of the last call of `view`
+        self._order: tuple[int, np.ndarray] | None = None
         self.start = start
         self.short = config.budget_s is not None or config.iterations < schedule.short_below
         self.most = self._most(data, most)
@@ -173,7 +171,7 @@ class Pace:
 
     def ceiling(self, divisor: int, progress: float) -> int:
         """Return the number of Gaussians at which growth stops now."""
-        return ceiling_at(self.start, self.most, divisor, progress, COARSE_UNTIL)
+        return ceiling_at(self.start, self.most, divisor, progress)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         """Return the learning rate of every tensor at this share of the run."""
@@ -216,4 +214,4 @@ class Pace:
         if resolution == "full":
             return FULL
         sample = data.photos[:: max(len(data.photos) // 8, 1)]
-        return coarse_to_fine([photo.cpu().numpy() for photo in sample], COARSE_UNTIL)
+        return coarse_to_fine([photo.cpu().numpy() for photo in sample])

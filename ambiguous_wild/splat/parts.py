@@ -157,7 +157,7 @@ class Parts:
     fields: Fields | None = None  # other fields beside the static one, see fields.py
     # returns other photos to train on (references: clean ones); None = those of the capture
     train_data: Callable[[TrainData], TrainData] | None = None
-    effects: tuple[Effect, ...] = ()  # see effects/; without any that code is never reached
+    effects: tuple[Effect, ...] = ()  # see effects/; of those that are not listed no code is reached
 
     def suited_to(self, effect: Effect) -> Parts:
         """Return the method changed as an added effect needs: with its start points and 2D filter."""

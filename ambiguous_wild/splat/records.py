@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +167,7 @@ class Timeline:
         text = io.StringIO()
         writer = csv.DictWriter(text, names, lineterminator="\n", restval="")
         writer.writeheader()
-        writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in self.rows)
+        writer.writerows(self.rows)
         write_text(path, text.getvalue())
 
 
@@ -235,11 +235,9 @@ class DensityLog:
 
     def state_dict(self) -> State:
         return {
-            "rounds": [[r.iteration, r.cloned, r.split, r.pruned, r.merged, r.count] for r in self.rounds],
-            **{
-                name: {"xyz": places.xyz, "stride": places.stride, "passed": places.passed}
-                for name, places in (("added", self.added), ("merged", self.merged))
-            },
+            "rounds": [list(astuple(round_)) for round_ in self.rounds],
+            "added": dict(vars(self.added)),
+            "merged": dict(vars(self.merged)),
         }
 
     def load_state_dict(self, state: State) -> None:

@@ -74,13 +74,13 @@ class Trainer(Run):
         self.pace = Pace(config, parts.schedule, data, start=len(gaussians), most=most)
         sizes = self.pyramid.sizes(self.pace.divisors)
         data.backend.prepare_loss(data.device, sizes, parts.lambda_dssim, parts.weighting)
-        self.effects = Chain(parts.effects, data) if parts.effects else None
-        attributes = {} if self.effects is None else self.effects.rows(gaussians)
+        self.effects = Chain(parts.effects, data)
+        attributes = self.effects.rows(gaussians)
         if attributes:
             gaussians = gaussians.carrying({name: a.values for name, a in attributes.items()})
         density = parts.density(parts.density_config, data.scene.extent, config.seed)
         density.setup(data)
-        density.protected = None if self.effects is None else self.effects.protected()
+        density.protected = self.effects.protected()
         self.field = Field(gaussians, rates_with(attributes, self.pace.learning_rates), density)
         self.drawing = SceneRenderer(data, parts, self.field, self.effects)
         parts.mask.setup(data)
@@ -100,13 +100,13 @@ class Trainer(Run):
         return self.field.density
 
     def state(self) -> State:
-        others = self.drawing.state_dict()
+        others, effects = self.drawing.state_dict(), self.effects.state_dict()
         return {
             **super().state(),
             **self.field.state_dict(),
             **({"fields": others} if others else {}),
             "mask": self.parts.mask.state_dict(),
-            **({} if self.effects is None else {"effects": self.effects.state_dict()}),
+            **({"effects": effects} if effects else {}),
         }
 
     def load_state(self, state: State) -> None:
@@ -114,8 +114,7 @@ class Trainer(Run):
         if self.drawing.others:
             self.drawing.load_state_dict(state["fields"], self.data.device)
         self.parts.mask.load_state_dict(state["mask"])
-        if self.effects is not None:
-            self.effects.load_state_dict(state["effects"])
+        self.effects.load_state_dict(state.get("effects", {}))
         super().load_state(state)
 
     def shot(self, camera: Camera, *, fitting: bool = False) -> Shot:
@@ -164,8 +163,7 @@ class Trainer(Run):
             photo=self.pyramid.photo(view, divisor),
             camera=self.pyramid.camera(view, divisor),
         )
-        if self.effects is not None:
-            shot = replace(shot, camera=self.effects.camera(shot))
+        shot = replace(shot, camera=self.effects.camera(shot))
         with self.clock.part("render"):
             rendered = self.drawing(self.gaussians, shot)
         of_shot = {f.name: getattr(shot, f.name) for f in fields(Shot)}
@@ -324,7 +322,7 @@ class Trainer(Run):
         if gradients.fields:
             with part("fields"):
                 self.drawing.learn(step, gradients.fields, progress, called_off)
-        if self.effects is not None:
+        if self.parts.effects:
             with part("effects"):
                 self.effects.step(gradients, replace(step, progress=progress), called_off)
                 if events:

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import AwError
@@ -315,9 +316,10 @@ class Sentinel:
         for name, value in inputs.items():
             flat = value.detach().reshape(-1)
             kept = self._kept.get(name)
-            if kept is None or len(kept) < len(flat):
-                kept = flat.new_zeros(len(flat)) if kept is None else _longer(kept, len(flat))
-                self._kept[name] = kept
+            if kept is None:
+                kept = self._kept[name] = torch.zeros_like(flat)
+            elif len(kept) < len(flat):
+                kept = self._kept[name] = F.pad(kept, (0, len(flat) - len(kept)))
             kept[: len(flat)] = torch.where(before > 0, kept[: len(flat)], flat)
 
     def first_broken(self) -> Broken | None:
@@ -350,7 +352,3 @@ def _named(keep: Tensor | None, method_cotangents: Cotangents | Tensor | None) -
     c = method_cotangents or Cotangents()
     named = {"keep": keep, "image": c.image, "extra": c.extra, "alpha": c.alpha, "depth": c.depth}
     return {name: value for name, value in named.items() if value is not None}
-
-
-def _longer(flat: Tensor, size: int) -> Tensor:
-    return torch.cat([flat, flat.new_zeros(size - len(flat))])

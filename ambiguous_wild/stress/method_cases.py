@@ -113,7 +113,7 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
 
 
 def _parts(trainer: Trainer) -> list[Any]:
-    effects = () if trainer.effects is None else trainer.effects.effects
+    effects = trainer.effects.effects
     fields = () if trainer.parts.fields is None else (trainer.parts.fields,)
     return [trainer.parts.mask, trainer.density, *effects, *fields]
 

@@ -7,6 +7,7 @@ import importlib.util
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
@@ -44,6 +45,7 @@ SAM_VIDEO = {
 CONV = ("efficientnet-lite0", "vgg16")  # the same names for weights, features and instances
 FEATURES = ("labhog", "sceneconv", *CONV, *DINO)
 INSTANCES = ("graph", *CONV, *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")
+Config = TypeVar("Config")
 _OPTION = re.compile(r",\s*([A-Za-z_][\w.]*)=([^,]*)$")
 
 
@@ -76,26 +78,25 @@ def parse(text: str) -> Spec:
     return Spec(name.strip(), int(size) if at else None, argument.strip(), dict(reversed(options.items())))
 
 
-def check_features(spec: str) -> None:
-    """Check that the name of the features is known; nothing is loaded.
+def check_features(spec: str) -> Spec:
+    """Parse a spec of features; nothing is loaded.
 
     Raises:
         AwError: an unknown name (names the nearest), or an invalid spec.
     """
+    return _known("features", spec, FEATURES)
+
+
+def check_instances(spec: str) -> Spec:
+    """Parse a spec of instances; raises like `check_features`."""
+    return _known("instances", spec, INSTANCES)
+
+
+def _known(kind: str, spec: str, names: tuple[str, ...]) -> Spec:
     parsed = parse(spec)
-    if parsed.name not in FEATURES:
-        raise unknown("features", parsed.name, FEATURES)
-
-
-def check_instances(spec: str) -> None:
-    """Check that the name of the instances is known; nothing is loaded.
-
-    Raises:
-        AwError: an unknown name (names the nearest), or an invalid spec.
-    """
-    parsed = parse(spec)
-    if parsed.name not in INSTANCES:
-        raise unknown("instances", parsed.name, INSTANCES)
+    if parsed.name not in names:
+        raise unknown(kind, parsed.name, names)
+    return parsed
 
 
 def make_features(spec: str) -> Features:
@@ -108,8 +109,7 @@ def make_features(spec: str) -> Features:
     Raises:
         AwError: unknown name (names the nearest) or option; the weights are missing.
     """
-    check_features(spec)
-    parsed = parse(spec)
+    parsed = check_features(spec)
     if parsed.argument:
         raise AwError(f"features {spec!r}: {parsed.name} takes nothing after a colon; remove it")
     if parsed.name == "labhog":
@@ -127,16 +127,10 @@ def make_features(spec: str) -> Features:
     if parsed.name in CONV:
         from ambiguous_wild.vision.convnets import ConvConfig, ConvFeatures
 
-        conv = with_options(ConvConfig(), options, f"option of {parsed.name}")
-        if parsed.size is not None:
-            conv = dataclasses.replace(conv, size=parsed.size)
-        return ConvFeatures(parsed.name, conv, folder)
+        return ConvFeatures(parsed.name, _sized(ConvConfig(), parsed, options), folder)
     from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 
-    config = with_options(DinoConfig(), options, f"option of {parsed.name}")
-    if parsed.size is not None:
-        config = dataclasses.replace(config, size=parsed.size)
-    return DinoFeatures(DINO[parsed.name], config, folder)
+    return DinoFeatures(DINO[parsed.name], _sized(DinoConfig(), parsed, options), folder)
 
 
 def make_instances(spec: str) -> Instances:
@@ -150,8 +144,7 @@ def make_instances(spec: str) -> Instances:
     Raises:
         AwError: unknown name (names the nearest) or option; the weights or the folder are missing.
     """
-    check_instances(spec)
-    parsed = parse(spec)
+    parsed = check_instances(spec)
     if parsed.argument and parsed.name not in ("grounded", "grounded-video", "labels"):
         raise AwError(f"instances {spec!r}: {parsed.name} takes nothing after a colon; remove it")
     return _BUILDERS.get(parsed.name, _sam)(parsed, spec)
@@ -173,10 +166,8 @@ def _grouped(parsed: Spec, spec: str) -> Instances:
     network = {k: v for k, v in options.items() if k == "layer"}
     own = {k: v for k, v in options.items() if k not in network}
     config = with_options(GroupConfig(), own, f"option of {parsed.name}")
-    features = with_options(ConvConfig(), network)
-    if parsed.size is not None:
-        features = dataclasses.replace(features, size=parsed.size)
-    return GroupedSegments(ConvFeatures(parsed.name, features, folder), config)
+    features = ConvFeatures(parsed.name, _sized(ConvConfig(), parsed, network), folder)
+    return GroupedSegments(features, config)
 
 
 def _labels(parsed: Spec, spec: str) -> Instances:
@@ -201,9 +192,7 @@ def _grounded(parsed: Spec, spec: str) -> Instances:
     if parsed.name == "grounded-video":
         tracking = {k: v for k, v in options.items() if k in ("every", "most", "known")}
         options = {k: v for k, v in options.items() if k not in tracking}
-    config = with_options(GroundedConfig(), options, "option of grounded")
-    if parsed.size is not None:
-        config = dataclasses.replace(config, shorter=parsed.size)
+    config = _sized(GroundedConfig(), parsed, options, "shorter")
     instances = GroundedInstances(parsed.argument, config, folder=folder, sam_folder=sam_folder)
     if parsed.name == "grounded":
         return instances
@@ -215,19 +204,13 @@ def _grounded(parsed: Spec, spec: str) -> Instances:
 
 def _sam(parsed: Spec, spec: str) -> Instances:
     folder, options = _weights(parsed.options)
-    where = f"option of {parsed.name}"
     if parsed.name in SAM:
         from ambiguous_wild.vision.sam import SamConfig, SamInstances
 
-        config = with_options(SamConfig(), options, where)
-        if parsed.size is not None:
-            config = dataclasses.replace(config, grid=parsed.size)
-        return SamInstances(SAM[parsed.name], config, folder)
+        return SamInstances(SAM[parsed.name], _sized(SamConfig(), parsed, options, "grid"), folder)
     from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances
 
-    video = with_options(SamVideoConfig(), options, where)
-    if parsed.size is not None:
-        video = dataclasses.replace(video, sam=dataclasses.replace(video.sam, grid=parsed.size))
+    video = _sized(SamVideoConfig(), parsed, options, "sam.grid")
     return SamVideoInstances(SAM_VIDEO[parsed.name], video, folder)
 
 
@@ -238,6 +221,12 @@ _BUILDERS: dict[str, Callable[[Spec, str], Instances]] = {
     "grounded": _grounded,
     "grounded-video": _grounded,
 }
+
+
+def _sized(config: Config, parsed: Spec, options: dict[str, str], size: str = "size") -> Config:
+    """Return the config with these options, and with the spec's size as the option of this name."""
+    sizes = {} if parsed.size is None else {size: str(parsed.size)}
+    return with_options(config, options | sizes, f"option of {parsed.name}")
 
 
 def _weights(options: dict[str, str], key: str = "weights") -> tuple[Path | None, dict[str, str]]:

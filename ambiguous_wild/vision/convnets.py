@@ -14,13 +14,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import State, config_hash
+from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.weight_files import expanded, read_tensors
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.vision import weights
 from ambiguous_wild.vision.dino import normalised
-from ambiguous_wild.vision.protocols import cell_grid, check_image, degraded_distance, whole_cells
+from ambiguous_wild.vision.protocols import FittedByDistance, cell_grid, check_image, check_sizes, whole_cells
 from ambiguous_wild.vision.weight_files import check_published, used_tensors
 
 _EPS = 1e-3  # of the batch norms
@@ -149,10 +149,6 @@ def _vgg(tensors: Mapping[str, Tensor], layer: str) -> nn.Module:
     return net
 
 
-def _prepare_vgg(pixels: Tensor, stride: int) -> Tensor:
-    return normalised(pixels)
-
-
 def _prepare_efficientnet(pixels: Tensor, stride: int) -> Tensor:
     """Scale pixels as in training, (x - 127) / 128, and move them by half a cell.
 
@@ -166,11 +162,11 @@ def _prepare_efficientnet(pixels: Tensor, stride: int) -> Tensor:
 
 NETWORKS = {
     "efficientnet-lite0": _Network(LAYERS, "stride8", 0, EfficientNetLite0, _prepare_efficientnet),
-    "vgg16": _Network(_VGG_LAYERS, "relu3_3", 252, _vgg, _prepare_vgg),
+    "vgg16": _Network(_VGG_LAYERS, "relu3_3", 252, _vgg, lambda pixels, _: normalised(pixels)),
 }
 
 
-class ConvFeatures:
+class ConvFeatures(FittedByDistance):
     """Features that are the output of one layer, [h, w, C]; the cells divide the image evenly."""
 
     def __init__(self, name: str, config: ConvConfig | None = None, folder: str | Path | None = None) -> None:
@@ -192,17 +188,13 @@ class ConvFeatures:
         self._layer = layer
         _, self.stride, self.channels = self._network.layers[layer]
         self.size = self._network.size if self.config.size == -1 else self.config.size
-        if self.size < 0 or 0 < self.size < self.stride or self.config.fit_photos < 1:
-            raise AwError(
-                f"{name}: size must be 0 or at least one cell of {self.stride} px and fit_photos at least 1, "
-                f"got {self.size} and {self.config.fit_photos}"
-            )
+        self.fit_photos = self.config.fit_photos
+        check_sizes(name, self.size, self.stride, self.fit_photos)
         self.path = _file(name, folder)
         self._registered = folder is None
         self._sha256 = sha256_file(self.path)
         settings = config_hash([self.size, layer, self.config.fit_photos])[:8]
         self.name = f"conv-1-{name}-{self._sha256[:12]}-{settings}"
-        self.unit = 0.1  # until `fit` measures it
         self._what = name
         self._model: nn.Module | None = None
         self._device: torch.device | None = None
@@ -233,14 +225,6 @@ class ConvFeatures:
             self._model = net.eval().requires_grad_(False)
         return self._model
 
-    def fit(self, photos: Sequence[Tensor]) -> None:
-        """Set `unit`, see `protocols.degraded_distance`.
-
-        Raises:
-            AwError: there is no photo.
-        """
-        self.unit = degraded_distance(self, photos, self.config.fit_photos)
-
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of cells for an image of this size in px."""
         return cell_grid(height, width, self.size, self.stride)
@@ -265,12 +249,6 @@ class ConvFeatures:
             pixels = whole_cells(image.float(), rows, columns, self.stride)
             maps = self.model(self._network.prepare(pixels, self.stride))
         return maps[0].permute(1, 2, 0).contiguous()
-
-    def state_dict(self) -> State:
-        return {"unit": self.unit}
-
-    def load_state_dict(self, state: State) -> None:
-        self.unit = float(state["unit"])
 
 
 def _file(name: str, folder: str | Path | None) -> Path:

@@ -9,7 +9,6 @@ On an NVIDIA GPU the net multiplies in bfloat16, for photos and renders alike (`
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import State, config_hash
+from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
-from ambiguous_wild.vision.protocols import cell_grid, check_image, degraded_distance, whole_cells
+from ambiguous_wild.vision.protocols import FittedByDistance, cell_grid, check_image, check_sizes, whole_cells
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class DinoConfig:
     fit_photos: int = 8  # photos that `fit` uses
 
 
-class DinoFeatures:
+class DinoFeatures(FittedByDistance):
     """Patch tokens after the final norm, [h, w, C]; the class token and registers are dropped."""
 
     def __init__(
@@ -79,13 +78,9 @@ class DinoFeatures:
         self.extra_tokens = 1 + int(facts.get("num_register_tokens", family.registers))  # + class token
         if not 0 <= self.config.blocks <= layers:
             raise AwError(f"{name} has {layers} blocks, got blocks={self.config.blocks}; 0 means all")
-        if self.config.size < 0 or 0 < self.config.size < self.patch or self.config.fit_photos < 1:
-            raise AwError(
-                f"{name}: size must be 0 or at least one patch of {self.patch} px and fit_photos at least 1, "
-                f"got {self.config.size} and {self.config.fit_photos}"
-            )
+        self.fit_photos = self.config.fit_photos
+        check_sizes(name, self.config.size, self.patch, self.fit_photos)
         self.name = f"dino-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
-        self.unit = 0.1  # until `fit` measures it
         self._model: nn.Module | None = None
         self._device: torch.device | None = None  # where the net is
         self._halved = False  # whether the weights are bfloat16
@@ -105,14 +100,6 @@ class DinoFeatures:
                 setattr(holder, attribute, nn.ModuleList(kept))
             self._model = model
         return self._model
-
-    def fit(self, photos: Sequence[Tensor]) -> None:
-        """Set `unit`, see `protocols.degraded_distance`.
-
-        Raises:
-            AwError: there is no photo.
-        """
-        self.unit = degraded_distance(self, photos, self.config.fit_photos)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Return rows and columns of patches for an image of this size in px."""
@@ -153,12 +140,6 @@ class DinoFeatures:
             if self._halved:
                 _halve(self.model)
         return self.model
-
-    def state_dict(self) -> State:
-        return {"unit": self.unit}
-
-    def load_state_dict(self, state: State) -> None:
-        self.unit = float(state["unit"])
 
 
 def normalised(pixels: Tensor) -> Tensor:

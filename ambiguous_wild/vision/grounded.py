@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,6 @@ class GroundedInstances:
         digests = f"{self.source.digest}-{self.sam.source.digest}"
         settings = config_hash({"prompt": self.prompt, "config": self.config})[:8]
         self.name = f"grounded-1-{name}-{sam}-{digests}-{settings}"
-        self._loaded: tuple[Any, Any] | None = None
 
     def labels(self, photo: Tensor) -> np.ndarray:
         """Labels [H, W] int32 of a photo [H, W, 3] in [0, 1], 1..K; 0 = nothing the prompt names."""
@@ -102,7 +102,7 @@ class GroundedInstances:
     @torch.no_grad()
     def detect(self, photo: Tensor) -> list[Detection]:
         """Detect the prompt's phrases: boxes by decreasing score, without duplicates."""
-        model, tokenizer = self._nets()
+        model, tokenizer = self._nets
         model.to(photo.device)
         height, width = int(photo.shape[0]), int(photo.shape[1])
         scale = min(self.config.shorter / min(height, width), self.config.longer / max(height, width))
@@ -127,18 +127,17 @@ class GroundedInstances:
             detections.append(Detection((x0, y0, x1, y1), float(values[k]), label))
         return detections
 
+    @cached_property
     def _nets(self) -> tuple[Any, Any]:
-        if self._loaded is None:
-            folder = self.source.folder
-            try:
-                tokenizer = model_class("BertTokenizer").from_pretrained(str(folder), local_files_only=True)
-            except (OSError, ValueError, TypeError) as error:
-                raise AwError(
-                    f"{folder} has no usable tokenizer: {str(error).splitlines()[0]}; download "
-                    "tokenizer.json and tokenizer_config.json"
-                ) from error
-            self._loaded = load(self.source, "GroundingDinoForObjectDetection", harmless=HARMLESS), tokenizer
-        return self._loaded
+        folder = self.source.folder
+        try:
+            tokenizer = model_class("BertTokenizer").from_pretrained(str(folder), local_files_only=True)
+        except (OSError, ValueError, TypeError) as error:
+            raise AwError(
+                f"{folder} has no usable tokenizer: {str(error).splitlines()[0]}; download "
+                "tokenizer.json and tokenizer_config.json"
+            ) from error
+        return load(self.source, "GroundingDinoForObjectDetection", harmless=HARMLESS), tokenizer
 
 
 def normal_prompt(prompt: str) -> str:

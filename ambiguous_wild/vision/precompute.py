@@ -159,12 +159,12 @@ def instance_labels(
         return SceneLabels(instances.identities(photos, names, folder, shown), True)
     if isinstance(instances, NamedInstances):
         return SceneLabels(instances.labels_of(photos, names), False)
-    result = []
-    for photo in shown(photos):
-        key = cache_key("instances", instances.name, None, photo.detach().cpu().numpy())
+    return SceneLabels([photo_labels(instances, photo, folder) for photo in shown(photos)], False)
 
-        def compute(photo: Tensor = photo) -> dict[str, np.ndarray]:
-            return {"labels": instances.labels(photo)}
 
-        result.append(cached(folder, key, {"labels": np.int32}, compute)["labels"])
-    return SceneLabels(result, False)
+def photo_labels(instances: Instances, photo: Tensor, folder: Path | None) -> np.ndarray:
+    """Labels [H, W] int32 of one photo [H, W, 3] in [0, 1]; not computed again if the folder holds them."""
+    if folder is None:
+        return instances.labels(photo)
+    key = cache_key("instances", instances.name, None, photo.detach().cpu().numpy())
+    return cached(folder, key, {"labels": np.int32}, lambda: {"labels": instances.labels(photo)})["labels"]

@@ -175,6 +175,39 @@ def degraded_distance(features: Callable[[Tensor], Tensor], photos: Sequence[Ten
     return float(f"{max(sum(means) / len(means), 1e-6):.4g}")
 
 
+class FittedByDistance:
+    """Features whose only statistic of a scene is `unit`."""
+
+    unit = 0.1  # until `fit` measures it
+    fit_photos: int  # photos that `fit` uses
+
+    def __call__(self, image: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def fit(self, photos: Sequence[Tensor]) -> None:
+        """Set `unit`, see `degraded_distance`.
+
+        Raises:
+            AwError: there is no photo.
+        """
+        self.unit = degraded_distance(self, photos, self.fit_photos)
+
+    def state_dict(self) -> State:
+        return {"unit": self.unit}
+
+    def load_state_dict(self, state: State) -> None:
+        self.unit = float(state["unit"])
+
+
+def check_sizes(name: str, size: int, cell: int, fit_photos: int) -> None:
+    """Raise AwError for a size in px below one cell (0 = the image's), or for no photos to fit."""
+    if size < 0 or 0 < size < cell or fit_photos < 1:
+        raise AwError(
+            f"{name}: size must be 0 or at least one cell of {cell} px and fit_photos at least 1, "
+            f"got {size} and {fit_photos}"
+        )
+
+
 def check_image(image: Tensor) -> None:
     """Raise AwError if the image is not [H, W, 3] or smaller than 8 px."""
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < _LEAST_PX:

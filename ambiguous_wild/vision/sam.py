@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -93,14 +94,11 @@ class SamInstances:
             )
         self.source: Pretrained = locate(name, tuple(_CLASSES), folder)
         self.name = f"sam-1-{name}-{self.source.digest}-{config_hash(self.config)[:8]}"
-        self._model: Any = None
 
-    @property
+    @cached_property
     def model(self) -> Any:
         """The net, loaded at first use."""
-        if self._model is None:
-            self._model = load(self.source, _CLASSES[self.source.model_type])
-        return self._model
+        return load(self.source, _CLASSES[self.source.model_type])
 
     @property
     def side(self) -> int:

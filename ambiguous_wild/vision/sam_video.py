@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.vision.mask_ops import add_new
-from ambiguous_wild.vision.precompute import cache_key, cached
+from ambiguous_wild.vision.precompute import cache_key, cached, photo_labels
 from ambiguous_wild.vision.pretrained import load, locate
 from ambiguous_wild.vision.protocols import Bar, Instances, no_bar
 from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
@@ -67,14 +68,11 @@ class SamVideoInstances:
         self.single: Instances = single or SamInstances(name, self.config.sam, folder)
         settings = config_hash({"config": self.config, "single": self.single.name})[:8]
         self.name = f"sam-video-1-{name}-{self.source.digest}-{settings}"
-        self._model: Any = None
 
-    @property
+    @cached_property
     def model(self) -> Any:
         """The net, loaded at first use."""
-        if self._model is None:
-            self._model = load(self.source, "Sam2VideoModel")
-        return self._model
+        return load(self.source, "Sam2VideoModel")
 
     def labels(self, photo: Tensor) -> np.ndarray:
         """Labels [H, W] int32 of one photo [H, W, 3], without identities."""
@@ -98,7 +96,7 @@ class SamVideoInstances:
         for start in bar(list(range(0, len(order), self.config.every))):
             chunk = order[start : start + self.config.every + 1]
             frames = [photos[i] for i in chunk]
-            detected = self._detected(frames[0], folder)
+            detected = photo_labels(self.single, frames[0], folder)
             empty = np.zeros_like(detected)
             first, next_id = add_new(
                 empty if carried is None else carried, detected, next_id, self.config.most, self.config.known
@@ -108,14 +106,6 @@ class SamVideoInstances:
                 result[i] = ids
             carried = maps[-1]
         return result
-
-    def _detected(self, photo: Tensor, folder: Path | None) -> np.ndarray:
-        if folder is None:
-            return self.single.labels(photo)
-        key = cache_key("instances", self.single.name, None, photo.detach().cpu().numpy())
-        return cached(folder, key, {"labels": np.int32}, lambda: {"labels": self.single.labels(photo)})[
-            "labels"
-        ]
 
     def _tracked(self, frames: list[Tensor], first: np.ndarray, folder: Path | None) -> list[np.ndarray]:
         names = [f"frame{k:04d}" for k in range(len(frames))]

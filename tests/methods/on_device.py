@@ -7,7 +7,6 @@ value, choosing rows by a mask and mixing devices all raise.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import cv2
@@ -41,15 +40,12 @@ def number(x: float) -> torch.Tensor:
     return torch.tensor(x, dtype=torch.float64)
 
 
-def capture(folder) -> Iterator[SimpleNamespace]:
-    """Photos of a wall with a distractor in each, the same photos without, the masks; one torch thread."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+def capture(folder) -> SimpleNamespace:
+    """Photos of a wall with a distractor in each, the same photos without, and the masks."""
     clean = [background(12 * v) for v in range(VIEWS)]
     photos, truths = zip(*[distracted(image, 40 + v) for v, image in enumerate(clean)])
     data = make_data(folder, list(photos), list(truths))
-    yield SimpleNamespace(clean=clean, truths=truths, data=sparse_wall(SimpleNamespace(data=data)))
-    torch.set_num_threads(threads)
+    return SimpleNamespace(clean=clean, truths=truths, data=sparse_wall(SimpleNamespace(data=data)))
 
 
 LOOK = dataclasses.replace(FAST.first_look, least=0.0, threshold=0.1, normal=1.0, known_by=1)

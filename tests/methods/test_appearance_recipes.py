@@ -27,12 +27,6 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.step import Shot
 from tests.methods.baselines import data_of, parts_of, step_of, trainer_of
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def random(*shape, seed=0):

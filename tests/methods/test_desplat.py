@@ -11,12 +11,6 @@ from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.rendered import Cotangents, Frame
 from ambiguous_wild.splat.step import Shot
 from tests.methods.baselines import data_of, parts_of, trained, trainer_of
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from ambiguous_wild.methods.mip import (
     matched,
     opacity_factor,
 )
-from ambiguous_wild.methods.uad import UadConfig, UncertaintyAware, footprint_mean
+from ambiguous_wild.methods.uad import UncertaintyAware, footprint_mean
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
@@ -95,7 +95,7 @@ def test_masked_views_and_small_ones_count_less():
     g = gaussians(n=2, rest=3)
     g.means.copy_(torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]]))
     view = camera()
-    density = UncertaintyAware(UadConfig(), extent=1.0, seed=0)
+    density = UncertaintyAware(DensityConfig(), extent=1.0, seed=0)
 
     def see(gradient, count, keep):
         rendered = SimpleNamespace(visible=torch.ones(2, dtype=torch.bool), radii=torch.ones(2))

@@ -14,22 +14,9 @@ from ambiguous_wild.splat import backend, checkpoint
 from ambiguous_wild.splat.step import Step
 from tests.host_reads import READ, moved, no_transfers
 from tests.methods.baselines import data_of, parts_of, same, step_of
-from tests.tiny_scene import TRAIN, write_tiny_scene
+from tests.tiny_scene import TRAIN
 
 STEPS = 8
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 @pytest.fixture

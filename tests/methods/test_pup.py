@@ -93,7 +93,7 @@ def test_rounds_together_remove_the_share(scene, tmp_path):
         trainer.step()
     before = len(trainer.gaussians)
     trainer.train()
-    assert trainer.density.done == 3
+    assert trainer.density.pruning_rounds == 3
     assert len(trainer.gaussians) == pytest.approx(0.2 * before, abs=4)
 
 

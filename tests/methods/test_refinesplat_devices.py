@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat import maps, merging, pixels, structure
 from ambiguous_wild.methods.refinesplat.density import (
     EntropyAwareDensity,
@@ -29,7 +30,7 @@ from tests.splat import scenes
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    yield from capture(tmp_path_factory.mktemp("scene"))
+    return capture(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(params=[False, True], ids=["cpu", "accelerator"])
@@ -66,7 +67,7 @@ def test_blurred_halves_and_sizes_are_opencvs(shape):
     assert np.array_equal(structure.nearest(tensor(x), (h, w)), small)
     large = cv2.resize(small, shape[::-1], interpolation=cv2.INTER_LINEAR)
     # places to 2^-24 of the width, times differences of up to 1 from pixel to pixel
-    assert np.allclose(structure.resized(tensor(small), shape), large, atol=shape[1] * 2**-22)
+    assert np.allclose(resized(tensor(small), *shape), large, atol=shape[1] * 2**-22)
 
 
 def pictures(kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -249,15 +250,15 @@ def test_masks_over_visits_are_the_cpus(scene, monkeypatch, config):
         found = there.keep(step)
         assert differing(expected, found) <= MOST and differing(predicted, there.predict(step)) <= MOST
         changed += int((expected == 0).sum())
-        assert np.allclose(there.shares[step.view], cpu.shares[step.view], rtol=1e-3, atol=MOST)
+        assert np.allclose(there.masks.shares[step.view], cpu.masks.shares[step.view], rtol=1e-3, atol=MOST)
     assert changed > 0.02 * 3 * sum(t.size for t in scene.truths)
-    assert there.w2 == pytest.approx(cpu.w2, abs=1e-3)
-    assert cpu.w2 == config.mask.w2 if config.mask.w2 is not None else cpu.w2 != 0.5
+    assert there.masks.w2 == pytest.approx(cpu.masks.w2, abs=1e-3)
+    assert cpu.masks.w2 == config.mask.w2 if config.mask.w2 is not None else cpu.masks.w2 != 0.5
     for name, value in cpu.facts().items():
         assert there.facts()[name] == (value if value is None else pytest.approx(value, rel=1e-2)), name
-    for view, judged in cpu.judged.items():
-        assert np.allclose(there.judged[view].values, judged.values, rtol=1e-3, atol=1e-3)
-        assert np.array_equal(there.judged[view].areas, judged.areas)
+    for view, judged in cpu.masks.judged.items():
+        assert np.allclose(there.masks.judged[view].values, judged.values, rtol=1e-3, atol=1e-3)
+        assert np.array_equal(there.masks.judged[view].areas, judged.areas)
 
 
 @pytest.mark.parametrize("begins_there", [True, False])

@@ -12,7 +12,7 @@ from tests.methods.test_refinesplat_policy import FAST, HEIGHT, WIDTH, fresh, st
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    yield from capture(tmp_path_factory.mktemp("limit"))
+    return capture(tmp_path_factory.mktemp("limit"))
 
 
 def test_a_mask_is_limited_by_the_photos_first_look(scene):

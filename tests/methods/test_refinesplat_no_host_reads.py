@@ -33,7 +33,7 @@ from tests.splat import scenes
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    yield from capture(tmp_path_factory.mktemp("scene"))
+    return capture(tmp_path_factory.mktemp("scene"))
 
 
 class Launches(torch.utils._python_dispatch.TorchDispatchMode):

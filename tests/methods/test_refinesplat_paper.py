@@ -106,7 +106,7 @@ def test_masks_equal_the_formulas(scene, config, w2):
     policy = policy_of(scene, config)
     image = blurred(scene.clean[1], 1)
     local, global_, final = by_the_formulas(policy, 1, image, w2, isinstance(config, PrintedConfig))
-    _, masks = policy.examine(step_of(scene.data, 1, image))
+    _, masks = policy.masks.examine(step_of(scene.data, 1, image))
     assert np.array_equal(masks.local, local)
     assert np.array_equal(masks.global_, global_)
     assert np.array_equal(masks.keep < 0.5, final)
@@ -114,11 +114,11 @@ def test_masks_equal_the_formulas(scene, config, w2):
 
 def test_printed_masks_everything_but_one_instance_or_no_instance(scene):
     policy = policy_of(scene, PRINTED)
-    _, first = policy.examine(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
+    _, first = policy.masks.examine(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
     flagged = np.unique(policy.inputs.labels[0][first.local])
     assert len(flagged) == policy.inputs.counts[0] - 1  # w2 starts at 1/2: the first of equal objectives
     high = dataclasses.replace(PRINTED, mask=dataclasses.replace(PRINTED.mask, w2=0.6))
-    _, last = policy_of(scene, high).examine(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
+    _, last = policy_of(scene, high).masks.examine(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
     assert not last.local.any()
 
 

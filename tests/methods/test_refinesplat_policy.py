@@ -114,15 +114,6 @@ def step_of(
     )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As the trainer has it: with two, load decides how a sum is split, and that its last bits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     clean = [background(12 * v) for v in range(VIEWS)]
@@ -209,7 +200,7 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
         policy = RefineSplatMask(dataclasses.replace(config, **changes))
         policy.setup(data)
         step = step_of(data, 1, blurred(scene.clean[1], 3))
-        return policy, *policy.examine(step, remember=True)
+        return policy, *policy.masks.examine(step, remember=True)
 
     policy, maps, _ = examined()
     factor = policy.looks[1].factor((HEIGHT, WIDTH))
@@ -224,7 +215,7 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
         assert float(masks.cut.threshold) == pytest.approx(least)
     unseen = ~pixels.seen[0]
     step = step_of(data, 0, torch.zeros(HEIGHT, WIDTH, 3))  # nothing of what the photo shows
-    keep = policy.examine(step)[1].keep
+    keep = policy.masks.examine(step)[1].keep
     assert unseen.any() and (keep[unseen] == 1.0).all() and keep.min() == 0.0
 
 
@@ -310,7 +301,9 @@ def test_identities_scale_the_evidence_of_pixels(scene):
     config = RefineSplatConfig(psi=FAST.psi, min_mask_start=1, mask=MaskConfig(entropy_weight=0.5))
     plain, scaled = fresh(scene, RefineSplatConfig(min_mask_start=1)), fresh(scene, config)
     step = step_of(scene.data, 0, blurred(scene.clean[0], 0))
-    ratio = (scaled.examine(step)[0].statistic / plain.examine(step)[0].statistic.clamp(min=1e-6)).numpy()
+    ratio = (
+        scaled.masks.examine(step)[0].statistic / plain.masks.examine(step)[0].statistic.clamp(min=1e-6)
+    ).numpy()
     truth = cv2.erode(scene.truths[0].astype(np.uint8), np.ones((9, 9))).astype(bool)
     assert ratio.min() > 0.49
     assert ratio.max() < 1.51

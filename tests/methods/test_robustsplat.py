@@ -12,27 +12,20 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.methods import masking_common
 from ambiguous_wild.methods.masking_common import MaskNet
 from ambiguous_wild.methods.refinesplat.inputs import train_tracks
-from ambiguous_wild.methods.robustsplat import RobustSplatConfig, RobustSplatMask, _fit, build, coarse_spec
+from ambiguous_wild.methods.robustsplat import (
+    RobustSplatConfig,
+    RobustSplatMask,
+    _fit,
+    build,
+    coarse_spec,
+    mask_loss,
+)
 from ambiguous_wild.vision import backends
 from ambiguous_wild.vision.labhog import LabHog
 from tests.methods.baselines import data_of, parts_of, step_of, trained
-from tests.tiny_scene import SQUARE, TRAIN, wall_colour, write_tiny_scene
+from tests.tiny_scene import SQUARE, TRAIN, wall_colour
 
 EARLY = {"min_mask_start": "20"}
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Barriers between threads cost more than these small maps do."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def clean_photo(view: int) -> torch.Tensor:
@@ -110,7 +103,7 @@ def test_the_relative_target_is_one_up_to_the_usual_distance():
 def test_the_mask_loss_is_the_printed_sum():
     rng = np.random.default_rng(2)
     m, t, low, up = rng.random((4, 6, 8))
-    got = masking_common.mask_loss(*map(torch.from_numpy, (m, t, low, up)), nominal=3000.0)
+    got = mask_loss(*map(torch.from_numpy, (m, t, low, up)), 3000.0, RobustSplatConfig())
     bounds = np.maximum(m - up, 0) + np.maximum(low - m, 0)
     want = 0.5 * np.abs(m - t).mean() + 0.5 * bounds.mean() + 2 * np.exp(-1.5) * (1 - m).mean()
     assert float(got) == pytest.approx(want, rel=1e-12)

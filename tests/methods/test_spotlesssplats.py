@@ -11,7 +11,7 @@ from ambiguous_wild.methods.masking_common import annealed, hashed_uniform, samp
 from ambiguous_wild.methods.spotlesssplats import PlacedNet, PruningDensity, SpotLessDensityConfig, placed
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.vision.segments import ward_clusters
-from tests.methods.baselines import data_of, parts_of, step_of, trained
+from tests.methods.baselines import data_of, masked_more_inside, parts_of, step_of, trained
 from tests.splat.scenes import gaussians
 from tests.tiny_scene import TRAIN
 
@@ -110,13 +110,8 @@ def test_bounds_come_from_the_steps_before(scene, tmp_path):
 def test_distractors_are_masked(scene, tmp_path, mask):
     trainer = trained(scene, tmp_path, parts_of("spotlesssplats", mask=mask), iterations=400)
     assert trainer.density.cut and not trainer.density.last_reset
-    inside, outside = [], []
-    for view in range(len(TRAIN)):
-        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
-        square = np.zeros(keep.shape, bool)
-        square[14:26, 14 + 4 * view : 26 + 4 * view] = True
-        inside.append(keep[square].mean()), outside.append(keep[~square].mean())
-    assert np.mean(inside) < np.mean(outside) - 0.2
+    inside, outside = masked_more_inside(trainer)
+    assert inside < outside - 0.2
 
 
 def test_harmonics_are_cut_from_above_alone_and_start_anew():

@@ -18,12 +18,6 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.render import render
 from tests.methods.baselines import data_of, masked_more_inside, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import camera, gaussians
-from tests.tiny_scene import write_tiny_scene
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
 def random(*shape, seed=0):
@@ -70,7 +64,7 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
     policy, step = nexus.parts.mask, nexus.make_step(10, 0)
     keep, gradients = policy._weight(step, learn=True)
     distance = policy.distance(step)
-    codes, leaf = step.gaussians.attributes["nexus_doubt"], policy.codes._leaf(step)
+    codes, leaf = step.gaussians.attributes["nexus_doubt"], policy.effect._leaf(step)
 
     def loss(doubts):
         drawn = step.draw(gaussians=as_colour(step.gaussians, slice(None), doubts), without=("nexussplats",))
@@ -80,10 +74,10 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
 
     found = gradients.attributes["nexus_doubt"]
     row = int(found.abs().sum(dim=1).argmax())
-    slope_of_doubt = slope(loss, policy.codes.doubts(codes, leaf), row, 0.05)
+    slope_of_doubt = slope(loss, policy.effect.doubts(codes, leaf), row, 0.05)
     with torch.enable_grad():
         code = codes[row : row + 1].clone().requires_grad_()
-        (through,) = torch.autograd.grad(policy.codes.doubts(code, leaf).sum(), code)
+        (through,) = torch.autograd.grad(policy.effect.doubts(code, leaf).sum(), code)
     torch.testing.assert_close(found[row], (slope_of_doubt * through[0]).float(), rtol=0.03, atol=1e-7)
     assert gradients.own["nexussplats"].keys() >= {"transient", "doubt_weight0", "doubt_bias2"}
     assert not gradients.sh0.any() and not gradients.screen.any()
@@ -103,7 +97,7 @@ def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
 
 def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
     policy, step = nexus.parts.mask, nexus.make_step(10, 0)
-    monkeypatch.setattr(policy.codes, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
+    monkeypatch.setattr(policy.effect, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
     monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
     weight, gradients = policy._weight(step, learn=True)
     pull = gradients.attributes["nexus_doubt"][:, 0]

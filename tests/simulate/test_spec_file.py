@@ -11,8 +11,7 @@ from ambiguous_wild.cli.simulate import simulate_command as command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.simulate.capture import plan
 from ambiguous_wild.simulate.presets import PRESETS
-from ambiguous_wild.simulate.spec_file import PICTURES, SHEET_NAMES, dump_spec, parse_spec, read_spec
-from ambiguous_wild.simulate.world import POSTERS, SHEETS
+from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec, read_spec
 
 RED = "{name: a, kind: visitor, texture: cloth, ambiguity: none}"
 
@@ -155,11 +154,6 @@ def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
         read_spec(tmp_path / "x.yaml")
     with pytest.raises(AwError, match="Is a directory"):
         read_spec(tmp_path)
-
-
-def test_the_names_that_a_spec_may_use_are_those_that_the_world_bakes() -> None:
-    assert sorted(SHEETS) == sorted(SHEET_NAMES)
-    assert tuple(f"poster_{p}" for p in POSTERS) == PICTURES
 
 
 def test_a_hand_that_looks_too_far_away_is_refused_before_memory_is_asked_for(tmp_path: Path) -> None:

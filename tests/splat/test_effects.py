@@ -37,14 +37,14 @@ def test_a_run_without_effects_never_calls_one_and_has_the_same_bits(scene, tmp_
     plain = trainer_for(scene, tmp_path / "plain")
     plain.train()
     calls = []
-    for cls in (Effect, Chain, AffineExposure, AppearanceEmbedding, SmoothingFilter, PoseRefinement, RowAdam):
+    for cls in (Effect, AffineExposure, AppearanceEmbedding, SmoothingFilter, PoseRefinement, RowAdam):
         for name, value in list(vars(cls).items()):
             if callable(value):
                 monkeypatch.setattr(cls, name, lambda *a, _n=f"{cls.__name__}.{name}", **k: calls.append(_n))
     asked = trainer_for(scene, tmp_path / "asked", ())
     asked.train()
     assert calls == []
-    assert asked.effects is None and "effects" not in asked.clock.parts_s
+    assert not asked.effects.effects and "effects" not in asked.clock.parts_s
     assert bits(asked) == bits(plain)
     Chain((AffineExposure(),), plain.data)  # the counters do count
     assert calls
@@ -106,7 +106,7 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
     first = trainer_for(scene, tmp_path / "first", ("dense",), max_gaussians=3 * sparse)
     assert len(plain.gaussians.means) == sparse and len(first.gaussians.means) == 2 * sparse
     assert torch.equal(first.gaussians.means[:sparse], plain.gaussians.means)
-    assert first.effects is not None and first.effects.facts() == {"dense": {"points": sparse}}
+    assert first.effects.facts() == {"dense": {"points": sparse}}
     # without a limit, the photos' pixels set it in a short run
     pixels = float(np.median([p.shape[0] * p.shape[1] for p in plain.data.photos]))
     free = trainer_for(scene, tmp_path / "free", ("dense",))
@@ -131,9 +131,8 @@ def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
     assert second.resume()
     second.train()
     assert bits(second) == bits(whole)
-    if whole.effects is not None:
-        assert str(second.effects.state_dict()) == str(whole.effects.state_dict())
-        assert all(np.isfinite(v) for facts in whole.effects.facts().values() for v in facts.values())
+    assert str(second.effects.state_dict()) == str(whole.effects.state_dict())
+    assert all(np.isfinite(v) for facts in whole.effects.facts().values() for v in facts.values())
 
 
 def test_a_render_between_steps_changes_nothing(scene, tmp_path):

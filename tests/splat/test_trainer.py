@@ -321,9 +321,7 @@ def test_coarse_to_fine_follows_the_photos_spectrum():
 
 
 def test_the_count_ceiling_rises_with_the_resolution():
-    values = [
-        ceiling_at(1000, 50_000, d, p, 0.4) for d, p in ((4, 0.0), (4, 0.2), (2, 0.2), (2, 0.4), (1, 0.4))
-    ]
+    values = [ceiling_at(1000, 50_000, d, p) for d, p in ((4, 0.0), (4, 0.2), (2, 0.2), (2, 0.4), (1, 0.4))]
     assert values == sorted(values)
     assert values[0] == 1000 + 49_000 // 16
     assert values[-1] == 50_000

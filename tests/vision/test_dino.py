@@ -147,7 +147,7 @@ def test_impossible_settings_and_images_are_refused(checkpoint):
     folder = checkpoint("dinov2")
     with pytest.raises(AwError, match="has 3 blocks"):
         DinoFeatures("x", DinoConfig(blocks=4), folder)
-    with pytest.raises(AwError, match="at least one patch of 14 px"):
+    with pytest.raises(AwError, match="at least one cell of 14 px"):
         DinoFeatures("x", DinoConfig(size=13), folder)
     with pytest.raises(AwError, match="at least 8x8"):
         DinoFeatures("x", folder=folder)(torch.zeros(4, 40, 3))

@@ -30,7 +30,7 @@ def test_boxes_scores_and_labels_equal_the_librarys_own(grounded, checkpoint, ph
     processor = GroundingDinoProcessor(GroundingDinoImageProcessorPil(), tokenizer)
     text = tokenizer("person. car.", return_tensors="pt")
     with torch.no_grad():
-        out = instances._nets()[0](pixel_values=fit_to(image, 64, 96), **text)
+        out = instances._nets[0](pixel_values=fit_to(image, 64, 96), **text)
     expected = processor.post_process_grounded_object_detection(
         out, text["input_ids"], threshold=0.0, text_threshold=0.0, target_sizes=[(64, 96)]
     )[0]
@@ -100,4 +100,4 @@ def test_a_folder_without_a_tokenizer_is_named(checkpoint, tmp_path):
         GroundedInstances("car", LOOSE, folder=tmp_path, sam_folder=checkpoint("sam2"))
     (tmp_path / "tokenizer.json").write_text("{")
     with pytest.raises(AwError, match="no usable tokenizer"):
-        GroundedInstances("car", LOOSE, folder=tmp_path, sam_folder=checkpoint("sam2"))._nets()
+        _ = GroundedInstances("car", LOOSE, folder=tmp_path, sam_folder=checkpoint("sam2"))._nets

@@ -71,7 +71,7 @@ def truth(height: int = 90, width: int = 130) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_grid_of_points_finds_what_is_there_where_it_is(checkpoint, photo, kind):
     instances = SamInstances(kind, SamConfig(grid=12, batch=50, least_stability=0.5), checkpoint(kind))
-    scene = instances._model = Scene(90, 130, padded=kind == "sam")
+    scene = instances.model = Scene(90, 130, padded=kind == "sam")
     labels = instances.labels(photo(0, 90, 130))
     assert labels.dtype == np.int32 and labels.max() == 3
     for label in (1, 2, 3):
@@ -83,7 +83,7 @@ def test_a_grid_of_points_finds_what_is_there_where_it_is(checkpoint, photo, kin
 @pytest.mark.parametrize("kind", KINDS)
 def test_boxes_of_the_photo_give_the_instance_inside(checkpoint, photo, kind):
     instances = SamInstances(kind, ALL, checkpoint(kind))
-    instances._model = Scene(90, 130, padded=kind == "sam")
+    instances.model = Scene(90, 130, padded=kind == "sam")
     boxes = np.array([[18, 8, 42, 32], [93, 53, 107, 67]] * 5, float)  # more than one batch
     masks = instances.in_boxes(photo(0, 90, 130), boxes)
     assert masks.shape == (10, 90, 130)
@@ -106,7 +106,7 @@ def test_points_give_the_instance_that_they_lie_on(checkpoint, photo, kind):
         return SimpleNamespace(pred_masks=net.at(*points[0].tolist())[None, :1, None])
 
     net.__class__ = type("Prompted", (Scene,), {"__call__": lambda self, **words: answer(**words)})
-    instances._model = net
+    instances.model = net
     group = np.array([[30.0, 20], [32, 22], [28, 18]])
     outside = np.array([[120.0, 80], [60, 20], [50, 22], *[[126.0, 85]] * 9])
     masks = instances.at_points(photo(0, 90, 130), [group, np.tile([[100.0, 60]], (30, 1))], outside)
@@ -164,7 +164,7 @@ def test_masks_of_boxes_equal_the_librarys_own_way(checkpoint, photo):
 
 def test_what_is_unsure_small_or_unstable_is_dropped(checkpoint, photo):
     instances = SamInstances("sam2", SamConfig(grid=12, least_iou=2.0), checkpoint("sam2"))
-    instances._model = Scene(90, 130, padded=False)
+    instances.model = Scene(90, 130, padded=False)
     assert not instances.labels(photo(0, 90, 130)).any()
     instances.config = SamConfig(grid=12, least_stability=0.5, least_area=0.03)
     assert instances.labels(photo(0, 90, 130)).max() == 2  # the small disc is 1.3 % of the photo

@@ -17,7 +17,6 @@ LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
 KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
 MODEL_FOLDERS = ("sparse", "dense/sparse", "colmap/sparse")  # each may hold numbered models instead
 DRONE_WIDTH = 1920  # px to which DroneSplat's loader reduces wider photos
-_NO_KEEP_MASKS = "are not keep masks of the dataset: left out"
 
 
 def model_folder(root: Path, chosen: str = "") -> Path | None:
@@ -194,21 +193,9 @@ def read_drone(root: Path, chosen: str = "") -> ForeignScene:
     split, missing = split_by_lists(model_names(model), read_lists(root), root, first_dot)
     notes: tuple[str, ...] = ()
     if (root / "masks").is_dir():
-        notes = (f"masks/ holds the instances of a segmentation, which {_NO_KEEP_MASKS}",)
-    return ForeignScene(
-        "drone",
-        root,
-        model,
-        photo_folder(root),
-        split,
-        1,
-        missing,
-        {},
-        DRONE_WIDTH,
-        None,
-        "Drone Imagery",
-        notes=notes,
-    )
+        notes = ("masks/ holds instances of a segmentation, not keep masks of the dataset: left out",)
+    scene = ForeignScene("drone", root, model, photo_folder(root), split, missing=missing, notes=notes)
+    return replace(scene, max_width=DRONE_WIDTH, dataset="Drone Imagery")
 
 
 def read_dualsplat(root: Path, chosen: str = "") -> ForeignScene:

@@ -36,7 +36,7 @@ def read_polycam(root: Path) -> ForeignScene:
         with tool_errors("Polycam", path):
             pose = [[data[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
             lens = {k: data[v] for k, v in zip(LENS, ("fx", "fy", "cx", "cy", "width", "height"))}
-        rows.append((name, pose, frame_camera(1, lens, {}, photos / name, path)))
+        rows.append((name, pose, frame_camera(lens, {}, photos / name, path)))
     return posed_scene("polycam", root, photos, rows, notes, points=False)
 
 
@@ -66,5 +66,5 @@ def read_record3d(root: Path) -> ForeignScene:
     rows = []
     for i, name in enumerate(find_posed(photos, [str(i) for i in range(len(poses))], path)):
         pose = np.column_stack([turns[i], poses[i, 4:]])
-        rows.append((name, pose, frame_camera(1, sized[i], {}, photos / name, path)))
+        rows.append((name, pose, frame_camera(sized[i], {}, photos / name, path)))
     return posed_scene("record3d", root, photos, rows, points=False)

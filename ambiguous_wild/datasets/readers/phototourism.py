@@ -83,9 +83,8 @@ def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
     in_model = sum(PurePosixPath(n).name in bases for v in listed.values() for n in v)
     if total and in_model < LEAST_SHARE * total and table is not None:
         raise AwError(
-            f"{table} names {total} photos, {in_model} of them are in the model of {len(names)}: it is "
-            "the table "
-            "of another scene"
+            f"{table} names {total} photos, {in_model} of them are in the model of {len(names)}: it is the "
+            "table of another scene"
         )
     split, missing = split_by_lists(names, listed, where)
     unlisted = len(names) - len(split)

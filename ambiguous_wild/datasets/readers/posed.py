@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import (
@@ -17,7 +18,6 @@ from ambiguous_wild.datasets.foreign import (
     find_photo,
     inside,
     pose_from_opengl,
-    quaternion_from_rotation,
 )
 from ambiguous_wild.datasets.readers.colmap import sides
 from ambiguous_wild.io.colmap_model import check_camera
@@ -136,7 +136,7 @@ def model_of_poses(rows: Iterable[Row]) -> Model:
             raise AwError(f"{name}: its transform_matrix is not [4, 4] numbers") from error
         except AwError as error:
             raise AwError(f"{name}: {error}") from None
-        q = quaternion_from_rotation(pose[:3, :3])
+        q = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)[[3, 0, 1, 2]]  # w, x, y, z
         none = np.zeros((0, 2)), np.zeros(0, np.int64)
         images[number] = ModelImage(number, q, pose[:3, 3], camera_of_photo.camera_id, name, *none)
     return Model({c.camera_id: c for c in cameras.values()}, images, points_without_tracks())

@@ -86,7 +86,7 @@ def _number(values: Mapping[str, object], key: str, path: Path) -> float | None:
 
 
 def frame_camera(
-    number: int, frame: Mapping[str, object], data: Mapping[str, object], photo: Path, path: Path
+    frame: Mapping[str, object], data: Mapping[str, object], photo: Path, path: Path
 ) -> ModelCamera:
     """Return the camera of a frame: its values first, then the file's common ones, then field of view.
 
@@ -124,7 +124,7 @@ def frame_camera(
         raise AwError(f"{problem}; undistort the photos to PINHOLE")
     size_px = (round(width), round(height))
     if fisheye:
-        return ModelCamera(number, "OPENCV_FISHEYE", *size_px, (fx, fy, cx, cy, *lens[:2], *third))
+        return ModelCamera(1, "OPENCV_FISHEYE", *size_px, (fx, fy, cx, cy, *lens[:2], *third))
     return brown_camera(size_px, (fx, fy, cx, cy), (*lens[:2], *third), lens[2:], str(path))
 
 
@@ -149,7 +149,7 @@ def read_frames(
     top = tops.pop() if len(tops) == 1 else ""
     folder = root / top if top else root
     named = {name[len(top) + 1 :] if top else name: frame for name, frame in frame_of.items()}
-    rows = [(n, f["transform_matrix"], frame_camera(1, f, data, folder / n, path)) for n, f in named.items()]
+    rows = [(n, f["transform_matrix"], frame_camera(f, data, folder / n, path)) for n, f in named.items()]
     return model_of_poses(rows), folder, named
 
 
@@ -220,7 +220,7 @@ def read_blender(root: Path) -> ForeignScene:
             name = photo.relative_to(root).as_posix()
             if name in split:
                 raise AwError(f"{path} lists {name!r} twice, or it is in both files")
-            rows.append((name, frame["transform_matrix"], frame_camera(1, frame, data, photo, path)))
+            rows.append((name, frame["transform_matrix"], frame_camera(frame, data, photo, path)))
             split[name] = side
     note = "photos with alpha are composited over white; initial points are random, as there is no model"
     model = model_of_poses(rows)

@@ -166,6 +166,7 @@ class EntropyAwareDensity(DensityControl):
     # [N, 3] sum of -dL/dmean over views, world
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {**DensityControl.sums, "downhill": (3,)}
     reads_keep: ClassVar[bool] = True  # for `support`
+    saved = (*DensityControl.saved, "last_merge", "merged", "last_judged")
     downhill: Tensor
 
     def __init__(self, config: DensityConfig, extent: float, seed: int) -> None:
@@ -264,15 +265,8 @@ class EntropyAwareDensity(DensityControl):
         self.support.match(len(gaussians), gaussians.device)
 
     def state_dict(self) -> State:
-        return super().state_dict() | {
-            "last_merge": self.last_merge,
-            "merged": self.merged,
-            "support": self.support.state_dict(),
-            "last_judged": self.last_judged,
-        }
+        return super().state_dict() | {"support": self.support.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
         super().load_state_dict(state)
-        self.last_merge, self.merged = state["last_merge"], state["merged"]
         self.support.load_state_dict(state["support"])
-        self.last_judged = state["last_judged"]

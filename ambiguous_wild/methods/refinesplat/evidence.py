@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, Spread
 from ambiguous_wild.methods.refinesplat.identity import Psi
 from ambiguous_wild.methods.refinesplat.maps import spread_of
-from ambiguous_wild.methods.refinesplat.structure import box, resized
+from ambiguous_wild.methods.refinesplat.structure import box
 from ambiguous_wild.methods.refinesplat.threshold import Statistic, contrast, entropy, surprise
 
 _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
@@ -81,7 +82,7 @@ def scaled_by(structure: Tensor, evidence: Tensor, weight: float) -> Tensor:
     """
     share = evidence.clamp(min=0.0)
     factor = 1.0 + weight * (2.0 * share / (share + 4.0) - 1.0)
-    return structure * resized(factor.float(), (structure.shape[0], structure.shape[1]))
+    return structure * resized(factor.float(), *structure.shape)
 
 
 def uncertainty(cosine: Tensor) -> Tensor:

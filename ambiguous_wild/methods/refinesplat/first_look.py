@@ -160,10 +160,8 @@ def first_look(
     answers = [answer(view, config.views, nothing, moves) for view in everything]
     views = config.views
     if masked_share(answers) >= config.crowd:
-        moves, views = (
-            nothing,
-            2 * views,
-        )  # features of a crowd are too few: renders get worse by 0.3 to 0.8 dB
+        # features of a crowd are too few: renders get worse by 0.3 to 0.8 dB
+        moves, views = nothing, 2 * views
         answers = [answer(view, config.views, nothing, nothing) for view in everything]
     for _ in range(config.rounds):
         before, answers = answers, [answer(view, views, answers, answers) for view in everything]

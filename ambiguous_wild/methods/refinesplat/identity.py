@@ -245,13 +245,8 @@ def _loss(logits: Tensor, identities: Tensor, variant: Variant) -> Tensor:
     return (F.softplus(logits).sum(1) - target * (identities > 0)).mean()
 
 
-def psi_arrays(psi: Psi) -> dict[str, np.ndarray]:
-    """Return psi's tensors as numpy arrays, for the cache."""
-    return {name: tensor.cpu().numpy() for name, tensor in psi.state_dict().items()}
-
-
 def psi_from_arrays(arrays: dict[str, np.ndarray]) -> Psi:
-    """Restore psi from `psi_arrays`, frozen."""
+    """Restore psi from the arrays of its `state_dict`, frozen."""
     hidden, channels = arrays["first.weight"].shape
     psi = Psi(channels, hidden, arrays["last.weight"].shape[0])
     psi.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})

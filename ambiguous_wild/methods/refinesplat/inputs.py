@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import Scene
+from ambiguous_wild.methods.masking_common import nearest
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import (
     Identities,
     Psi,
     associate,
-    psi_arrays,
     psi_from_arrays,
     train_psi,
 )
@@ -81,7 +81,7 @@ class FrozenInputs:
         association = self._identities(phi)
         grid, identities = [], []
         for index, label in enumerate(self.labels):
-            cells = grid_labels(np.maximum(label, 0), *phi[index].shape[:2])
+            cells = nearest(torch.from_numpy(np.maximum(label, 0)), *phi[index].shape[:2]).numpy()
             grid.append(torch.from_numpy(cells.astype(np.int64)).to(data.device))
             ids = association.of_instance[index][cells].astype(np.int64)
             identities.append(torch.from_numpy(ids).to(data.device))
@@ -111,13 +111,6 @@ class FrozenInputs:
             min_similarity=config.identity_similarity,
             most=most,
         )
-
-
-def grid_labels(labels: np.ndarray, h: int, w: int) -> np.ndarray:
-    """Return the labels [h, w] at the centres of cells of labels [H, W]."""
-    rows = ((np.arange(h) * 2 + 1) * labels.shape[0]) // (2 * h)
-    columns = ((np.arange(w) * 2 + 1) * labels.shape[1]) // (2 * w)
-    return labels[rows[:, None], columns[None, :]]
 
 
 def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -248,7 +241,8 @@ def _psi(
     names = ["mean", "std", "first.weight", "first.bias", "last.weight", "last.bias"]
 
     def compute() -> dict[str, np.ndarray]:
-        return psi_arrays(train_psi(cells, ids, count, config.psi, config.mask.variant, data.seed))
+        psi = train_psi(cells, ids, count, config.psi, config.mask.variant, data.seed)
+        return {name: tensor.cpu().numpy() for name, tensor in psi.state_dict().items()}
 
     return psi_from_arrays(cached(data.cache_dir, key, dict.fromkeys(names, np.float32), compute)).to(
         data.device

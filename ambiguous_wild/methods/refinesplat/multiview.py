@@ -33,6 +33,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.maps import (
     MapStack,
     Ranks,
@@ -42,7 +43,7 @@ from ambiguous_wild.methods.refinesplat.maps import (
     common_offset,
     sized,
 )
-from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, nearest, resized
+from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, nearest
 from ambiguous_wild.splat.backend import backend_of
 
 SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
@@ -314,9 +315,8 @@ def discount(
     if others is None:
         return evidence
     excess = (others.evidence / unit - config.free).clamp_(min=0.0) * others.weight
-    size = (evidence.shape[0], evidence.shape[1])
-    at_pixels = resized(excess.nan_to_num_(nan=0.0), size)
-    return evidence * resized(others.taught, size) / (1.0 + config.strength * at_pixels).sqrt_()
+    at_pixels = resized(excess.nan_to_num_(nan=0.0), *evidence.shape)
+    return evidence * resized(others.taught, *evidence.shape) / (1.0 + config.strength * at_pixels).sqrt_()
 
 
 def _query_of(

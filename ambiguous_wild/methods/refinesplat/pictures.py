@@ -12,9 +12,8 @@ from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.evidence import Maps
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
-from ambiguous_wild.methods.refinesplat.masks import Judged, Masks, MaskStore, enlarge
+from ambiguous_wild.methods.refinesplat.masks import MaskStore, enlarge
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.moving import POINTS, draw_points
 
@@ -28,17 +27,6 @@ class Policy(Protocol):
     points: dict[str, MotionPoints]
     masks: MaskStore
 
-    @property
-    def w2(self) -> float: ...
-
-    @property
-    def shares(self) -> dict[int, tuple[float, float, float, float]]: ...
-
-    @property
-    def judged(self) -> dict[int, Judged]: ...
-
-    def examine(self, step: Step) -> tuple[Maps, Masks]: ...
-
 
 def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.ndarray]:
     """Return pictures of the evidence, instances by their statistic, and all masks; [H, W, 3] uint8 each.
@@ -50,7 +38,7 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
         step: step of a train view at the photo's own size.
         begun: whether masks are used at this step.
     """
-    maps, masks = policy.examine(step)
+    maps, masks = policy.masks.examine(step)
     labels = policy.inputs.labels[step.view]
     photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
     grey = faded(photo)
@@ -78,7 +66,7 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
 
 def explain(policy: Policy, step: Step, x: int, y: int) -> list[str]:
     """Return what decided about a pixel of the photo, in the order in which it is asked."""
-    maps, masks = policy.examine(step)
+    maps, masks = policy.masks.examine(step)
     view, config = step.view, policy.config.mask
     store = policy.masks
     shape = store.labels.shapes[view]
@@ -136,17 +124,18 @@ def _outlined(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
     """Write entropies.png: the last statistics of all photos' instances, and their thresholds."""
-    views = [v for v in sorted(policy.judged) if v in policy.shares and len(policy.judged[v].values)]
+    judged, shares = policy.masks.judged, policy.masks.shares
+    views = [v for v in sorted(judged) if v in shares and len(judged[v].values)]
     if not views:
         return []
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    values = np.concatenate([policy.judged[v].values for v in views])
-    distances = np.concatenate([policy.judged[v].distances for v in views])
-    areas = np.concatenate([policy.judged[v].areas for v in views])
-    cuts = np.array([policy.shares[v][3] for v in views])
-    above = np.concatenate([policy.judged[v].values > policy.shares[v][3] for v in views])
+    values = np.concatenate([judged[v].values for v in views])
+    distances = np.concatenate([judged[v].distances for v in views])
+    areas = np.concatenate([judged[v].areas for v in views])
+    cuts = np.array([shares[v][3] for v in views])
+    above = np.concatenate([judged[v].values > shares[v][3] for v in views])
     figure = Figure(figsize=(11, 4.2), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
@@ -178,7 +167,7 @@ def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
         axes.set_xlabel(f"mean {policy.config.mask.statistic} of an instance (at the end: and above)")
         axes.set_xlim(0, end)
     left.legend(fontsize=8, loc="upper right")
-    left.set_title(f"{len(values)} instances of {len(views)} photos, w2 = {policy.w2:.2f}", fontsize=10)
+    left.set_title(f"{len(values)} instances of {len(views)} photos, w2 = {policy.masks.w2:.2f}", fontsize=10)
     what = "photo against render" if features else "what stands out, and how large it is"
     right.set_title(f"{what}: each instance, its size by its area", fontsize=10)
     path = folder / "entropies.png"

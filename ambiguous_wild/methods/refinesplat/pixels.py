@@ -23,10 +23,11 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
+from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.maps import low_quantile, median
 from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
-from ambiguous_wild.methods.refinesplat.structure import resized, structure_residual, unrelated_residual
+from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.vision.sparse_surface import seldom_seen
 
@@ -186,10 +187,10 @@ class PixelEvidence:
             Evidence [H, W] float32 at the photo's size, and the unit, 0-d float64.
         """
         photo, config = self.photos[view], self.config
-        size = (photo.shape[0], photo.shape[1])
-        judged, seen = resized(alpha, size) >= config.least_alpha, self.seen[view]
+        size = photo.shape[:2]
+        judged, seen = resized(alpha, *size) >= config.least_alpha, self.seen[view]
         left_out = ~(judged if seen is None else judged & seen)
-        evidence = structure_residual(photo, resized(image, size), config.base)
+        evidence = structure_residual(photo, resized(image, *size), config.base)
         evidence = evidence.masked_fill_(left_out, 0.0)
         if config.memory > 0 and view in self.before:
             evidence = torch.lerp(evidence, self.before[view].float(), config.memory)

@@ -18,14 +18,14 @@ from torch import Tensor
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
-from ambiguous_wild.methods.masking_common import PausingMask, upsampled
+from ambiguous_wild.methods.masking_common import PausingMask, resized
 from ambiguous_wild.methods.refinesplat import pictures
 from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, silence
 from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look, masked_share
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
-from ambiguous_wild.methods.refinesplat.masks import Judged, Masks, MaskStore
+from ambiguous_wild.methods.refinesplat.masks import MaskStore
 from ambiguous_wild.methods.refinesplat.threshold import Variant
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.data import shrink_keep
@@ -209,7 +209,7 @@ class RefineSplatMask(PausingMask):
         return shrink_keep(self.masks.examine(step)[1].keep, step.divisor)
 
     def facts(self) -> Facts:
-        shares = self.shares
+        shares = self.masks.shares
         rows = np.array([shares[view] for view in sorted(shares)], dtype=np.float64).reshape(-1, 4)
         finite = rows[np.isfinite(rows[:, 3]), 3]
         mean = rows[:, :3].mean(axis=0) if len(rows) else np.zeros(3)
@@ -218,7 +218,7 @@ class RefineSplatMask(PausingMask):
             "masked_share_local": float(mean[1]),
             "masked_share_global": float(mean[2]),
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
-            "w2": self.w2,
+            "w2": self.masks.w2,
             # mean share of a photo that the first look masks
             "first_look_share": masked_share([look.passing for look in self.looks.values()]),
             # not if only pictures read identities
@@ -230,36 +230,12 @@ class RefineSplatMask(PausingMask):
         """Whether masks or losses read identities; pictures always do."""
         return self.config.mask.needs_identities or self.regularises()
 
-    @property
-    def w2(self) -> float:
-        """Weight of T_ent's lower subset, learnt or fixed."""
-        return self.masks.w2
-
-    @property
-    def shares(self) -> dict[int, tuple[float, float, float, float]]:
-        """Each view's shares masked in all, locally and globally, and T_ent, when its mask was last made."""
-        return self.masks.shares
-
-    @property
-    def judged(self) -> dict[int, Judged]:
-        """Each view's instances when its mask was last made."""
-        return self.masks.judged
-
-    def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
-        """Return the maps of the step's view and its masks at the photo's own size.
-
-        Args:
-            step: step of any train view.
-            remember: whether to store the evidence for other views.
-        """
-        return self.masks.examine(step, remember=remember)
-
     @torch.no_grad()
     def compare(self, step: Step) -> Maps:
         """Compute entropy and distances on the feature grid from the step's render."""
         frozen, mask = self.inputs.semantics, self.config.mask
         features = self.inputs.features
-        image = upsampled(step.rendered.image, *self.data.photos[step.view].shape[:2])
+        image = resized(step.rendered.image, *self.data.photos[step.view].shape[:2])
         maps = compare(frozen.phi[step.view], features(image), frozen.psi, features.unit, mask)
         h, w = maps.distance.shape
         alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
@@ -268,7 +244,7 @@ class RefineSplatMask(PausingMask):
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
         inputs, config = self.inputs.semantics, self.config
         assert inputs.psi is not None  # cotangent returned before
-        logits = inputs.psi(self.inputs.features(upsampled(image, *self.data.photos[step.view].shape[:2])))
+        logits = inputs.psi(self.inputs.features(resized(image, *self.data.photos[step.view].shape[:2])))
         h, w, channels = logits.shape
         flat = logits.reshape(-1, channels)
         # without weights the capture's own masks still apply
@@ -324,9 +300,6 @@ def _cells(keep: Tensor | None, h: int, w: int, like: Tensor) -> Tensor:
 
 def _instances(config: RefineSplatConfig) -> Instances:
     return GraphSegments(config.segments) if config.instances == "graph" else make_instances(config.instances)
-
-
-Config = RefineSplatConfig
 
 
 def build(options: RefineSplatConfig) -> Parts:

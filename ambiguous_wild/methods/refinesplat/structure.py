@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.splat.backend import backend_of
 
 RESIDUAL_BOX = 5  # px
@@ -58,9 +59,7 @@ def unrelated_residual(photos: Sequence[Tensor], base: float = 0.3) -> float:
     values = []
     for index in range(len(photos)):
         photo, other = (photos[k % len(photos)].cpu() for k in (index, index + len(photos) // 2))
-        other = other.flip(1)
-        if other.shape != photo.shape:
-            other = resized(other, (photo.shape[0], photo.shape[1]))
+        other = resized(other.flip(1), *photo.shape[:2])
         values.append(float(np.median(structure_residual(photo, other, base).numpy())))
     return float(np.median(values)) if values else 0.0
 
@@ -87,15 +86,6 @@ def box(maps: Tensor, size: int) -> Tensor:
     padded = F.pad(maps[None].double(), (size // 2,) * 4, mode="replicate")
     # one axis after the other needs 2 * size additions a pixel instead of size^2
     return F.avg_pool2d(F.avg_pool2d(padded, (size, 1), 1), (1, size), 1)[0].to(maps)
-
-
-def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """Resize [h, w] or [h, w, 3] to (height, width), bilinear."""
-    if tuple(x.shape[:2]) == size:
-        return x
-    maps = x[None] if x.ndim == 2 else x.permute(2, 0, 1)
-    large = F.interpolate(maps[None], size=size, mode="bilinear", align_corners=False)[0]
-    return large[0] if x.ndim == 2 else large.permute(1, 2, 0)
 
 
 def nearest(x: Tensor, size: tuple[int, int]) -> Tensor:

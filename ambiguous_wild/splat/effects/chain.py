@@ -1,4 +1,4 @@
-"""The effects of a run as one object, which the trainer calls if the run has effects."""
+"""The effects of a run as one object."""
 
 from __future__ import annotations
 
@@ -106,6 +106,8 @@ class Chain:
 
     def render(self, gaussians: Gaussians, shot: Shot, draw: Draw, without: Collection[str] = ()) -> Rendered:
         """Draw with all effects except those named; the effects have already changed the camera."""
+        if not self.effects:
+            return draw(gaussians, shot, None)
         drawn, model_pulls = self.model(gaussians, shot, without)
         rendered = draw(drawn, shot, self._shade(drawn, shot, without))
         frame, frame_pulls = frame_of(rendered), []

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import argparse
 import csv
+import difflib
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 
@@ -32,19 +33,23 @@ GROUPS = {
 BASELINES = ("courtyard-colour", "courtyard-plain", "monstree-cutouts")
 COLOURS = ("time-of-day", "white-balance")
 HAND_MADE = ("features=labhog", "instances=graph")  # without pretrained networks; rows need not name them
-WITHOUT_MOTION = "refinesplat, first_look.motion=0"
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
+
+
+def rows(*datasets: str) -> Iterator[Mapping[str, str]]:
+    """The rows of some tables of the board."""
+    for name in datasets:
+        with (ROOT / "leaderboard" / "measured" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+            yield from csv.DictReader(file)
 
 
 def board(*datasets: str, only: str = "") -> Board:
     """The metrics of some tables of the board, of one seed or as means over all."""
     seeds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
-    for name in datasets:
-        with (ROOT / "leaderboard" / "measured" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                for metric in ("psnr", "mask_iou"):
-                    if row[metric] and only in ("", row["seed"]):
-                        seeds[row["scene"], label(row), metric].append(float(row[metric]))
+    for row in rows(*datasets):
+        for metric in ("psnr", "mask_iou"):
+            if row[metric] and only in ("", row["seed"]):
+                seeds[row["scene"], label(row), metric].append(float(row[metric]))
     found: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for (scene, method, metric), values in seeds.items():
         found[scene][method][metric] = mean(values)
@@ -95,52 +100,44 @@ def scenes() -> list[str]:
 
 
 def baselines() -> list[str]:
-    """PSNR of every method on some scenes."""
-    return ranking(board(*RANKED_ON, only="0"), BASELINES)
+    """PSNR of every method on some scenes, and the time of its training on the first, if it ran alone."""
+    seconds = {
+        label(row): f"{float(row['cost_train_s']):.0f}"
+        for row in rows(*RANKED_ON)
+        if (row["scene"], row["cost_alone"]) == (BASELINES[0], "1")
+    }
+    ranked = ranking(board(*RANKED_ON, only="0"), BASELINES)
+    return [line([f"`{name}`", *psnr, seconds.get(name, "")]) for name, psnr in ranked]
 
 
 def colours() -> list[str]:
     """PSNR of every method where colours differ between photos."""
-    return ranking(board("colours", only="0"), COLOURS)
+    return [line([f"`{name}`", *psnr]) for name, psnr in ranking(board("colours", only="0"), COLOURS)]
 
 
-def ranking(found: Board, scenes: Sequence[str]) -> list[str]:
-    """PSNR of the methods that are measured on all these scenes, the best in the mean first."""
+def ranking(found: Board, scenes: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Name and PSNR of the methods that are measured on all these scenes, the best in the mean first."""
     psnr = {
         name: [found[scene][name]["psnr"] for scene in scenes]
         for name in found[scenes[0]]
-        if name != WITHOUT_MOTION and all(name in found[scene] for scene in scenes)
+        if all(name in found[scene] for scene in scenes)
     }
     best = sorted(psnr, key=lambda name: -mean(psnr[name]))
-    return [line([f"`{name}`", *(f"{x:.2f}" for x in psnr[name])]) for name in best]
-
-
-def motion() -> list[str]:
-    """PSNR and mask IoU of RefineSplat without and with what moves, by group of scenes."""
-    found, lines = board(*RANKED_ON), []
-    for group, prefixes in GROUPS.items():
-        scenes = [methods for scene, methods in found.items() if scene.startswith(prefixes)]
-        measured = [methods for methods in scenes if WITHOUT_MOTION in methods]
-        if measured:
-            both = (WITHOUT_MOTION, "refinesplat")
-            psnr = [f"{mean(methods[name]['psnr'] for methods in measured):.2f}" for name in both]
-            iou = [f"{mean(methods[name]['mask_iou'] for methods in measured):.3f}" for name in both]
-            lines.append(line([group, " / ".join(psnr), " / ".join(iou)]))
-    return lines
+    return [(name, [f"{x:.2f}" for x in psnr[name]]) for name in best]
 
 
 TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
     "README.md": {"means": means},
-    "docs/refinesplat.md": {"motion": motion, "scenes": scenes},
+    "docs/refinesplat.md": {"scenes": scenes},
     "docs/baselines.md": {"baselines": baselines, "colours": colours},
 }
 
 
 def written(page: str, text: str) -> str:
     """The page's text with its tables as the board says."""
-    for name, rows in TABLES[page].items():
+    for name, lines in TABLES[page].items():
         pattern = re.compile(rf"(<!-- figures: {name} -->\n\|[^\n]*\n\|[^\n]*\n)(\|[^\n]*\n)+")
-        text, count = pattern.subn(lambda m, rows=rows: m[1] + "\n".join(rows()) + "\n", text)
+        text, count = pattern.subn(lambda m, lines=lines: m[1] + "\n".join(lines()) + "\n", text)
         if count != 1:
             raise SystemExit(f"{page} has {count} tables after '<!-- figures: {name} -->', not one")
     return text
@@ -157,10 +154,11 @@ def main() -> None:
         path = ROOT / page
         before = path.read_text(encoding="utf-8")
         after = written(page, before)
-        for old, new in zip(before.splitlines(), after.splitlines(), strict=False):
-            if old != new:
-                differ = True
-                print(f"{page}:\n- {old}\n+ {new}")
+        changes = list(
+            difflib.unified_diff(before.splitlines(), after.splitlines(), page, page, n=0, lineterm="")
+        )
+        print(*changes, sep="\n", end="\n" * bool(changes))
+        differ = differ or bool(changes)
         if not check:
             path.write_text(after, encoding="utf-8")
     sys.exit(1 if check and differ else 0)

@@ -43,6 +43,9 @@ def test_the_tables_of_readme_and_docs_are_those_of_the_board():
 
 def test_the_readme_counts_the_scenes_on_which_refinesplat_is_first():
     with benchmark("figures") as figures:
-        psnr = [[methods[m]["psnr"] for m in figures.RANKED] for methods in figures.board(*figures.RANKED_ON).values()]
+        psnr = [
+            [methods[m]["psnr"] for m in figures.RANKED]
+            for methods in figures.board(*figures.RANKED_ON).values()
+        ]
         first = sum(row[figures.RANKED.index("refinesplat")] == max(row) for row in psnr)
         assert f"first on {first} of {len(psnr)} scenes" in (figures.ROOT / "README.md").read_text("utf-8")

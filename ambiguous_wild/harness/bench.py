@@ -323,11 +323,14 @@ def _check_effects(
     scenes: Sequence[Path],
     methods: Collection[MethodEntry],
 ) -> None:
-    """Raise AwError for an unknown effect, or a plan that no method would use."""
-    from ambiguous_wild.harness.chosen_effects import check_wanted, takes_effects
+    """Raise AwError for an unknown effect, or effects or a plan that no method would use."""
+    from ambiguous_wild.harness.chosen_effects import NOT_OURS, check_wanted, takes_effects
 
     for wanted in choices:
         check_wanted(wanted)
+        if wanted not in ("auto", "none") and not any(map(takes_effects, methods)):
+            names = ", ".join(method.name for method in methods)
+            raise AwError(f"--effects {wanted} would not be used by {names}: {NOT_OURS}; leave it out")
     if plan is None:
         return
     name = plan if isinstance(plan, str | Path) else plan.scene

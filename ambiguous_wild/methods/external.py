@@ -165,6 +165,7 @@ class CommandProgram:
                 command = "resume" if resuming else "train"
                 write_json(task.work / BEGUN, list(self.words("train")))
                 done["train_s"] = self._command("train", command, values, task)
+                done |= {"resumed": 1.0} if resuming else {}
                 write_json(state, done)
             if self.keys.render and "render_s" not in done:
                 done["render_s"] = self._command("render", "render", values, task)
@@ -238,10 +239,13 @@ class CommandProgram:
         ply = self._one(fill_pattern(self.keys.ply, values)) if self.keys.ply else None
         if self.keys.ply and ply is None:
             raise AwError(f"{self.name} left no splats: {fill_pattern(self.keys.ply, values)} is not there")
-        cost: dict[str, float] = dict(done)
+        # the part before a stop was not timed
+        untimed = {"resumed", "train_s"} if "resumed" in done else set()
+        cost = {name: seconds for name, seconds in done.items() if name not in untimed}
         if task.budget_s is None and "iterations" in self._used():
-            cost |= {"iterations": task.iterations}
-            cost |= {"ms_per_iteration": 1e3 * done["train_s"] / task.iterations}
+            cost["iterations"] = task.iterations
+            if "train_s" in cost:
+                cost["ms_per_iteration"] = 1e3 * cost["train_s"] / task.iterations
         return Produced(
             renders={name: path for name, path in renders.items() if path is not None},
             masks={name: path for name, path in masks.items() if path is not None},
@@ -276,7 +280,9 @@ class CommandProgram:
 
 def _read(state: Path) -> dict[str, float]:
     data = own_json(state)
-    return {k: float(data[k]) for k in ("train_s", "render_s") if isinstance(data.get(k), (int, float))}
+    return {
+        k: float(data[k]) for k in ("train_s", "render_s", "resumed") if isinstance(data.get(k), (int, float))
+    }
 
 
 def _revision(folder: Path) -> str | None:

@@ -184,6 +184,15 @@ def test_a_resume_command_takes_over_where_something_lies(scene, tmp_path):
     _, report = run(reference, scene, tmp_path / "runs")
     assert report.outcome == "trained", report.error
     assert (report.folder / "external/output/begun").exists()
+    # the time before the stop is not known
+    assert not {"train_s", "ms_per_iteration", "reference_s"} & report.result["cost"].keys()
+
+
+def test_effects_that_no_method_takes_are_refused(scene, tmp_path):
+    words = ["--method", describe(tmp_path), "--scene", str(scene.root), "--effects", "exposure"]
+    refused = CliRunner().invoke(bench, [*words, "-o", str(tmp_path / "runs")]).exception
+    assert isinstance(refused, AwError) and "--effects exposure would not be used by nearest" in str(refused)
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(

@@ -172,9 +172,10 @@ def mask_loss(
 
     The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights, hence constant and left out.
     """
-    pull = config.lambda_pull * math.exp(-nominal / config.beta) * (1.0 - mask).mean()
+    pull = config.lambda_pull * math.exp(-nominal / config.beta)
     bounds = (F.relu(mask - upper) + F.relu(lower - mask)).mean()
-    return config.lambda_cosine * (mask - target).abs().mean() + config.lambda_residual * bounds + pull
+    agreement = config.lambda_cosine * (mask - target).abs().mean()
+    return agreement + config.lambda_residual * bounds + pull * (1.0 - mask).mean()
 
 
 class RobustSplatMask(PausingMask):

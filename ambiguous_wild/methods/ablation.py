@@ -42,9 +42,9 @@ class Group:
     source: str = ""  # table of the paper
 
 
-def values(name: str, key: str, *values: object) -> tuple[Variant, ...]:
+def values(name: str, key: str, *chosen: object) -> tuple[Variant, ...]:
     """Return a variant NAME-VALUE for each value of an option."""
-    return tuple(Variant(f"{name}-{value}", (f"{key}={value}",)) for value in values)
+    return tuple(Variant(f"{name}-{value}", (f"{key}={value}",)) for value in chosen)
 
 
 def folder_name(method: str, group: Group, variant: Variant) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
@@ -175,14 +176,14 @@ def degraded_distance(features: Callable[[Tensor], Tensor], photos: Sequence[Ten
     return float(f"{max(sum(means) / len(means), 1e-6):.4g}")
 
 
-class FittedByDistance:
+class FittedByDistance(ABC):
     """Features whose only statistic of a scene is `unit`."""
 
     unit = 0.1  # until `fit` measures it
     fit_photos: int  # photos that `fit` uses
 
-    def __call__(self, image: Tensor) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def __call__(self, image: Tensor) -> Tensor: ...
 
     def fit(self, photos: Sequence[Tensor]) -> None:
         """Set `unit`, see `degraded_distance`.

@@ -33,7 +33,10 @@ NEAR_DEG = 3.0  # largest angle of poses that may be one place found twice
 SAME_SHARE = 0.1  # of the path's radius: largest distance of positions that are one place
 GRID = 12  # cells a side of the grid on which the area of matches is measured
 LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a distractor
-LITTLE_AREA = 0.05  # the same if all placed photos that share a motion with it agree
+# The same if all placed photos that share a motion with it agree, and the matches are spread over the photo
+# at least so much of what as many features drawn at random would be: those of a distractor are crowded.
+LITTLE_AREA, LITTLE_SPREAD = 0.05, 0.2
+LEAST_POINTS = 6  # points, which two others observe, that fix how far a photo with one partner is from it
 AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two partners are enough
 PLACES = 3  # largest number of places tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of the points of a place
@@ -53,6 +56,7 @@ class Place:
     pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
     partners: frozenset[int]  # placed photos that agree with it
     area: float  # share of the photo's textured part that their matches cover
+    spread: float = 1.0  # cells with matches, relative to as many features drawn at random
     evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)  # motion -> its features
 
     @property
@@ -83,32 +87,40 @@ class Placement:
     def run(self) -> None:
         """Place all photos anew, one after another, until none moves, or hardly any of many."""
         outs = [0] * len(self.matched.ids)
-        self._settle(outs)
-        while len(parts := self.components()) > 1:
-            # Each part is consistent in itself, but nothing fixes where it is from the others.
-            for part in parts[1:]:
-                poses = {photo: self.poses.pop(photo) for photo in sorted(part)}
-                if len(poses) >= LEAST_PHOTOS:
-                    self.apart.append(poses)
-                for photo in poses:
-                    outs[photo] = TAKEN_OUT
+        parts: list[dict[int, np.ndarray]] = [{}]
+        while parts and len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
             self._settle(outs)
-        if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
-            self._triangulate_and_adjust(final=True)
-        firm = self.components(self.provisional)
-        self.provisional |= set(self.poses) - (firm[0] if firm else set())
+            parts = self._keep_largest()
+            if not parts and len(self.poses) >= LEAST_PHOTOS:
+                self._triangulate_and_adjust(final=True)
+                parts = self._keep_largest()
+            self.apart += [part for part in parts if len(part) >= LEAST_PHOTOS]
+        firm = self.components(self.provisional)[:1]
+        firm = [part for part in firm if len(part) >= LEAST_PHOTOS]
+        self.provisional = set(self.poses).difference(*firm)
         for photo in range(len(outs)):
             if photo not in self.poses:
                 self.left_out.setdefault(photo, "too few of its points are left")
 
     def _settle(self, outs: list[int]) -> None:
         """Place all photos anew until none moves; `outs` counts how often each was taken out."""
-        rounds, moved = 0, True
+        rounds, moved, pairs = 0, True, False
         while moved and rounds <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
             before = set(self.poses)
-            self._triangulate_and_adjust(final=False)
+            self._triangulate_and_adjust(final=False, pairs=pairs)
             moved = self._place_all(outs, only_out=rounds == ROUNDS)
             rounds += not set(self.poses) > before
+            if not moved and not pairs and self.left_out:
+                # Where photos overlap little, points that two of them observe are all that a third has.
+                moved = pairs = True
+
+    def _keep_largest(self) -> list[dict[int, np.ndarray]]:
+        """Keep the largest part that links connect; return the poses of the others.
+
+        Each is consistent in itself, but nothing fixes where it is from the largest.
+        """
+        others = self.components()[1:]
+        return [{photo: self.poses.pop(photo) for photo in sorted(part)} for part in others]
 
     def links(self) -> dict[Pair, int]:
         """Return the placed pairs of which a motion fits, with the number of their matches that fit."""
@@ -177,7 +189,7 @@ class Placement:
             best, rival = self._best(photo, pose_now, rays, points)
             few = pose_now is None and best.area < AREA_NEW
             reason = _reason(best, rival, AGREE_NEW if few else AGREE)
-            if reason is not None and unopposed(best, rival):
+            if reason is not None and self._unopposed(photo, best, rival, points):
                 self.provisional.add(photo)
                 reason = None
             if reason is None and pose_now is None and (only_out or outs[photo] >= TAKEN_OUT):
@@ -221,6 +233,21 @@ class Placement:
         elsewhere.append(self._rival_by_motions(photo, best.partners))
         return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
 
+    def _unopposed(self, photo: int, best: Place, rival: Place, points: Points) -> bool:
+        """Tell whether little evidence for a place is enough, because nothing speaks against it."""
+        if rival.partners or best.area < LITTLE_AREA or best.spread < LITTLE_SPREAD:
+            return False
+        if len(best.partners) >= AGREE:
+            return True
+        if not best.partners or best.pose is None or best.area < AREA_NEW:
+            return False
+        features, xyz = points.matched_with(photo, self.pairs[photo], self.poses)
+        local = xyz @ best.pose[:, :3].T + best.pose[:, 3]
+        front = local[:, 2] > 0
+        pixels = np.asarray(self.matched.cameras[photo].img_from_cam(local[front])).reshape(-1, 2)
+        off = np.linalg.norm(pixels - self.matched.features[photo][features[front]], axis=1)
+        return np.count_nonzero(off < RESECTION_PX) >= LEAST_POINTS
+
     def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
         """Collect placed partners' evidence for a place; a partner agrees if one of its motions fits."""
         evidence = {}
@@ -240,7 +267,8 @@ class Placement:
         self, photo: int, pose: np.ndarray | None, evidence: Mapping[tuple[Pair, int], np.ndarray]
     ) -> Place:
         partners = frozenset(a + b - photo for (a, b), _ in evidence)
-        return Place(pose, partners, self._area(photo, list(evidence.values())), evidence)
+        rows = list(evidence.values())
+        return Place(pose, partners, self._area(photo, rows), self._spread(photo, rows), evidence)
 
     def _rival_by_motions(self, photo: int, agree: frozenset[int]) -> Place:
         """Return the place that most other placed partners imply, by motions that turn the photo alike."""
@@ -277,6 +305,15 @@ class Placement:
         cells = self.cells[photo]
         return len(np.unique(cells[np.concatenate(rows)])) / len(np.unique(cells))
 
+    def _spread(self, photo: int, rows: Sequence[np.ndarray]) -> float:
+        """Return the number of cells that hold the features `rows`, over that of as many drawn at random."""
+        if not rows:
+            return 0.0
+        cells = self.cells[photo]
+        chosen = np.unique(np.concatenate(rows))
+        shares = np.bincount(cells) / len(cells)
+        return len(np.unique(cells[chosen])) / float((1 - (1 - shares) ** len(chosen)).sum())
+
     def resections(self, photo: int, points: Points) -> list[np.ndarray]:
         """Find poses [3, 4] of a photo from points that at least two other photos determine."""
         features, xyz = points.matched_with(photo, self.pairs[photo], self.poses)
@@ -296,8 +333,13 @@ class Placement:
             left = left[~np.asarray(answer["inlier_mask"])]
         return poses
 
-    def _triangulate_and_adjust(self, *, final: bool) -> None:
-        """Triangulate all matches that fit the poses, then adjust jointly; `final`: until nothing changes."""
+    def _triangulate_and_adjust(self, *, final: bool, pairs: bool = True) -> None:
+        """Triangulate all matches that fit the poses, then adjust jointly.
+
+        Args:
+            final: adjust until nothing changes.
+            pairs: also triangulate points that only two photos observe.
+        """
         matched = self.matched
         matched.write_verified(self.database, matched.fitting(self.poses))
         db = pycolmap.Database.open(str(self.database))
@@ -306,7 +348,7 @@ class Placement:
         finally:
             db.close()
         options = pipeline_options(self.seed)
-        options.triangulation.ignore_two_view_tracks = not final  # twice the points to begin training with
+        options.triangulation.ignore_two_view_tracks = not pairs  # twice the points to begin training with
         model = pycolmap.Reconstruction()
         model.load(cache)
         for camera in matched.cameras:
@@ -337,7 +379,7 @@ class Placement:
             self.matched.distorted = False
             for camera in self.matched.cameras:
                 camera.params = [*camera.params[:3], 0.0]
-            self._triangulate_and_adjust(final=final)
+            self._triangulate_and_adjust(final=final, pairs=pairs)
             return
         self._use_model(model)
 
@@ -436,11 +478,6 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
     if len(rival.partners) >= AGREE and rival.weight > RIVAL * best.weight:
         return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
     return None
-
-
-def unopposed(best: Place, rival: Place) -> bool:
-    """Tell whether little evidence for a place is enough, because nothing speaks against it."""
-    return len(best.partners) >= AGREE and best.area >= LITTLE_AREA and not rival.partners
 
 
 def _cells(features: np.ndarray, width: int, height: int) -> np.ndarray:

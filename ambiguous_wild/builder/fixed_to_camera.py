@@ -1,7 +1,7 @@
 """Find what is fixed to the camera: a bonnet, a drone's legs, a rig, a watermark, a burnt-in time stamp.
 
-Its features stay at the same pixel while the others move, so that most matches of a pair may say that the camera
-stands still. The evidence is counted in cells of the photo, over all pairs that move: a cell is fixed if its
+Its features stay at the same pixel while the others move, so that most matches of a pair may say that the
+camera stands still. The evidence is counted in cells of the photo, over all pairs that move: a cell is fixed if its
 matches stay within a pixel in many photos, and hardly any of them moves a little. That tells it from distant
 scenery and from the point that a camera circles, around which displacements grow gradually from 0.
 
@@ -10,14 +10,16 @@ A tripod has no pairs that move, and of a scene that stands still in most of its
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.builder.motions import Pair
+from ambiguous_wild.builder.records import FixedMask
 
+FIXED = "fixed.json"  # file of the stage `matches`: a list of `FixedMask`
 CELLS = 64  # cells along the longer side
 MAP_CELL = 5  # px of a cell in the map that becomes the mask
 STILL_PX, STILL_SIDE = 1.0, 1600  # largest displacement of a still match, at most at this longer side, px
@@ -40,6 +42,7 @@ BORDER_PX = 3  # px of the map at the border of the photo that are no outline
 CALM = 0.5  # largest change of such pixels, relative to the median pixel of the rest
 MARGIN_PX = 2  # px of the map by which the mask is larger
 SHOWN = 0.4  # least share of the gradient that stays in a photo that shows the area
+SPANS = 0.6  # share of a side from which on an area spans it
 COMPARED = 24  # photos whose pixels are compared
 
 
@@ -50,7 +53,9 @@ class FixedArea:
     size: tuple[int, int]  # width and height of the photos, px
     photos: list[int]  # photos of this camera and size
     covered: np.ndarray  # [h, w] bool, reduced photo: True where it is
-    slope: np.ndarray | None = None  # [2, h, w] gradient along x and y, median over photos; None: not measured
+    slope: np.ndarray | None = (
+        None  # [2, h, w] gradient along x and y, median over photos; None: not measured
+    )
 
     @property
     def share(self) -> float:
@@ -68,6 +73,33 @@ class FixedArea:
         covered = cv2.resize(self.covered.astype(np.float32), self.size, interpolation=cv2.INTER_LINEAR)
         return np.where(covered > 0.5, 0, 255).astype(np.uint8)
 
+    def without(self, photos: Iterable[int]) -> FixedArea:
+        """Return the area without some photos, which do not show it."""
+        left_out = set(photos)
+        return replace(self, photos=[k for k in self.photos if k not in left_out])
+
+    def where(self) -> str:
+        """Name the side of the photo that it lies at; empty if it spans the photo or lies in its middle."""
+        words = []
+        for axis, names in ((1, ("upper", "lower")), (0, ("left", "right"))):
+            line = np.flatnonzero(self.covered.any(axis=axis)) / self.covered.shape[1 - axis]
+            low, high = float(line[0]), float(line[-1])
+            if high - low < SPANS and not 1 / 3 < (low + high) / 2 < 2 / 3:
+                words.append(names[int((low + high) / 2 > 0.5)])
+        return " ".join(words)
+
+    def record(self, names: Sequence[str], mask: str) -> FixedMask:
+        """Return the record of the area.
+
+        Args:
+            names: work names of all photos.
+            mask: file name of its keep mask.
+        """
+        width, height = self.size
+        photos, share = [names[k] for k in self.photos], round(self.share, 4)
+        where = self.where()
+        return FixedMask(photos=photos, width=width, height=height, share=share, where=where, mask=mask)
+
     def shown_by(
         self,
         grey: np.ndarray,  # [H, W] uint8
@@ -78,6 +110,22 @@ class FixedArea:
         photo = _slopes(_reduced([grey], self.covered.shape))[:, 0, self.covered]
         pattern = self.slope[:, self.covered]
         return bool((photo * pattern).sum() >= SHOWN * (pattern * pattern).sum())
+
+
+def moving_matches(
+    features: Sequence[np.ndarray], matches: Mapping[Pair, np.ndarray], areas: Sequence[FixedArea]
+) -> dict[Pair, np.ndarray]:
+    """Return the matches [K, 2] that touch no area, of the pairs that lose some."""
+    covered = {photo: area.covers(features[photo]) for area in areas for photo in area.photos}
+    left = {}
+    for (a, b), rows in matches.items():
+        touched = np.zeros(len(rows), bool)
+        for photo, index in ((a, rows[:, 0]), (b, rows[:, 1])):
+            if photo in covered:
+                touched |= covered[photo][index]
+        if touched.any():
+            left[a, b] = rows[~touched]
+    return left
 
 
 @dataclass
@@ -96,7 +144,8 @@ def find_fixed(
     sizes: Sequence[tuple[int, int]],  # width and height of each photo, px
     cameras: Sequence[int],  # camera number of each photo
     matches: Mapping[Pair, np.ndarray],  # [K, 2] features of the pair's photos
-    read: Callable[[int], np.ndarray] | None = None,  # grey pixels of a photo, [H, W] uint8; None: no refinement
+    read: Callable[[int], np.ndarray]
+    | None = None,  # grey pixels of a photo, [H, W] uint8; None: no refinement
 ) -> list[FixedArea]:
     """Find the fixed areas, one a camera and size at most.
 
@@ -133,7 +182,9 @@ def _of_group(
     side = CELLS * MAP_CELL
     scale = side / max(size)
     shape = (max(round(size[1] * scale), 1), max(round(size[0] * scale), 1))
-    large = cv2.resize(fixed.astype(np.uint8), None, fx=MAP_CELL, fy=MAP_CELL, interpolation=cv2.INTER_NEAREST)
+    large = cv2.resize(
+        fixed.astype(np.uint8), None, fx=MAP_CELL, fy=MAP_CELL, interpolation=cv2.INTER_NEAREST
+    )
     seeds = large[: shape[0], : shape[1]] > 0
     closed = _closed(seeds, round(CLOSED * side))
     kept = np.zeros_like(seeds)
@@ -170,15 +221,11 @@ def _count(
         still, near, moving = moved <= still_px(size), moved <= NEAR * still_px(size), moved > MOVED * side
         if moving.sum() < MOVING or moving.sum() <= (near & ~still).sum():
             continue
-        column, row = np.clip(
-            (first * CELLS / side).astype(int), 0, [width - 1, height - 1]
-        ).T
+        column, row = np.clip((first * CELLS / side).astype(int), 0, [width - 1, height - 1]).T
         cell = row * width + column
         for k, chosen in enumerate((still, near & ~still, ~still & ~moving, moving)):
             counts[k] += np.bincount(cell[chosen], minlength=height * width)
-        column, row = np.clip(
-            (second[moving] * CELLS / side).astype(int), 0, [width - 1, height - 1]
-        ).T
+        column, row = np.clip((second[moving] * CELLS / side).astype(int), 0, [width - 1, height - 1]).T
         counts[3] += np.bincount(row * width + column, minlength=height * width)
         shown[a, cell[still]] = shown[b, cell[still]] = True
     counts[3] /= 2  # both ends of a match that moves were counted

@@ -107,7 +107,7 @@ def test_a_plain_capture_has_none():
 
 def test_the_point_that_a_camera_circles_is_not_fixed():
     rng = np.random.default_rng(3)
-    points = rng.normal(0, 1.2, (1500, 3)) + [0, 0, 5]
+    points = rng.normal([0, 0, 5], 1.2, (1500, 3))
     photos = []
     for angle in np.linspace(-0.6, 0.6, 10):
         eye = np.array([5 * np.sin(angle), 0, 5 - 5 * np.cos(angle)])
@@ -134,7 +134,7 @@ def test_photos_that_stand_still_have_none():
     """A tripod: all stands still but a passer-by."""
     rng = np.random.default_rng(5)
     still, passer = _band(0, 1, 600, rng), _band(0.4, 0.8, 60, rng) * [0.2, 1.0]
-    assert _find([np.vstack([still, passer + [60 * k, 0]]) for k in range(8)], rng) == []
+    assert _find([np.vstack([still, passer + np.array([60 * k, 0])]) for k in range(8)], rng) == []
 
 
 def test_a_camera_that_turns_on_a_tripod_shows_a_bonnet_but_no_scenery():

@@ -1,9 +1,9 @@
 """Find what is fixed to the camera: a bonnet, a drone's legs, a rig, a watermark, a burnt-in time stamp.
 
 Its features stay at the same pixel while the others move, so that most matches of a pair may say that the
-camera stands still. The evidence is counted in cells of the photo, over all pairs that move: a cell is fixed if its
-matches stay within a pixel in many photos, and hardly any of them moves a little. That tells it from distant
-scenery and from the point that a camera circles, around which displacements grow gradually from 0.
+camera stands still. The evidence is counted in cells of the photo, over all pairs that move: a cell is fixed
+if its matches stay within a pixel in many photos, and hardly any of them moves a little. That tells it from
+distant scenery and from the point that a camera circles, around which displacements grow gradually from 0.
 
 A tripod has no pairs that move, and of a scene that stands still in most of its area nothing is taken out.
 """
@@ -12,12 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.motions import Pair
 from ambiguous_wild.builder.records import FixedMask
+
+if TYPE_CHECKING:
+    from ambiguous_wild.builder.motions import Pair
 
 FIXED = "fixed.json"  # file of the stage `matches`: a list of `FixedMask`
 CELLS = 64  # cells along the longer side
@@ -39,7 +42,7 @@ LARGEST = 0.6  # largest share of the photo; more means that the scene stands st
 CLOSED = 0.05  # gap between fixed cells that is closed, over the longer side
 LASTING = 0.5  # least gradient that stays, over the median gradient, on the outline of what hardly changes
 BORDER_PX = 3  # px of the map at the border of the photo that are no outline
-CALM = 0.5  # largest change of such pixels, relative to the median pixel of the rest
+CALM = 0.55  # largest change of such pixels, relative to the median pixel of the rest
 MARGIN_PX = 2  # px of the map by which the mask is larger
 SHOWN = 0.4  # least share of the gradient that stays in a photo that shows the area
 SPANS = 0.6  # share of a side from which on an area spans it
@@ -126,6 +129,14 @@ def moving_matches(
         if touched.any():
             left[a, b] = rows[~touched]
     return left
+
+
+def words_of(share: float, where: str) -> str:
+    """Return "the lower 20 % of every photo", or "2 % of every photo (lower right)"."""
+    percent = f"{100 * share:.0f} %" if share >= 0.01 else "under 1 %"
+    if where and " " not in where:
+        return f"the {where} {percent} of every photo"
+    return f"{percent} of every photo" + (f" ({where})" if where else "")
 
 
 @dataclass
@@ -229,7 +240,9 @@ def _count(
         counts[3] += np.bincount(row * width + column, minlength=height * width)
         shown[a, cell[still]] = shown[b, cell[still]] = True
     counts[3] /= 2  # both ends of a match that moves were counted
-    return _Evidence(*counts.reshape(4, height, width), shown.reshape(photos, height, width))
+    still_count, near_count, slow_count, moving_count = counts.reshape(4, height, width)
+    shown = shown.reshape(photos, height, width)
+    return _Evidence(still_count, near_count, slow_count, moving_count, shown)
 
 
 def still_px(size: tuple[int, int]) -> float:
@@ -314,16 +327,13 @@ def _grown(
 
 
 def _closed(area: np.ndarray, reach: int) -> np.ndarray:
-    """Close gaps of an area [h, w] bool, and the gap to a border of the photo that lies within reach."""
-    padded = cv2.copyMakeBorder(area.astype(np.uint8), *[2 * reach] * 4, cv2.BORDER_REPLICATE)
-    for edge, inner in (
-        (np.s_[:reach], np.s_[2 * reach : 3 * reach]),
-        (np.s_[-reach:], np.s_[-3 * reach : -2 * reach]),
-    ):
-        padded[edge] |= padded[inner].max(axis=0)
-        padded[:, edge] |= padded[:, inner].max(axis=1, keepdims=True)
-    shut = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(reach // 2 + 1))
-    return shut[2 * reach : -2 * reach, 2 * reach : -2 * reach] > 0
+    """Close gaps of an area [h, w] bool up to a width in px, and such gaps to the border of the photo."""
+    padded = np.pad(area, reach)
+    inner = slice(reach, 2 * reach)
+    for view in (padded, padded[::-1], padded.T, padded.T[::-1]):  # what is near a border goes on beyond it
+        view[:reach] = view[inner].any(axis=0)
+    shut = cv2.morphologyEx(padded.astype(np.uint8), cv2.MORPH_CLOSE, _disc(reach // 2))
+    return np.asarray(shut[reach:-reach, reach:-reach] > 0)
 
 
 def _filled(

@@ -10,6 +10,7 @@ from typing import cast
 
 import numpy as np
 
+from ambiguous_wild.builder.fixed_to_camera import words_of
 from ambiguous_wild.builder.records import (
     BuildInputs,
     BuildRecord,
@@ -187,17 +188,8 @@ def fixed_lines(fixed: Sequence[FixedRecord]) -> list[str]:
     """Return a line for each mask of something that is fixed to the camera."""
     lines = []
     for area in fixed:
-        percent, where = (
-            f"{100 * area['share']:.0f} %" if area["share"] >= 0.01 else "under 1 %",
-            area["where"],
-        )
-        what = (
-            f"the {where} {percent} of every photo"
-            if where and " " not in where
-            else f"{percent} of every photo"
-        )
+        what = words_of(area["share"], area["where"])
         what += f" of {area['width']}x{area['height']}" if len(fixed) > 1 else ""
-        what += f" ({where})" if " " in where else ""
         masked = counted(len(area["photos"]), "photo")
         lines.append(
             f"{what} stands still while the rest moves (bonnet, rig or watermark?): masked in {masked}"

@@ -241,8 +241,8 @@ def _count(
         shown[a, cell[still]] = shown[b, cell[still]] = True
     counts[3] /= 2  # both ends of a match that moves were counted
     still_count, near_count, slow_count, moving_count = counts.reshape(4, height, width)
-    shown = shown.reshape(photos, height, width)
-    return _Evidence(still_count, near_count, slow_count, moving_count, shown)
+    by_photo = shown.reshape(photos, height, width)
+    return _Evidence(still_count, near_count, slow_count, moving_count, by_photo)
 
 
 def still_px(size: tuple[int, int]) -> float:
@@ -359,7 +359,7 @@ def _in_cells(area: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the cells [h, w] bool of which a map [H, W] bool has a pixel."""
     padded = np.zeros((shape[0] * MAP_CELL, shape[1] * MAP_CELL), bool)
     padded[: area.shape[0], : area.shape[1]] = area
-    return padded.reshape(shape[0], MAP_CELL, shape[1], MAP_CELL).any(axis=(1, 3))
+    return np.asarray(padded.reshape(shape[0], MAP_CELL, shape[1], MAP_CELL).any(axis=(1, 3)))
 
 
 def _enlarged(cells: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -6,12 +6,20 @@ Matches are projections of random points, so that the truth is known and no phot
 from __future__ import annotations
 
 from itertools import combinations
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder import report
+from ambiguous_wild.builder.checks import fixed_to_camera
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
+from ambiguous_wild.builder.photo_comparison import compare_photos, photo_features
+from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+from tests.builder.capture_maker import COUNT, SETTINGS, write_capture, write_split_capture
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
 NOISE_PX = 0.2
@@ -165,3 +173,61 @@ def test_pixels_complete_an_area_with_few_features_and_tell_who_shows_it():
     assert area.share == pytest.approx(0.2, abs=0.02)
     assert [area.shown_by(photo(k)) for k in range(8)] == [True] * 8
     assert not any(area.shown_by(photo(k, shown=False)) for k in range(8))
+
+
+def _over(path: Path, bonnet: np.ndarray) -> None:
+    """Paste a bonnet over the lower rows of a photo."""
+    photo = cv2.imread(str(path))
+    photo[-len(bonnet) :] = bonnet
+    cv2.imwrite(str(path), photo, [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+
+def test_a_scene_is_built_past_a_bonnet(tmp_path: Path):
+    """The user's masks are kept, and a test photo without a bonnet gets no mask of it."""
+    raw = write_split_capture(tmp_path / "raw")
+    bonnet = cv2.resize(
+        np.random.default_rng(0).integers(0, 256, (8, 40, 3), np.uint8),
+        (320, 60),
+        interpolation=cv2.INTER_CUBIC,
+    )
+    for path in [*sorted((raw / "train").glob("*.jpg")), raw / "test" / "p01.jpg"]:
+        _over(path, bonnet)
+    for i in range(COUNT):
+        mask = np.full((240, 320), 255, np.uint8)
+        mask[:, :30] = 0
+        write_png(tmp_path / "masks" / f"p{i:02d}.png", mask)
+    result = build_scene(raw, tmp_path / "scene", SETTINGS, masks=tmp_path / "masks")
+    [fact] = result.info["fixed_to_camera"]
+    assert sorted(fact["photos"]) == ["test/p01.jpg", *(f"train/p{i:02d}.jpg" for i in (0, 2, 3, 5))]
+    assert (fact["width"], fact["height"], fact["where"]) == (320, 240, "lower")
+    assert fact["share"] == pytest.approx(0.25, abs=0.03)
+    [line] = report.fixed_lines([fact])
+    assert line.startswith(f"the lower {100 * fact['share']:.0f} % of every photo") and "5 photos" in line
+    assert result.info["counts"]["registered"] == COUNT
+    for name, hidden in {"train/p00": True, "test/p01": True, "test/p04": False}.items():
+        keep = read_gray(result.scene / "masks" / f"{name}.png")  # at half of the size
+        assert not keep[:, :10].any() and keep[:80, 25:].all()
+        assert keep[95:, 25:].any() != hidden
+    assert result.info["masks"] is not None
+    shares = result.info["masks"]["kept_share"]
+    assert shares["p00"] < 0.75 and shares["p04"] == pytest.approx(1 - 30 / 320, abs=1e-3)
+    for image in pycolmap.Reconstruction(str(result.scene / "sparse" / "0")).images.values():
+        if image.name != "p04.png":
+            assert max(p.xy[1] for p in image.points2D if p.has_point3D()) < 0.79 * 240
+
+
+def test_the_capture_check_names_it_and_compares_the_rest(tmp_path: Path):
+    bonnet = cv2.resize(
+        np.random.default_rng(0).integers(0, 256, (8, 40, 3), np.uint8),
+        (320, 60),
+        interpolation=cv2.INTER_CUBIC,
+    )
+    paths = write_capture(tmp_path / "raw")
+    plain = compare_photos([photo_features(read_png_rgb(path)) for path in paths])
+    for path in paths:
+        _over(path, bonnet)
+    compared = compare_photos([photo_features(read_png_rgb(path)) for path in paths])
+    check = fixed_to_camera(compared)
+    assert check.state == "warning" and check.finding.startswith("the lower 2") and check.advice
+    assert fixed_to_camera(plain).state == "ok" and plain.fixed == []
+    assert compared.partners.tolist() == plain.partners.tolist()

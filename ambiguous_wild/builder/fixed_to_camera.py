@@ -82,14 +82,14 @@ class FixedArea:
         return replace(self, photos=[k for k in self.photos if k not in left_out])
 
     def where(self) -> str:
-        """Name the side of the photo that it lies at; empty if it spans the photo or lies in its middle."""
+        """Say where in the photo it lies: "lower right"; one word if it spans the other side, none if both."""
         words = []
-        for axis, names in ((1, ("upper", "lower")), (0, ("left", "right"))):
+        for axis, names in ((1, ("upper", "middle", "lower")), (0, ("left", "middle", "right"))):
             line = np.flatnonzero(self.covered.any(axis=axis)) / self.covered.shape[1 - axis]
             low, high = float(line[0]), float(line[-1])
-            if high - low < SPANS and not 1 / 3 < (low + high) / 2 < 2 / 3:
-                words.append(names[int((low + high) / 2 > 0.5)])
-        return " ".join(words)
+            if high - low < SPANS:
+                words.append(names[int(3 * (low + high) / 2)])
+        return " ".join(dict.fromkeys(words))
 
     def record(self, names: Sequence[str], mask: str) -> FixedMask:
         """Return the record of the area.

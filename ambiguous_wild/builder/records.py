@@ -95,7 +95,7 @@ class FixedRecord(TypedDict):
     width: int  # px, of these photos
     height: int  # px
     share: float  # of the photo
-    where: str  # "lower", "upper right", ...; empty: no single side
+    where: str  # "lower", "upper right", ...; see `FixedArea.where`
 
 
 class FixedMask(FixedRecord):

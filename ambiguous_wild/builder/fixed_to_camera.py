@@ -82,7 +82,7 @@ class FixedArea:
         return replace(self, photos=[k for k in self.photos if k not in left_out])
 
     def where(self) -> str:
-        """Say where in the photo it lies: "lower right"; one word if it spans the other side, none if both."""
+        """Say where it lies: "lower right"; one word if it spans the other side, none if it spans both."""
         words = []
         for axis, names in ((1, ("upper", "middle", "lower")), (0, ("left", "middle", "right"))):
             line = np.flatnonzero(self.covered.any(axis=axis)) / self.covered.shape[1 - axis]

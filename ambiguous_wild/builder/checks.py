@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.collect import collect
+from ambiguous_wild.builder.fixed_to_camera import words_of
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
     candidate_pairs,
@@ -76,6 +77,7 @@ def run_checks(
         near_duplicates(facts, thumbnails),
         overlap(facts, compared),
         motion(compared),
+        fixed_to_camera(compared),
     ]
 
 
@@ -238,6 +240,20 @@ def motion(compared: PhotoComparison) -> Check:
     finding = f"{100 * compared.forward:.0f} % of overlapping pairs differ by motion along the line of sight"
     advice = "walk sideways or around the subject: motion along the line of sight gives no parallax"
     return _row("motion", "pixels", compared.forward > FORWARD, finding, advice)
+
+
+def fixed_to_camera(compared: PhotoComparison) -> Check:
+    """Find what stands still in the photos while the rest moves: a bonnet, a rig, a watermark."""
+    if not compared.fixed:
+        return Check("fixed to camera", "ok", "pixels", "nothing stands still while the rest moves")
+    shown = "; ".join(
+        words_of(area.share, area.where())
+        + (f" of {area.size[0]}x{area.size[1]}" if len(compared.fixed) > 1 else "")
+        for area in compared.fixed
+    )
+    finding = f"{shown} stands still while the rest moves"
+    advice = "aw build-scene masks it; take the photos without it (a bonnet, a rig, a stamp) if you can"
+    return Check("fixed to camera", "warning", "pixels", finding, advice)
 
 
 def _row(name: str, basis: str, bad: bool, finding: str, advice: str, photos: tuple[str, ...] = ()) -> Check:

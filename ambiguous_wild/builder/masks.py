@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.builder.records import MaskResult, ScreenedPhoto
+from ambiguous_wild.builder.records import FixedMask, MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import orientation, read_alpha, read_mask, upright, write_png
+from ambiguous_wild.io.images import orientation, read_alpha, read_gray, read_mask, upright, write_png
 from ambiguous_wild.io.photos import TRANSPARENT
 from ambiguous_wild.io.scene_folder import find_masks as by_name
 
@@ -90,6 +90,43 @@ def lay_out_masks(
             shares[fact["stem"]] = round(float((mask > 0).mean()), 4)
         write_png(folder / "masks" / f"{fact['work_name']}.png", mask)
     return {"kept_share": shares, "alpha": sorted(alpha)}
+
+
+def add_fixed(
+    folder: Path,
+    facts: list[ScreenedPhoto],
+    matches: Path,
+    fixed: list[FixedMask],
+    before: Path | None,
+    shares: Mapping[str, float],
+) -> dict[str, float]:
+    """Write every photo's mask less what is fixed to the camera to `folder/masks/<work name>.png`.
+
+    Args:
+        folder: folder of the stage, empty.
+        facts: screened photos.
+        matches: folder of the fixed masks.
+        fixed: fixed masks.
+        before: folder of the masks so far, as `lay_out_masks` writes them; None: there are none.
+        shares: stem -> share that these keep.
+
+    Returns:
+        stem -> share that is kept, of photos with a mask.
+    """
+    (folder / "masks").mkdir()
+    kept, fixed_masks = dict(shares), {}
+    for record in fixed:
+        fixed_masks.update(dict.fromkeys(record["photos"], read_gray(matches / record["mask"])))
+    for fact in facts:
+        name = fact["work_name"]
+        mask = read_gray(before / f"{name}.png") if before else None
+        if name in fixed_masks:
+            mask = fixed_masks[name] if mask is None else np.minimum(mask, fixed_masks[name])
+            kept[fact["stem"]] = round(float((mask > 0).mean()), 4)
+        if mask is None:
+            mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
+        write_png(folder / "masks" / f"{name}.png", mask)
+    return kept
 
 
 def mask_warnings(facts: MaskResult | None) -> list[str]:

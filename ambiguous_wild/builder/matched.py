@@ -71,6 +71,17 @@ class Matched:
         cameras = {camera.camera_id: copy.deepcopy(camera) for camera in self.cameras}
         return replace(self, cameras=[cameras[camera.camera_id] for camera in self.cameras])
 
+    def replace_matches(self, database: Path, matches: Mapping[Pair, np.ndarray]) -> None:
+        """Replace the matches [K, 2] of some pairs in the database."""
+        db = pycolmap.Database.open(str(database))
+        try:
+            with pycolmap.DatabaseTransaction(db):
+                for (a, b), rows in matches.items():
+                    db.delete_matches(self.ids[a], self.ids[b])
+                    db.write_matches(self.ids[a], self.ids[b], np.ascontiguousarray(rows, np.uint32))
+        finally:
+            db.close()
+
     def rays(self) -> list[np.ndarray]:
         """Return the features of every photo as x / z and y / z, [N, 2], by its present camera."""
         return [

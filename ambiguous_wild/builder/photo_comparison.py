@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+
+from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
 
 SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 1000
@@ -47,6 +49,7 @@ class PhotoComparison:
     partners: np.ndarray  # [N] int, number of photos that overlap with it
     group: np.ndarray  # [N] int, connected groups of overlapping photos; 0 is the largest
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
+    fixed: list[FixedArea]  # fixed to the camera; its features are not compared
 
 
 def photo_features(
@@ -103,13 +106,21 @@ def compare_photos(
     jobs: int = 1,  # threads; the result does not depend on it
 ) -> PhotoComparison:
     """Match each photo with the next and the most similar ones; solve for one offset a photo."""
+    ordered = candidate_pairs(features)
+    with ThreadPoolExecutor(jobs) as pool:
+        matches = dict(zip(ordered, pool.map(lambda pair: _raw_matches(features, pair), ordered)))
+    sizes = [f.size for f in features]
+    fixed = find_fixed([f.xy for f in features], sizes, [0] * len(features), matches)
+    if fixed:
+        features = _without(features, fixed)
+        matches = {pair: _raw_matches(features, pair) for pair in ordered}
     count = len(features)
     graph = np.zeros((count, count), bool)
     rows: list[tuple[int, int, np.ndarray, float]] = []
     forward: list[bool] = []
 
     def matched(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
-        matching = _match(features[pair[0]], features[pair[1]])
+        matching = _match(features, pair, matches[pair])
         step()
         return matching
 
@@ -123,8 +134,7 @@ def compare_photos(
         if good.sum() >= MIN_INLIERS // 2:
             rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
 
-    tried = set(candidate_pairs(features))
-    ordered = sorted(tried)
+    tried = set(ordered)
     # OpenCV keeps random numbers per thread, and each match seeds them: the result is deterministic.
     with ThreadPoolExecutor(jobs) as pool:
         for (i, j), inliers in zip(ordered, pool.map(matched, ordered)):
@@ -135,9 +145,9 @@ def compare_photos(
         for j in most_similar(features, i, EXTRA_CANDIDATES):
             if (pair := (min(i, j), max(i, j))) not in tried:
                 tried.add(pair)
-                enter(*pair, _match(features[pair[0]], features[pair[1]]))
+                enter(*pair, _match(features, pair, _raw_matches(features, pair)))
     share = float(np.mean(forward)) if forward else math.nan
-    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share)
+    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share, fixed)
 
 
 def is_forward(
@@ -179,11 +189,34 @@ def most_similar(features: Sequence[PhotoFeatures], index: int, most: int) -> li
     return [int(j) for j in np.argsort(-alike, kind="stable") if j != index][:most]
 
 
-def _match(a: PhotoFeatures, b: PhotoFeatures) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the indices of matching features in each photo; None where the photos do not overlap."""
+def _without(features: Sequence[PhotoFeatures], fixed: Sequence[FixedArea]) -> list[PhotoFeatures]:
+    """Return the photos without the features of what is fixed to the camera."""
+    seen = list(features)
+    for area in fixed:
+        for k in area.photos:
+            rest = ~area.covers(seen[k].xy)
+            parts = {name: getattr(seen[k], name)[rest] for name in ("xy", "descriptors", "values")}
+            seen[k] = replace(seen[k], **parts)
+    return seen
+
+
+def _raw_matches(
+    features: Sequence[PhotoFeatures], pair: tuple[int, int]
+) -> np.ndarray:  # [K, 2] features of the pair's photos
+    """Match two photos, without a check of the geometry; both need `MIN_INLIERS` features."""
+    a, b = (features[k] for k in pair)
     if min(len(a.xy), len(b.xy)) < MIN_INLIERS:
-        return None
-    one, two = _ratio_matches(a.descriptors, b.descriptors)
+        return np.zeros((0, 2), int)
+    return np.column_stack(_ratio_matches(a.descriptors, b.descriptors))
+
+
+def _match(
+    features: Sequence[PhotoFeatures],
+    pair: tuple[int, int],
+    matches: np.ndarray,  # of `_raw_matches`
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the indices of matching features in each photo; None where the photos do not overlap."""
+    (a, b), (one, two) = (features[k] for k in pair), matches.T
     if len(one) < MIN_INLIERS:
         return None
     cv2.setRNGSeed(0)

@@ -246,7 +246,7 @@ class Placement:
         front = local[:, 2] > 0
         pixels = np.asarray(self.matched.cameras[photo].img_from_cam(local[front])).reshape(-1, 2)
         off = np.linalg.norm(pixels - self.matched.features[photo][features[front]], axis=1)
-        return np.count_nonzero(off < RESECTION_PX) >= LEAST_POINTS
+        return bool(np.count_nonzero(off < RESECTION_PX) >= LEAST_POINTS)
 
     def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
         """Collect placed partners' evidence for a place; a partner agrees if one of its motions fits."""

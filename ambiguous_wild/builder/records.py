@@ -88,6 +88,22 @@ class FeatureResult(TypedDict):
     features: dict[str, int]  # work name -> number
 
 
+class FixedRecord(TypedDict):
+    """What stands still in all photos of one camera and size while the rest moves."""
+
+    photos: list[str]  # photos that it is masked in: work names; sources in scene.json
+    width: int  # px, of these photos
+    height: int  # px
+    share: float  # of the photo
+    where: str  # "lower", "upper right", ...; see `FixedArea.where`
+
+
+class FixedMask(FixedRecord):
+    """`FixedRecord` with its keep mask."""
+
+    mask: str  # file in the folder of the stage `matches`
+
+
 class MatchResult(TypedDict):
     """Result of the stage `matches`."""
 
@@ -95,6 +111,7 @@ class MatchResult(TypedDict):
     pairs: int  # pairs tried
     verified: int  # pairs with a motion that other pairs confirm
     planar: int  # verified pairs whose matches lie on one plane
+    fixed: list[FixedMask]  # fixed to the camera; none of its features is matched
 
 
 class ModelSummary(TypedDict):
@@ -232,6 +249,7 @@ class BuildRecord(TypedDict):
     warnings: list[str]
     photos: dict[str, ScenePhoto]
     masks: MaskResult | None
+    fixed_to_camera: list[FixedRecord]
     truth: dict[str, int] | None
 
 

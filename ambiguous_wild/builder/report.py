@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
+from ambiguous_wild.builder.fixed_to_camera import words_of
 from ambiguous_wild.builder.records import (
     BuildInputs,
     BuildRecord,
     CameraFact,
     ExifRecord,
     FeatureResult,
+    FixedMask,
+    FixedRecord,
     LostPhoto,
     MappingResult,
     MaskResult,
@@ -29,7 +32,7 @@ from ambiguous_wild.builder.records import (
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import exif_focal
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.io.colmap_records import Model
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
@@ -53,6 +56,7 @@ def scene_record(
     truth: dict[str, int] | None,
     motion: MotionResult,
     masks: MaskResult | None,
+    fixed: Sequence[FixedMask],
     warnings: list[str],
 ) -> BuildRecord:
     """Assemble scene.json without its files, inputs and timings."""
@@ -110,6 +114,16 @@ def scene_record(
             f"{f['stem']}.png": _photo(f, sides, features["features"], mapping["partners"]) for f in facts
         },
         "masks": masks,
+        "fixed_to_camera": [
+            {
+                "photos": [sources[name] for name in area["photos"]],
+                "width": area["width"],
+                "height": area["height"],
+                "share": area["share"],
+                "where": area["where"],
+            }
+            for area in fixed
+        ],
         "truth": truth,
     }
 
@@ -166,7 +180,21 @@ def summary_lines(info: SceneRecord) -> list[str]:
     if info["lost"]:
         reasons = shortlist([f"{p['source']} ({p['reason']})" for p in info["lost"]], 4)
         lines.append(f"{len(info['lost'])} not placed: {reasons}")
+    lines += fixed_lines(info["fixed_to_camera"])
     return lines + [f"warning: {w}" for w in info["warnings"]]
+
+
+def fixed_lines(fixed: Sequence[FixedRecord]) -> list[str]:
+    """Return a line for each mask of something that is fixed to the camera."""
+    lines = []
+    for area in fixed:
+        what = words_of(area["share"], area["where"])
+        what += f" of {area['width']}x{area['height']}" if len(fixed) > 1 else ""
+        masked = counted(len(area["photos"]), "photo")
+        lines.append(
+            f"{what} stands still while the rest moves (bonnet, rig or watermark?): masked in {masked}"
+        )
+    return lines
 
 
 def sfm_share(info: SceneRecord) -> float:

@@ -16,6 +16,7 @@ from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NotRequired, TypedDict, cast
 
+from ambiguous_wild.builder.fixed_to_camera import FIXED
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     FeatureResult,
@@ -67,6 +68,7 @@ class MatchJob(TypedDict):
     only: list[str] | None  # names that look for partners; None: all
     focals: dict[str, float] | None  # name -> EXIF focal length over the longer side; None: poses are known
     earlier: str | None  # file of the pairs that are matched already
+    photos: str | None  # folder; None: what is fixed to the camera stays matched
     seed: int
     jobs: int
     parent: NotRequired[int]
@@ -237,6 +239,7 @@ def match(
     earlier: Path | None = None,
     left_out: Sequence[str] | None = None,
     posed: bool = False,
+    photos: Path | None = None,
 ) -> MatchResult:
     """Match pairs, and find the motions that they show.
 
@@ -251,6 +254,7 @@ def match(
         earlier: folder of an earlier result whose pairs are kept.
         left_out: work names of the photos that look for partners; None: all.
         posed: the poses are known, so pairs are matched only.
+        photos: folder of the photos, to take out what is fixed to the camera; None: it stays matched.
     """
     matcher = plan.matcher
     database = folder / DATABASE
@@ -272,6 +276,7 @@ def match(
         "only": list(left_out) if left_out is not None else None,
         "focals": None if posed else {f["work_name"]: x for f in facts if (x := exif_focal(f)) is not None},
         "earlier": str(earlier / PAIRS) if earlier else None,
+        "photos": str(photos) if photos else None,
         "seed": settings.seed,
         "jobs": jobs,
     }
@@ -279,7 +284,8 @@ def match(
     bar.finish()
     pairs = every if matcher == "exhaustive" else len(listed.read_text(encoding="utf-8").splitlines())
     counts = {"verified": 0, "planar": 0} if posed else json.loads((folder / "pairs.json").read_text())
-    return cast(MatchResult, {"matcher": matcher, "pairs": pairs, **counts})
+    fixed = json.loads((folder / FIXED).read_text(encoding="utf-8")) if photos else []
+    return cast(MatchResult, {"matcher": matcher, "pairs": pairs, **counts, "fixed": fixed})
 
 
 def map_scene(

@@ -28,10 +28,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ambiguous_wild.builder.fixed_to_camera import FIXED, FixedArea, find_fixed, moving_matches
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.parts import join
 from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
-from ambiguous_wild.builder.records import ModelSummary
+from ambiguous_wild.builder.records import FixedMask, ModelSummary
 from ambiguous_wild.builder.retrieval import (
     MOTIONS,
     PAIRS,
@@ -49,6 +50,7 @@ from ambiguous_wild.builder.sfm import (
     TriangulationJob,
 )
 from ambiguous_wild.io.files import write_json
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PEAK, EDGE, LEVELS, BLUR = 0.02, 10.0, 3, 1.6
@@ -210,12 +212,54 @@ def run_matches(job: MatchJob) -> None:
     if job["focals"] is None:  # poses are known: triangulation takes the matches that fit them
         return
     matched = Matched.read(database)
+    if job["photos"] and _take_out_fixed(job, matched):
+        matched = Matched.read(database)
     matched.find_focals(job["focals"], job["jobs"])
     agreed = matched.find_motions(job["jobs"])
     matched.write_agreed(database, agreed)
     matched.save_motions(database.with_name(MOTIONS))
     planar = [len(matched.motions[pair][number].rotations) > 1 for pair, (number, _) in agreed.items()]
     write_json(database.with_name("pairs.json"), {"verified": len(agreed), "planar": sum(planar)})
+
+
+def _take_out_fixed(job: MatchJob, matched: Matched) -> bool:
+    """Remove the matches of what is fixed to the camera from the database; tell whether there was any.
+
+    Writes `FIXED` and the keep masks beside the database. What an earlier attempt found stays.
+    """
+    database, photos = Path(job["database"]), Path(str(job["photos"]))
+    earlier = Path(job["earlier"]).parent if job["earlier"] else None
+    numbers = {name: k for k, name in enumerate(matched.names)}
+    records: list[FixedMask] = []
+    if earlier is not None:
+        records = json.loads((earlier / FIXED).read_text(encoding="utf-8"))
+    if earlier is not None and records:
+        areas = []
+        for record in records:
+            shutil.copyfile(earlier / record["mask"], database.with_name(record["mask"]))
+            covered = read_gray(earlier / record["mask"]) == 0
+            size = (record["width"], record["height"])
+            areas.append(FixedArea(size, [numbers[name] for name in record["photos"]], covered))
+    else:
+
+        def read(photo: int) -> np.ndarray:
+            return cv2.cvtColor(read_png_rgb(photos / matched.names[photo]), cv2.COLOR_RGB2GRAY)
+
+        sizes = [(camera.width, camera.height) for camera in matched.cameras]
+        cameras = [camera.camera_id for camera in matched.cameras]
+        areas = find_fixed(matched.features, sizes, cameras, matched.matches, read)
+        tests = {numbers[name] for name in job["test_names"]}
+        areas = [
+            area.without(k for k in area.photos if k in tests and not area.shown_by(read(k)))
+            for area in areas
+        ]
+        for number, area in enumerate(areas):
+            records.append(area.record(matched.names, f"fixed-{number}.png"))
+            write_png(database.with_name(records[-1]["mask"]), area.keep_mask())
+    write_json(database.with_name(FIXED), records)
+    if areas:
+        matched.replace_matches(database, moving_matches(matched.features, matched.matches, areas))
+    return bool(areas)
 
 
 def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:

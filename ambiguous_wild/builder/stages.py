@@ -18,7 +18,14 @@ import numpy as np
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, read_test_list, split_photos
 from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
-from ambiguous_wild.builder.masks import alphas, find_masks, lay_out_masks, mask_hashes, mask_warnings
+from ambiguous_wild.builder.masks import (
+    add_fixed,
+    alphas,
+    find_masks,
+    lay_out_masks,
+    mask_hashes,
+    mask_warnings,
+)
 from ambiguous_wild.builder.moving import write_motion
 from ambiguous_wild.builder.package import SceneParts, package
 from ambiguous_wild.builder.progress import Bar
@@ -256,6 +263,7 @@ class Stages:
         registered = {stems[i.name] for i in model.images.values()}
         check_factor(settings.factor or 1, [s for s in sides if stems[s[1]] in registered])
         train, test, how, split_warnings = split_photos(facts, registered, tests)
+        mask_stage = self._fixed_masks(work, screened, mask_stage, matches)
         flat = self._undistort(work, screened, mask_stage, mapping, model)
         motion = work.run(
             "motion",
@@ -292,6 +300,7 @@ class Stages:
             truth=flat.facts["truth"],
             motion=motion.facts,
             masks=mask_stage.facts if mask_stage else None,
+            fixed=matches.facts["fixed"],
             warnings=[*mask_warnings(mask_stage.facts if mask_stage else None), *split_warnings],
         )
         record: KeyedRecord = {
@@ -338,6 +347,26 @@ class Stages:
         key = [screened.key, mask_hashes(mask_files)]
         return work.run("masks", key, lambda f: lay_out_masks(f, mask_files, facts, alpha))
 
+    def _fixed_masks(
+        self,
+        work: Workspace,
+        screened: StageResult[ScreenResult],
+        masks: StageResult[MaskResult] | None,
+        matches: StageResult[MatchResult],
+    ) -> StageResult[MaskResult] | None:
+        """Add what is fixed to the camera to the masks; without it they stay as they are."""
+        fixed = matches.facts["fixed"]
+        if not fixed:
+            return masks
+        before, facts = masks.folder / "masks" if masks else None, screened.facts["photos"]
+        old: MaskResult = masks.facts if masks else {"kept_share": {}, "alpha": []}
+
+        def add(folder: Path) -> MaskResult:
+            shares = add_fixed(folder, facts, matches.folder, fixed, before, old["kept_share"])
+            return {"kept_share": shares, "alpha": old["alpha"]}
+
+        return work.run("fixed-masks", [matches.key, masks and masks.key], add)
+
     def _sfm(
         self,
         work: Workspace,
@@ -364,7 +393,7 @@ class Stages:
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
             best.matches.facts,
-            [*panorama_warnings(facts), *used],
+            [*panorama_warnings(facts), *used, *report.fixed_lines(best.matches.facts["fixed"])],
         )
         return best
 
@@ -397,7 +426,7 @@ class Stages:
              left_out, settings.seed],
             lambda f: match(
                 f, features.folder, facts, settings, plan, self.jobs, self.bar,
-                earlier.matches.folder if earlier else None, left_out,
+                earlier.matches.folder if earlier else None, left_out, photos=photos,
             ),
         )  # fmt: skip
         mapping = work.run(

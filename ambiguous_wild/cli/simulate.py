@@ -129,10 +129,13 @@ def simulate_command(
     state = "already there, unchanged" if facts["reused"] else "wrote"
     things = counted(len(spec.distractors), "distractor")
     cover = "covers" if len(spec.distractors) == 1 else "cover"
+    if spec.fixed:
+        things = f"{things} and a {spec.fixed}" if spec.distractors else f"a {spec.fixed}"
+        cover = "cover" if spec.distractors else "covers"
     covered = f"{things} {cover} {_range(facts['occlusion'])} of a train photo"
     click.echo(
         f"{state}: {output}: {spec.train_views} train and {spec.test_views} test photos of "
-        f"{spec.width}x{spec.height}; {covered if spec.distractors else 'no distractors'}"
+        f"{spec.width}x{spec.height}; {covered if spec.distractors or spec.fixed else 'no distractors'}"
     )
     effects = list(plain_spec(spec)["effects"])
     if effects:
@@ -205,6 +208,11 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
     show_default=True,
     help="Darkness of the shadows: 0 none, 1 black. Scenes only.",
 )
+@click.option(
+    "--fixed",
+    type=click.Choice(["bonnet", "stamp"]),
+    help="Fixed to the camera: the same in all photos, test photos too. Plain photos only.",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 @click.pass_context
@@ -254,9 +262,10 @@ def composite_command(
     place = shlex.quote(str(output))
     if plain:
         changed = sum(bool(photo["distractors"]) for photo in train.values())
+        fixed = f", a {config.fixed} in all photos" if config.fixed else ""
         click.echo(
-            f"wrote: {output}: {len(train)} train photos, {changed} of them with distractors; distractors cover {shares}; "
-            f"{facts['source']['photos'] - len(train)} test photos"
+            f"wrote: {output}: {len(train)} train photos, {changed} of them with distractors{fixed}; distractors cover "
+            f"{shares}; {facts['source']['photos'] - len(train)} test photos"
         )
         click.echo(f"next: aw build-scene {place} -o SCENE")
         return

@@ -1,9 +1,9 @@
 """Add distractors to plain photos, before structure from motion: write a raw capture with the truth.
 
 RAW/train/<stem>.jpg                quality 95, upright; some with distractors
-RAW/test/<stem>.jpg                 every sixth photo, without distractors
-RAW/truth/distractor/<stem>.png     of train photos: 255 where a distractor is, else 0
-RAW/truth/clean/<stem>.png          the original train photo
+RAW/test/<stem>.jpg                 every sixth photo, without distractors that move
+RAW/truth/distractor/<stem>.png     of changed photos and train photos: 255 where a distractor is, else 0
+RAW/truth/clean/<stem>.png          the original of these photos
 RAW/truth/composite.json            config, cut-outs with sha256; per photo source, pieces and coverage
 """
 
@@ -37,8 +37,10 @@ from ambiguous_wild.simulate.cutouts import (
     read_cutouts,
     truth,
 )
+from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
 from ambiguous_wild.simulate.placement import CompositeConfig, natural_heights
 from ambiguous_wild.simulate.records import Spread, spread
+from ambiguous_wild.simulate.tracer import srgb_to_linear
 
 _TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos
 _MOST_PIECES = 3  # largest number of pieces in a photo
@@ -115,8 +117,9 @@ def composite_photos(
     Args:
         source: folder of at least six photos without distractors; every sixth becomes a test photo.
         output: the folder to write; it appears complete or not at all.
-        config: only coverage, presence (share of train photos with distractors), patches and seed are used.
-        cutouts: folder of PNG files with alpha; may be None with ``config.patches``.
+        config: only coverage, presence (share of train photos with distractors), patches, fixed and seed are
+            used.
+        cutouts: folder of PNG files with alpha; may be None with ``config.patches`` or ``config.fixed``.
         progress: wraps the photos, for a bar.
 
     Raises:
@@ -137,27 +140,34 @@ def composite_photos(
     choice_seed, *seeds = np.random.SeedSequence(config.seed).spawn(1 + len(paths))
     order = np.random.default_rng(choice_seed).permutation(len(train))
     chosen = {train[i] for i in order[: max(1, round(config.presence * len(train)))]}
+    if cutouts is None and not config.patches:
+        chosen = set()
     photos: dict[str, PastedPhoto] = {}
     with atomic_dir(target, replace=False) as folder:
         for part in ("train", "test"):
             (folder / part).mkdir()
-        for path, test, seed in zip(progress(paths), is_test, seeds, strict=True):
+        for number, (path, test, seed) in enumerate(zip(progress(paths), is_test, seeds, strict=True)):
             (clean, exif), own = _read(path), path.relative_to(base).with_suffix(".png")
             name = own.with_suffix(".jpg").as_posix()
-            if test:
+            if test and config.fixed is None:
                 _write_jpeg(folder / "test" / name, clean, exif)
                 continue
-            changed, mask, pieces = clean, np.zeros(clean.shape[:2], np.uint8), list[PastedPiece]()
+            over, pieces = np.zeros((*clean.shape[:2], 4), np.float32), list[PastedPiece]()
             if path in chosen:
                 rng = np.random.default_rng(seed)
                 cover = float(mean * rng.uniform(*_SPREAD))
                 others = [p for p in train if p != path]
-                drawn = _draw(shapes, others, cover * mask.size, config.patches, rng)
+                area = cover * clean.shape[0] * clean.shape[1]
+                drawn = _draw(shapes, others, area, config.patches, rng)
                 over, pieces = _layer(drawn, clean.shape, cover, rng)
-                changed, mask = composed(clean, over), truth(over)
-            _write_jpeg(folder / "train" / name, changed, exif)
+            if config.fixed is not None:
+                over = _with_fixed(config.fixed, clean, over, number, config.seed)
+            changed, mask = composed(clean, over), truth(over)
+            _write_jpeg(folder / ("test" if test else "train") / name, changed, exif)
             write_png(folder / "truth" / "clean" / own, clean)
             write_png(folder / "truth" / "distractor" / own, mask)
+            if test:
+                continue
             share, sha256 = round(float((mask > 0).mean()), 6), sha256_file(path)
             source_ = path.relative_to(base).as_posix()
             photos[name] = PastedPhoto(source=source_, sha256=sha256, occlusion=share, distractors=pieces)
@@ -174,6 +184,20 @@ def composite_photos(
         }
         write_json(folder / "truth" / "composite.json", facts)
     return facts
+
+
+def _with_fixed(
+    thing: FixedThing,
+    photo: np.ndarray,  # [H, W, 3] uint8, sRGB
+    moving: np.ndarray,  # [H, W, 4] float32, the photo's other distractors
+    number: int,
+    seed: int,
+) -> np.ndarray:
+    """Lay what is fixed to the camera over the other distractors."""
+    light = srgb_to_linear(composed(photo, moving).astype(np.float32) / 255)
+    top = fixed_layer(thing, light, number, seed)
+    top[top[..., 3] < TRUTH_COVER] = 0  # as of the others
+    return laid_over(top, moving)
 
 
 def _base(root: Path) -> Path:

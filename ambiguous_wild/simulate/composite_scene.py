@@ -128,6 +128,11 @@ def composite(
     root, target = Path(source), Path(output)
     name = check_name("scene name (the folder's)", target.resolve().name)
     check_request(root, target, config, cutouts)
+    if config.fixed is not None:
+        raise AwError(
+            f"--fixed is for plain photos, and {root} is a scene, whose poses were found without; give "
+            "the folder of its original photos"
+        )
     shape_rng, place_rng, patch_rng = (
         np.random.default_rng(s) for s in np.random.SeedSequence(config.seed).spawn(3)
     )
@@ -151,8 +156,11 @@ def check_request(root: Path, target: Path, config: CompositeConfig, cutouts: Pa
         raise AwError(f"{target} and {root} lie inside each other; choose another folder for -o")
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise AwError(f"{target} exists; remove it or choose another folder for -o")
-    if cutouts is None and not config.patches:
-        raise AwError("no distractors are given: pass --cutouts FOLDER of PNG files with alpha, or --patches")
+    if cutouts is None and not config.patches and config.fixed is None:
+        raise AwError(
+            "no distractors are given: pass --cutouts FOLDER of PNG files with alpha, --patches, or (plain "
+            "photos) --fixed"
+        )
 
 
 def _check_scene(scene: Scene) -> None:

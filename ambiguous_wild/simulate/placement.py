@@ -23,6 +23,7 @@ from ambiguous_wild.simulate.cutouts import (
     layer,
     project,
 )
+from ambiguous_wild.simulate.fixed_things import FixedThing
 
 _DRAWS = 24  # positions drawn for a cut-out, of which the best is taken
 _NEARER = (0.90, 0.98)  # depth of the cut-out relative to that of the point behind it
@@ -43,6 +44,7 @@ class CompositeConfig:
     pose: Literal["standing", "lying"] = "standing"  # upright; or seen from above, at any angle
     shadow: float = 0.0  # 0 (none) to 1 (black)
     patches: bool = False  # fill the shapes with the scene's own texture
+    fixed: FixedThing | None = None  # fixed to the camera, in all photos, test photos too; plain photos only
     seed: int = 0
 
     def check(self) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import image_effects as fx
 from ambiguous_wild.simulate.distractors import Placement, movers
+from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
 from ambiguous_wild.simulate.records import DrawnEffects
@@ -29,6 +30,7 @@ from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, linea
 from ambiguous_wild.simulate.world import World
 
 _MAX_INSTANTS = 24  # largest number of instants of an exposure
+FIXED = 255  # number of what is fixed to the camera, as owner of a pixel
 ImageFilter = Callable[[np.ndarray], np.ndarray]
 
 
@@ -48,7 +50,7 @@ class RenderedPhoto:
 
     photo: np.ndarray  # [H, W, 3] uint8, as stored
     clean: np.ndarray  # [H, W, 3] uint8, without distractors and moving shadow, before JPEG
-    owner: np.ndarray  # [H, W] uint8: number of the first distractor in the pixel, 0 = none
+    owner: np.ndarray  # [H, W] uint8: number of the first distractor in the pixel, 0 = none; or `FIXED`
     shadow: np.ndarray | None  # [H, W] bool: darkened by a moving shadow; None: no such effect
     effects: DrawnEffects
 
@@ -70,6 +72,7 @@ class PreparedPhoto:
     scene: _LitScene
     camera: Camera  # for the rays; finer and larger than the photo's if an effect moves pixels
     distractors: ShapeTable
+    fixed: FixedThing | None  # fixed to the camera
     move: ImageFilter | None  # effects that move pixels
     drawn: DrawnEffects  # random values of the effects so far
 
@@ -83,7 +86,8 @@ def prepare_photo(
     scene = _lit(effects, world, random, drawn)
     move, camera, light = _optics(effects, planned.camera, scene.light, random, drawn)
     distractors = movers(spec, planned.placements, world)
-    return PreparedPhoto(effects, replace(scene, light=light), camera, distractors, move, drawn)
+    fixed = spec.fixed if planned.split == "train" else None
+    return PreparedPhoto(effects, replace(scene, light=light), camera, distractors, fixed, move, drawn)
 
 
 def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
@@ -100,6 +104,9 @@ def finish_photo(
     """Do the steps after the rays are traced."""
     effects, drawn = prepared.effects, prepared.drawn
     distracted, clean, owner, shadow = _moved(prepared.move, traced)
+    if prepared.fixed is not None:
+        top = fixed_layer(prepared.fixed, distracted, random.number, random.seed)
+        distracted, owner = laid_over(top, distracted), np.where(top[..., 3] > 0, FIXED, owner)
     sensor = _sensor(effects, planned.camera, random, drawn)
     clean_pixels = _to_uint8(sensor(clean))
     pixels = clean_pixels if distracted is clean else _to_uint8(sensor(distracted))

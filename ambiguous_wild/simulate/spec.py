@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ambiguous_wild.simulate.fixed_things import FixedThing
+
 Kind = Literal[
     "visitor",
     "twin",
@@ -229,6 +231,7 @@ class CaptureSpec:
     zoom: tuple[float, float] = (1.0, 1.0)  # range of factors on `focal_35mm`
     world: WorldSpec = field(default_factory=WorldSpec)
     effects: Effects = field(default_factory=Effects)
+    fixed: FixedThing | None = None  # fixed to the camera, in every train photo, on top of `occlusion`
     designed: Designed = field(default_factory=Designed)
 
 

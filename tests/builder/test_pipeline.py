@@ -99,7 +99,7 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
     assert list(info) == [
         "schema", "schema_version", "name", "license", "factor", "images", "split", "seed", "settings",
         "chosen", "counts", "reprojection_error_px", "mean_track_length", "cameras", "lost", "skipped",
-        "warnings", "photos", "masks", "truth", "build_key", "inputs", "seconds", "files",
+        "warnings", "photos", "masks", "fixed_to_camera", "truth", "build_key", "inputs", "seconds", "files",
     ]  # fmt: skip
     assert set(info) == SceneRecord.__required_keys__
     assert list(info["inputs"]) == ["photos", "masks", "truth", "test_list", "settings", "versions"]

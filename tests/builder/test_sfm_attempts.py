@@ -25,7 +25,7 @@ def attempts(monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: in
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
         model = {"images": placed[plan.name], "points": 9999} if placed[plan.name] else None
-        part = SimpleNamespace(folder=Path("nowhere"), facts={"model": model, "plan": plan.name})
+        part = SimpleNamespace(folder=Path("nowhere"), facts={"model": model, "plan": plan.name, "fixed": []})
         return SfmStages(part, part, part)
 
     monkeypatch.setattr(Stages, "_attempt", attempt)

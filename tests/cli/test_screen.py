@@ -28,7 +28,7 @@ def test_the_table_says_what_and_why_and_writes_nothing(raw: Path) -> None:
     done = CliRunner().invoke(command, [str(raw)], catch_exceptions=False)
     assert done.exit_code == 0 and sorted(raw.iterdir()) == before
     assert "1 of 6 photos are left out" in done.stdout and "-> repair or remove them" in done.stdout
-    assert "5 photos: 1 of 10 checks failed" in done.stdout and "\x1b[31mz" not in done.stdout
+    assert "5 photos: 1 of 11 checks failed" in done.stdout and "\x1b[31mz" not in done.stdout
 
 
 def test_json_holds_the_same_and_strict_refuses(raw: Path) -> None:

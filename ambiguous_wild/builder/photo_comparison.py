@@ -47,6 +47,8 @@ class PhotoComparison:
     partners: np.ndarray  # [N] int, number of photos that overlap with it
     group: np.ndarray  # [N] int, connected groups of overlapping photos; 0 is the largest
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
+    # Features that match in two overlapping photos, [M] each.
+    matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
 
 
 def photo_features(
@@ -105,6 +107,7 @@ def compare_photos(
     """Match each photo with the next and the most similar ones; solve for one offset a photo."""
     count = len(features)
     graph = np.zeros((count, count), bool)
+    matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
     rows: list[tuple[int, int, np.ndarray, float]] = []
     forward: list[bool] = []
 
@@ -117,6 +120,7 @@ def compare_photos(
         if inliers is None:
             return
         graph[i, j] = graph[j, i] = True
+        matches[i, j] = inliers
         forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]], features[i].size))
         difference = features[i].values[inliers[0]] - features[j].values[inliers[1]]
         good = np.isfinite(difference).all(axis=1)
@@ -137,7 +141,7 @@ def compare_photos(
                 tried.add(pair)
                 enter(*pair, _match(features[pair[0]], features[pair[1]]))
     share = float(np.mean(forward)) if forward else math.nan
-    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share)
+    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share, matches)
 
 
 def is_forward(

@@ -11,16 +11,17 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
 from ambiguous_wild.builder.growth import Growth
 from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, lay_out, weakly_held
+from ambiguous_wild.builder.records import MappingResult, MapResult
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
 from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
 
 FILE = "map.png"  # in the scene's folder
 SIZE_PX, PANEL_PX, TITLE_PX = (1300, 860), 380, 40  # of the picture, its side panel and its title
@@ -30,7 +31,10 @@ STRONGEST = 4  # links drawn of each photo, besides the weak ones
 MOST_ADVICE, MOST_LISTED = 7, 8  # sentences at the side
 LONGEST_NAME = 16  # characters
 DOWN = 0.8  # share of the mean viewing direction along the normal of the cameras' plane: nadir photos
-WIDE, THIN = 0.15, 0.4  # smallest and largest ratio of the cameras' second and third axis to that before: a plane
+WIDE, THIN = (
+    0.15,
+    0.4,
+)  # smallest and largest ratio of the cameras' second and third axis to that before: a plane
 LEVEL = 0.3  # length of the mean up direction below which up is unknown
 ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
 
@@ -74,6 +78,19 @@ class CaptureMap:
     posed: bool = True  # positions are those of the cameras
 
 
+def draw_built(
+    folder: Path,
+    model: Model,
+    mapping: MappingResult,
+    sources: Mapping[str, str],
+    tests: Collection[str],
+) -> MapResult:
+    """Write the map of a built scene into a folder; arguments as in `map_of_model`."""
+    drawn = map_of_model(model, cast(Mapping[str, Any], mapping), sources, tests)
+    write_map(drawn, folder / FILE)
+    return {"advice": drawn.advice}
+
+
 def map_of_model(
     model: Model,  # named by work names
     mapping: Mapping[str, Any],  # `MappingResult`; what it lacks is not drawn
@@ -104,14 +121,12 @@ def map_of_model(
     links = _links(mapping.get("links", ()), at)
     other_parts = [part for part in mapping.get("parts", ()) if not at.keys() & set(part)]
     elsewhere = {name for part in other_parts for name in part}
-    left_out = {
-        name: reason for name, reason in mapping["left_out"].items() if name in sources and name not in elsewhere
-    }
+    left_out = {name: why for name, why in mapping["left_out"].items() if name in sources.keys() - elsewhere}
     order = {name: k for k, name in enumerate(sources)}
     result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, seen from above", photos, [], [], [])
     result = _with_links(result, links)
     for part in other_parts:
-        members = sorted((order[name] for name in part if name in order))
+        members = sorted(order[name] for name in part if name in order)
         if not members:
             continue
         every = list(sources)
@@ -306,14 +321,14 @@ def _size(xy: np.ndarray) -> float:
     return float(np.ptp(xy, axis=0).max()) or 1.0 if len(xy) else 1.0
 
 
-WIDEST = 1.8  # size of the map in sizes of the cameras' box: far points are cut off
-CORE = (5, 95)  # percentiles of the backdrop's positions that are shown if they fit
+WIDEST = 1.5  # size of the map in sizes of the cameras' box: far points are cut off
+CORE = (10, 90)  # percentiles of the backdrop's positions that are shown if they fit
 MARGIN = 0.08  # of the map's size
 FONT_PX, NAME_PX = 12.0, 11.0
 CHARACTER, DIGIT = 0.56, 0.66  # mean width of a character of a sentence and of a name, of the font's size
 CAMERA_PX, OPENING_DEG = 8.0, 50.0  # diameter of a camera's dot, and angle of its wedge
 SHORT_PX, WEDGE_PX = 12.0, 24.0  # length of a wedge where cameras are close together, and elsewhere
-BULGE = 0.12  # of a link: links along a straight path would hide each other
+BULGE = 0.2  # of a link, of its length: links along a straight path would hide each other
 # Positions of a name around its camera, in the order in which they are tried.
 AROUND = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 WEAK_COLOUR, STAR_COLOUR, LINK_COLOUR = (200, 20, 110), CATEGORIES[4], (120, 130, 150)
@@ -355,7 +370,8 @@ def place_names(
         wide, high = DIGIT * NAME_PX * len(names[photo]), NAME_PX
         for right, up in AROUND:
             middle = xy[photo] + [right * (half + 3 + wide / 2), up * (half + 3 + high / 2)]
-            box = np.array([*(middle - [wide / 2, high / 2]), *(middle + [wide / 2, high / 2])])
+            half_size = np.array([wide, high]) / 2
+            box = np.concatenate([middle - half_size, middle + half_size])
             if box[0] < 0 or box[1] < 0 or box[2] > size[0] or box[3] > size[1]:
                 continue
             others = np.concatenate(taken)
@@ -409,8 +425,10 @@ def _draw_map(axes: Any, drawn: CaptureMap, size: tuple[int, int]) -> None:
         axes.scatter(*to_px(drawn.points).T, s=2.5, c=faded, linewidths=0, zorder=0)
     xy = to_px([photo.xy for photo in drawn.photos])
     most = max((link.matches for link in drawn.links), default=1)
+    half_way = np.median(xy, axis=0)
     for link in drawn.links:
-        _draw_link(axes, link.kind, xy[list(link.ends)], 0.6 + 3.4 * np.sqrt(link.matches / max(most, 1)))
+        width = 0.6 + 3.4 * np.sqrt(link.matches / max(most, 1))
+        _draw_link(axes, link.kind, xy[list(link.ends)], half_way, width)
     wedge_px = wedge_length(xy)
     for photo, at in zip(drawn.photos, xy):
         _draw_camera(axes, photo, at, wedge_px)
@@ -422,17 +440,19 @@ def _draw_map(axes: Any, drawn: CaptureMap, size: tuple[int, int]) -> None:
     _draw_names(axes, drawn, xy, to_px(drawn.stars), size)
 
 
-def _draw_link(axes: Any, kind: str, ends: np.ndarray, width: float) -> None:
-    """Draw a link between two positions [2, 2] in px."""
+def _draw_link(axes: Any, kind: str, ends: np.ndarray, middle: np.ndarray, width: float) -> None:
+    """Draw a link between two positions [2, 2] in px, a strong one as an arc towards the middle [2]."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Curve
 
     if kind == "strong":
         along = ends[1] - ends[0]
-        middle = ends.mean(axis=0) + BULGE * np.array([-along[1], along[0]])
-        curve = Curve([ends[0], middle, ends[1]], [Curve.MOVETO, Curve.CURVE3, Curve.CURVE3])
-        colour = (*plot_colour(LINK_COLOUR), 0.4)
-        axes.add_patch(PathPatch(curve, facecolor="none", edgecolor=colour, lw=width, zorder=1))
+        aside = BULGE * np.array([-along[1], along[0]])
+        start = ends.mean(axis=0)
+        top = start + aside * (1 if (middle - start) @ aside >= 0 else -1)
+        curve = Curve([ends[0], top, ends[1]], [Curve.MOVETO, Curve.CURVE3, Curve.CURVE3])
+        faint = (*plot_colour(LINK_COLOUR), 0.4)
+        axes.add_patch(PathPatch(curve, facecolor="none", edgecolor=faint, lw=width, zorder=1))
         return
     colour, dash = (WEAK_COLOUR, "-") if kind == "weak" else (NEUTRAL, "--")
     axes.plot(*ends.T, dash, color=plot_colour(colour), lw=max(width, 1.5), zorder=2)
@@ -450,24 +470,41 @@ def wedge_length(
 
 
 def _draw_camera(axes: Any, photo: MapPhoto, at: np.ndarray, wedge_px: float) -> None:
-    """Draw a dot, with a wedge that opens in the viewing direction; none if that is along the map's normal."""
+    """Draw a dot, with a wedge in the viewing direction unless that is nearly along the map's normal."""
     from matplotlib.patches import Circle, Wedge
 
     colour = plot_colour(COLOURS[photo.kind])
     if photo.unsure:
-        axes.text(*at, "?", color=colour, fontsize=_points(18), ha="center", va="center", weight="bold", zorder=4)
+        axes.text(
+            *at, "?", color=colour, fontsize=_points(18), ha="center", va="center", weight="bold", zorder=4
+        )
         return
     length = float(np.hypot(*photo.heading)) if photo.heading else 0.0
     if photo.heading and length > LEVEL:
         middle = float(np.degrees(np.arctan2(photo.heading[1], photo.heading[0])))
         ends = (middle - OPENING_DEG / 2, middle + OPENING_DEG / 2)
         axes.add_patch(
-            Wedge(at, wedge_px * length, *ends, facecolor=(*colour, 0.3), edgecolor=colour, lw=0.7, zorder=3)
+            Wedge(
+                _pair(at),
+                wedge_px * length,
+                *ends,
+                facecolor=(*colour, 0.3),
+                edgecolor=colour,
+                lw=0.7,
+                zorder=3,
+            )
         )
     hollow = photo.provisional or photo.kind == "left out"
     edge = plot_colour(WEAK_COLOUR) if photo.weak else colour
     axes.add_patch(
-        Circle(at, CAMERA_PX / 2, facecolor="white" if hollow else colour, edgecolor=edge, lw=2.0, zorder=4)
+        Circle(
+            _pair(at),
+            CAMERA_PX / 2,
+            facecolor="white" if hollow else colour,
+            edgecolor=edge,
+            lw=2.0,
+            zorder=4,
+        )
     )
 
 
@@ -499,7 +536,7 @@ def _draw_names(
 def _draw_panel(axes: Any, drawn: CaptureMap) -> None:
     """Draw the legend, the advice and the list of photos that are left out."""
     line = FONT_PX * 1.35
-    top = SIZE_PX[1] - TITLE_PX
+    top = float(SIZE_PX[1] - TITLE_PX)
     for kind, text in _legend(drawn):
         _draw_sample(axes, kind, (22, top - line / 2))
         axes.text(46, top, text, fontsize=_points(FONT_PX), va="top")
@@ -558,6 +595,5 @@ def _draw_sample(axes: Any, kind: str, at: tuple[float, float]) -> None:
         "provisional": MapPhoto("", at, provisional=True),
         "?": MapPhoto("", at, "left out", unsure=True),
         "weak photo": MapPhoto("", at, weak=True),
-        **{name: MapPhoto("", at, name) for name in COLOURS},
-    }[kind]
+    }.get(kind, MapPhoto("", at, cast(Kind, kind)))
     _draw_camera(axes, photo, np.array(at), WEDGE_PX / 1.5)

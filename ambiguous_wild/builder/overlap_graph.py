@@ -106,7 +106,7 @@ def lay_out(
         if len(part) > 1:
             own = _lay_out_part(part, links)
             own -= own.min(axis=0)
-            xy[part] = own + [right, -own[:, 1].max() / 2]
+            xy[part] = own + np.array([right, -own[:, 1].max() / 2])
             right = float(xy[part, 0].max()) + 1.5
     single = [part[0] for part in parts if len(part) == 1]
     low = float(xy[:, 1].min()) - 1.5 if len(single) < count else 0.0

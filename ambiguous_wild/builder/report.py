@@ -10,6 +10,7 @@ from typing import cast
 
 import numpy as np
 
+from ambiguous_wild.builder.capture_map import FILE as MAP
 from ambiguous_wild.builder.records import (
     BuildInputs,
     BuildRecord,
@@ -18,6 +19,7 @@ from ambiguous_wild.builder.records import (
     FeatureResult,
     LostPhoto,
     MappingResult,
+    MapResult,
     MaskResult,
     MatchResult,
     MotionResult,
@@ -235,6 +237,12 @@ def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> li
     if not odd:
         return []
     return [f"focal length of {len(odd)} of {len(cameras)} cameras contradicts EXIF: {shortlist(odd, 2)}"]
+
+
+def map_warnings(result: MapResult) -> list[str]:
+    """Return one warning with the advice of the map, if there is any."""
+    advice = result["advice"]
+    return [f"the capture has weak places, see {MAP}: {shortlist(advice, 2)}"] if advice else []
 
 
 def _parallax_warnings(model: Model) -> list[str]:

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.builder import report
+from ambiguous_wild.builder.capture_map import FILE as MAP
+from ambiguous_wild.builder.capture_map import draw_built
 from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, read_test_list, split_photos
 from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
 from ambiguous_wild.builder.masks import alphas, find_masks, lay_out_masks, mask_hashes, mask_warnings
@@ -269,6 +271,17 @@ class Stages:
                 {work_name: f"{stem}.png" for work_name, stem in stems.items() if f"{stem}.png" in train},
             ),
         )
+        drawn = work.run(
+            "map",
+            [inputs["versions"], mapping.key, test],
+            lambda f: draw_built(
+                f,
+                model,
+                mapping.facts,
+                {fact["work_name"]: fact["source"] for fact in facts},
+                [name for name, stem in stems.items() if f"{stem}.png" in test],
+            ),
+        )
         factor = settings.factor or auto_factor([(f["width"], f["height"]) for f in facts])
         small_key, small_folder = flat.key, None
         if factor > 1:
@@ -292,7 +305,11 @@ class Stages:
             truth=flat.facts["truth"],
             motion=motion.facts,
             masks=mask_stage.facts if mask_stage else None,
-            warnings=[*mask_warnings(mask_stage.facts if mask_stage else None), *split_warnings],
+            warnings=[
+                *mask_warnings(mask_stage.facts if mask_stage else None),
+                *split_warnings,
+                *report.map_warnings(drawn.facts),
+            ],
         )
         record: KeyedRecord = {
             **record_of_build,
@@ -309,6 +326,7 @@ class Stages:
             test,
             [p for p in truth_files if p.is_file()],
             motion.folder / FILE,
+            drawn.folder / MAP,
             [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts["kept_share"]],
         )
         return self._package(work, small_key, parts, record)
@@ -364,7 +382,7 @@ class Stages:
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
             best.matches.facts,
-            [*panorama_warnings(facts), *used],
+            [*panorama_warnings(facts), *used, "'aw screen PHOTOS --map map.png' draws which photos overlap"],
         )
         return best
 

@@ -18,7 +18,7 @@ import numpy as np
 from ambiguous_wild.builder.growth import Growth
 from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, lay_out, weakly_held
 from ambiguous_wild.builder.records import MappingResult, MapResult
-from ambiguous_wild.core.errors import counted, shortlist
+from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
@@ -31,10 +31,9 @@ STRONGEST = 4  # links drawn of each photo, besides the weak ones
 MOST_ADVICE, MOST_LISTED = 7, 8  # sentences at the side
 LONGEST_NAME = 16  # characters
 DOWN = 0.8  # share of the mean viewing direction along the normal of the cameras' plane: nadir photos
-WIDE, THIN = (
-    0.15,
-    0.4,
-)  # smallest and largest ratio of the cameras' second and third axis to that before: a plane
+# Cameras lie in a plane if their second axis is longer than this share of the first, and their third shorter
+# than this share of the second.
+WIDE, THIN = 0.15, 0.4
 LEVEL = 0.3  # length of the mean up direction below which up is unknown
 ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
 
@@ -133,10 +132,8 @@ def map_of_model(
         loose = _links(mapping.get("unplaced_links", ()), order)
         inside, outside = best_join([order[name] for name in names], members, loose)
         pair = (labels[every[inside]], labels[every[outside]])
-        result.listed.append(
-            f"{counted(len(members), 'photo')} of another part: "
-            f"{shortlist([labels[every[k]] for k in members], 3)}"
-        )
+        named = shortlist([labels[every[k]] for k in members], 3)
+        result.listed.append(f"another part, {len(members)} photos: {named}")
         result.advice.insert(0, f"take a photo that shows both {pair[0]} and {pair[1]}, to join the parts")
     result = _with_left_out(result, left_out, mapping, labels, at, plane, size)
     points = model.points.xyz[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
@@ -163,18 +160,39 @@ def map_of_photos(
     ]
     title = f"about {len(main)} of {len(sources)} photos will be placed; near = much overlap, not positions"
     result = _with_links(CaptureMap(title, photos, [], [], [], posed=False), links)
-    for inside, outside in joins(growth, links):
-        result.stars.append(_middle(photos[inside], photos[outside]))
-        result.advice.append(_between(photos[inside], photos[outside]))
-    return replace(result, advice=list(dict.fromkeys(result.advice)))
+    gaps = joins(growth, links)
+    matches = {link[:2]: link[2] for link in links}
+    bridged = [
+        MapLink(pair, matches.get(_sorted(pair), 0), "weak" if _sorted(pair) in matches else "left out")
+        for pair in gaps
+    ]
+    known = {_sorted(pair) for pair in gaps}
+    return replace(
+        result,
+        links=[*(link for link in result.links if _sorted(link.ends) not in known), *bridged],
+        stars=list(dict.fromkeys([*(_middle(photos[a], photos[b]) for a, b in gaps), *result.stars])),
+        advice=list(dict.fromkeys([*(_between(photos[a], photos[b]) for a, b in gaps), *result.advice])),
+        listed=[
+            f"another part, {len(part)} photos: {shortlist([photos[k].name for k in part], 3)}"
+            for part in growth.parts[1:]
+        ]
+        + ([f"of no part: {shortlist([photos[k].name for k in growth.others])}"] if growth.others else []),
+    )
 
 
 def joins(growth: Growth, links: Sequence[Link]) -> list[tuple[int, int]]:
-    """Return pairs of photos between which more photos are needed: one in the main part, one outside it."""
+    """Return pairs of photos between which more photos are needed, so that all parts join the first."""
     if not growth.parts:
         return []
-    main = growth.parts[0]
-    return [best_join(main, outside, links) for outside in [*growth.parts[1:], *([k] for k in growth.others)]]
+    inside, pairs = set(growth.parts[0]), []
+    left = [*growth.parts[1:], *([k] for k in growth.others)]
+    while left:
+        pair = best_join(inside, [photo for part in left for photo in part], links)
+        pairs.append(pair)
+        (joined,) = (part for part in left if pair[1] in part)
+        inside |= set(joined)
+        left.remove(joined)
+    return pairs
 
 
 def between(first: str, second: str) -> str:
@@ -223,7 +241,7 @@ def top_view(
 def _links(rows: Sequence[Sequence[Any]], at: Mapping[str, int]) -> list[Link]:
     """Return links between known photos by index."""
     known = [(at[a], at[b], int(m)) for a, b, m in rows if a in at and b in at]
-    return [(min(a, b), max(a, b), m) for a, b, m in known]
+    return [(*_sorted((a, b)), m) for a, b, m in known]
 
 
 def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
@@ -306,6 +324,10 @@ def _with_left_out(
 
 def _between(first: MapPhoto, second: MapPhoto) -> str:
     return between(first.name, second.name)
+
+
+def _sorted(pair: tuple[int, int]) -> tuple[int, int]:
+    return min(pair), max(pair)
 
 
 def _middle(first: MapPhoto, second: MapPhoto) -> tuple[float, float]:

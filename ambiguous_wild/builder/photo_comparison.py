@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 SIDE = 800  # px, longer side at which photos are compared
-FEATURES = 1000
+FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
 RATIO = 0.8  # Lowe's ratio test
-MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
+MIN_INLIERS = 12  # matches of one epipolar geometry for two photos to overlap
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
 EXTRA_CANDIDATES = 60  # further candidates of a photo that overlaps with none or one of these
@@ -30,7 +30,7 @@ QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue
 
 @dataclass(frozen=True)
 class PhotoFeatures:
-    """Features and colours of one photo, about 150 kB, from which photos are compared."""
+    """Features and colours of one photo, about 300 kB, from which photos are compared."""
 
     size: tuple[int, int]  # width and height at which it is compared, px
     xy: np.ndarray  # [F, 2] float32 px
@@ -45,10 +45,14 @@ class PhotoComparison:
 
     offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
     partners: np.ndarray  # [N] int, number of photos that overlap with it
-    group: np.ndarray  # [N] int, connected groups of overlapping photos; 0 is the largest
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
     # Features that match in two overlapping photos, [M] each.
     matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+
+    @property
+    def links(self) -> list[tuple[int, int, int]]:
+        """Pairs of overlapping photos with the number of their matches."""
+        return [(*pair, len(rows)) for pair, (rows, _) in sorted(self.matches.items())]
 
 
 def photo_features(
@@ -141,7 +145,7 @@ def compare_photos(
                 tried.add(pair)
                 enter(*pair, _match(features[pair[0]], features[pair[1]]))
     share = float(np.mean(forward)) if forward else math.nan
-    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share, matches)
+    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, matches)
 
 
 def is_forward(

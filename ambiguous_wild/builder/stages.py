@@ -382,7 +382,7 @@ class Stages:
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
             best.matches.facts,
-            [*panorama_warnings(facts), *used, "'aw screen PHOTOS --map map.png' draws which photos overlap"],
+            [*panorama_warnings(facts), *used, "'aw screen PHOTOS -o map.png' draws which photos overlap"],
         )
         return best
 

@@ -21,6 +21,7 @@ from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.growth import Growth, predict_growth
 from ambiguous_wild.builder.overlap_graph import Link
 from ambiguous_wild.builder.photo_comparison import (
+    MIN_INLIERS,
     PhotoComparison,
     candidate_pairs,
     compare_photos,
@@ -45,8 +46,8 @@ ISO_RATIO = 2.0  # one stop
 FOCAL_RATIO = 1.01
 SOFT = -0.8  # log2 of fine detail on the same surfaces: a photo below it is softer than the others
 FOCUS_SPREAD = 1.2  # log2, the same percentiles
-# Share of the overlapping pairs that differ by motion along the line of sight: 0.9 in a walk down a street, whose
-# depth is imprecise; 0.58 in internet photos of unequal lenses and below 0.5 in others.
+# Share of the overlapping pairs that differ by motion along the line of sight: 0.9 in a walk down a street,
+# where depth is imprecise; 0.58 in internet photos of unequal lenses and below 0.5 in others.
 FORWARD = 0.8
 
 
@@ -232,10 +233,20 @@ def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison, growth: Gr
     if growth.others:
         finding += "; the others share too few features with two photos at once: "
         finding += shortlist([names[k] for k in growth.others], 3)
-    gaps = [f"{names[a]} and {names[b]}" for a, b in joins(growth, compared.links)]
+    gaps = [f"{names[a]} and {names[b]}" for a, b in joins(growth, overlaps(compared, growth))]
     advice = f"take 2 or 3 photos between {shortlist(gaps, 3)}"
     outside = tuple(names[k] for k in range(count) if k not in main)
     return Check("overlap", "warning", "pixels", finding, advice, outside)
+
+
+def overlaps(compared: PhotoComparison, growth: Growth) -> list[Link]:
+    """Return the pairs of photos that overlap: few matches count only within a part, which confirms them."""
+    part = {photo: number for number, photos in enumerate(growth.parts) for photo in photos}
+    return [
+        (a, b, matches)
+        for a, b, matches in compared.links
+        if matches >= MIN_INLIERS or (a in part and part[a] == part.get(b))
+    ]
 
 
 def motion(compared: PhotoComparison) -> Check:
@@ -323,7 +334,9 @@ def check_capture(
     if read.skipped:
         checks.insert(0, _files_check(read.skipped, len(capture.sources)))
     names = [f["source"] for f in facts]
-    return CaptureReport(capture.root, len(facts), read.skipped, checks, names, compared.links, growth)
+    return CaptureReport(
+        capture.root, len(facts), read.skipped, checks, names, overlaps(compared, growth), growth
+    )
 
 
 def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:

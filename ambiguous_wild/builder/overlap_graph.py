@@ -128,9 +128,8 @@ def _lay_out_part(part: Sequence[int], links: Sequence[Link]) -> np.ndarray:
     apart = shortest_path(coo_array((lengths, ends), (len(part), len(part))).tocsr(), directed=False)
     # Classical scaling is the start: it depends on no random numbers.
     centring = np.eye(len(part)) - 1 / len(part)
-    _, vectors = np.linalg.eigh(-centring @ apart**2 @ centring / 2)
-    xy = vectors[:, :-3:-1] if len(part) > 2 else np.column_stack([vectors[:, -1], np.zeros(len(part))])
-    xy = xy * apart.mean()
+    values, vectors = np.linalg.eigh(-centring @ apart**2 @ centring / 2)
+    xy = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, :-3:-1]
     weights = 1 / np.maximum(apart, 1e-9) ** 2
     np.fill_diagonal(weights, 0.0)
     laplacian = np.diag(weights.sum(axis=1)) - weights

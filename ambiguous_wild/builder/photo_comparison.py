@@ -18,7 +18,10 @@ import numpy as np
 SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
 RATIO = 0.8  # Lowe's ratio test
-MIN_INLIERS = 12  # matches of one epipolar geometry for two photos to overlap
+MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
+# The same for the prediction of growth, where other photos must confirm them. With 16, a walk of 29 photos that
+# COLMAP places whole seems to fall into 24 and 5.
+LEAST_MATCHES = 12
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
 EXTRA_CANDIDATES = 60  # further candidates of a photo that overlaps with none or one of these
@@ -46,12 +49,12 @@ class PhotoComparison:
     offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
     partners: np.ndarray  # [N] int, number of photos that overlap with it
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
-    # Features that match in two overlapping photos, [M] each.
+    # Features that match in two photos, [M] each; at least `LEAST_MATCHES`.
     matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
 
     @property
     def links(self) -> list[tuple[int, int, int]]:
-        """Pairs of overlapping photos with the number of their matches."""
+        """Matched pairs of photos with the number of their matches."""
         return [(*pair, len(rows)) for pair, (rows, _) in sorted(self.matches.items())]
 
 
@@ -123,8 +126,10 @@ def compare_photos(
     def enter(i: int, j: int, inliers: tuple[np.ndarray, np.ndarray] | None) -> None:
         if inliers is None:
             return
-        graph[i, j] = graph[j, i] = True
         matches[i, j] = inliers
+        if len(inliers[0]) < MIN_INLIERS:
+            return
+        graph[i, j] = graph[j, i] = True
         forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]], features[i].size))
         difference = features[i].values[inliers[0]] - features[j].values[inliers[1]]
         good = np.isfinite(difference).all(axis=1)
@@ -188,15 +193,15 @@ def most_similar(features: Sequence[PhotoFeatures], index: int, most: int) -> li
 
 
 def _match(a: PhotoFeatures, b: PhotoFeatures) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the indices of matching features in each photo; None where the photos do not overlap."""
-    if min(len(a.xy), len(b.xy)) < MIN_INLIERS:
+    """Return the indices of matching features in each photo; None where they are too few."""
+    if min(len(a.xy), len(b.xy)) < LEAST_MATCHES:
         return None
     one, two = _ratio_matches(a.descriptors, b.descriptors)
-    if len(one) < MIN_INLIERS:
+    if len(one) < LEAST_MATCHES:
         return None
     cv2.setRNGSeed(0)
     _, inlier = cv2.findFundamentalMat(a.xy[one], b.xy[two], cv2.FM_RANSAC, 2.0, 0.99, 500)
-    if inlier is None or int(inlier.sum()) < MIN_INLIERS:
+    if inlier is None or int(inlier.sum()) < LEAST_MATCHES:
         return None
     keep = inlier.ravel() > 0
     return one[keep], two[keep]

@@ -29,12 +29,13 @@ DPI = 100
 MOST_POINTS = 5000  # of the backdrop
 STRONGEST = 4  # links drawn of each photo, besides the weak ones
 MOST_ADVICE, MOST_LISTED = 7, 8  # sentences at the side
-LONGEST_NAME = 16  # characters
+LONGEST_NAME = 14  # characters
 DOWN = 0.8  # share of the mean viewing direction along the normal of the cameras' plane: nadir photos
 # Cameras lie in a plane if their second axis is longer than this share of the first, and their third shorter
 # than this share of the second.
 WIDE, THIN = 0.15, 0.4
-LEVEL = 0.3  # length of the mean up direction below which up is unknown
+LEVEL = 0.3  # length of the mean up direction below which up is unknown; shorter headings are not drawn
+COMMON = 0.4  # length of the mean heading from which on it is up on the map
 ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
 
 Kind = Literal["train", "test", "part", "left out"]
@@ -201,10 +202,9 @@ def between(first: str, second: str) -> str:
 
 
 def photo_label(source: str) -> str:
-    """Return the name of a photo for the map: without extension, its middle left out if it is long."""
+    """Return the name of a photo for the map: without extension, its beginning left out if it is long."""
     text = "".join(c if c.isprintable() else "?" for c in str(PurePosixPath(source).with_suffix("")))
-    half = LONGEST_NAME // 2
-    return text if len(text) <= LONGEST_NAME else f"{text[: half - 1]}…{text[-half:]}"
+    return text if len(text) <= LONGEST_NAME else f"…{text[1 - LONGEST_NAME :]}"
 
 
 def top_view(
@@ -214,7 +214,8 @@ def top_view(
     """Return the map's axes, right and up, in the world.
 
     The map is perpendicular to the cameras' mean up direction. Nadir photos have no common one: they are seen
-    as from behind the cameras, on the plane in which these lie. The longest axis of the path is horizontal.
+    as from behind the cameras, on the plane in which these lie. Up on the map is where most photos look; if
+    they look all round, the longest axis of the path is horizontal and the first photo on the left.
     """
     spread = centres - centres.mean(axis=0)
     axes = np.linalg.svd(spread, full_matrices=False)[2] if len(centres) > 2 else np.eye(3)
@@ -227,15 +228,14 @@ def top_view(
         normal = up / np.linalg.norm(up)
     else:
         normal = axes[2] * (1 if up @ axes[2] >= 0 else -1)
-    flat = spread - np.outer(spread @ normal, normal)
-    longest = np.linalg.svd(flat, full_matrices=False)[2][0]
+    ahead = view - (view @ normal) * normal
+    if np.linalg.norm(ahead) > COMMON:
+        ahead /= np.linalg.norm(ahead)
+        return np.stack([np.cross(ahead, normal), ahead])
+    longest = np.linalg.svd(spread - np.outer(spread @ normal, normal), full_matrices=False)[2][0]
     right = longest - (longest @ normal) * normal
     right /= max(float(np.linalg.norm(right)), 1e-12)
-    ahead = np.cross(normal, right)
-    # Most photos look up the map; if they look all round, the first photo is on the left.
-    ahead_share = float(view @ ahead)
-    flip = ahead_share < 0 if abs(ahead_share) > LEVEL else spread[0] @ right > 0
-    return np.stack([right, ahead]) * (-1 if flip else 1)
+    return np.stack([right, np.cross(normal, right)]) * (-1 if spread[0] @ right > 0 else 1)
 
 
 def _links(rows: Sequence[Sequence[Any]], at: Mapping[str, int]) -> list[Link]:
@@ -447,11 +447,10 @@ def _draw_map(axes: Any, drawn: CaptureMap, size: tuple[int, int]) -> None:
         axes.scatter(*to_px(drawn.points).T, s=2.5, c=faded, linewidths=0, zorder=0)
     xy = to_px([photo.xy for photo in drawn.photos])
     most = max((link.matches for link in drawn.links), default=1)
-    half_way = np.median(xy, axis=0)
+    half_way, wedge_px = np.median(xy, axis=0), wedge_length(xy)
     for link in drawn.links:
-        width = 0.6 + 3.4 * np.sqrt(link.matches / max(most, 1))
+        width = wedge_px / WEDGE_PX * (0.6 + 3.4 * np.sqrt(link.matches / max(most, 1)))
         _draw_link(axes, link.kind, xy[list(link.ends)], half_way, width)
-    wedge_px = wedge_length(xy)
     for photo, at in zip(drawn.photos, xy):
         _draw_camera(axes, photo, at, wedge_px)
     if drawn.stars:
@@ -595,7 +594,7 @@ def _legend(drawn: CaptureMap) -> Iterator[tuple[str, str]]:
         yield "part", "another part"
     if any(photo.provisional for photo in drawn.photos):
         yield "provisional", "placed with little evidence"
-    if "left out" in kinds:
+    if any(photo.kind == "left out" and not photo.unsure for photo in drawn.photos):
         yield "left out", "not placed" if drawn.posed else "will not be placed"
     if any(photo.unsure for photo in drawn.photos):
         yield "?", "not placed, drawn beside its best match"

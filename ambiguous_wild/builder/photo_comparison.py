@@ -19,8 +19,8 @@ SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
 RATIO = 0.8  # Lowe's ratio test
 MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
-# The same for the prediction of growth, where other photos must confirm them. With 16, a walk of 29 photos that
-# COLMAP places whole seems to fall into 24 and 5.
+# The same for the prediction of growth, where other photos must confirm them. With 16, a walk of 29 photos
+# that COLMAP places whole seems to fall into 24 and 5.
 LEAST_MATCHES = 12
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8

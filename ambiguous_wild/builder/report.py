@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from ambiguous_wild.builder.capture_map import FILE as MAP
+from ambiguous_wild.builder.map_drawing import FILE as MAP
 from ambiguous_wild.builder.records import (
     BuildInputs,
     BuildRecord,

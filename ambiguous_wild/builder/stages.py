@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.builder import report
-from ambiguous_wild.builder.capture_map import FILE as MAP
-from ambiguous_wild.builder.capture_map import draw_built
 from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, read_test_list, split_photos
 from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
+from ambiguous_wild.builder.map_drawing import FILE as MAP
+from ambiguous_wild.builder.map_drawing import draw_built
 from ambiguous_wild.builder.masks import alphas, find_masks, lay_out_masks, mask_hashes, mask_warnings
 from ambiguous_wild.builder.moving import write_motion
 from ambiguous_wild.builder.package import SceneParts, package

@@ -106,8 +106,8 @@ def screen_command(
     """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
     near-duplicates, overlap, motion. Nothing is written but the picture of -o."""
 
-    from ambiguous_wild.builder.capture_map import write_map
     from ambiguous_wild.builder.checks import check_capture, refuse_failed
+    from ambiguous_wild.builder.map_drawing import write_map
     from ambiguous_wild.builder.progress import Bar
     from ambiguous_wild.io.files import check_output
 

@@ -11,18 +11,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.builder.capture_map import (
-    NAME_PX,
     CaptureMap,
     MapPhoto,
-    frame,
     map_of_model,
     map_of_photos,
     photo_label,
-    place_names,
     top_view,
-    write_map,
 )
 from ambiguous_wild.builder.growth import Growth
+from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, write_map
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import read_png_rgb
 

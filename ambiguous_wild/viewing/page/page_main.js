@@ -241,7 +241,7 @@ async function start() {
   fill($("view"), [["", "free"], ...DATA.views.map((v, i) => [String(i), `${v.split}: ${v.name}`])]);
   $("notes").replaceChildren(...DATA.notes.map((note) => h("li", {}, note)));
   $("chart").hidden = !DATA.map;
-  if (DATA.map) $("map").src = DATA.map;
+  $("map").style.backgroundImage = `url(${DATA.map})`;
   busy("starting");
   R = await loadRenderer();
   T = R.THREE;

@@ -21,7 +21,6 @@ from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.growth import Growth, predict_growth
 from ambiguous_wild.builder.overlap_graph import Link
 from ambiguous_wild.builder.photo_comparison import (
-    MIN_INLIERS,
     PhotoComparison,
     candidate_pairs,
     compare_photos,
@@ -233,20 +232,10 @@ def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison, growth: Gr
     if growth.others:
         finding += "; the others share too few features with two photos at once: "
         finding += shortlist([names[k] for k in growth.others], 3)
-    gaps = [f"{names[a]} and {names[b]}" for a, b in joins(growth, overlaps(compared, growth))]
+    gaps = [f"{names[a]} and {names[b]}" for a, b in joins(growth, compared.links)]
     advice = f"take 2 or 3 photos between {shortlist(gaps, 3)}"
     outside = tuple(names[k] for k in range(count) if k not in main)
     return Check("overlap", "warning", "pixels", finding, advice, outside)
-
-
-def overlaps(compared: PhotoComparison, growth: Growth) -> list[Link]:
-    """Return the pairs of photos that overlap: few matches count only within a part, which confirms them."""
-    part = {photo: number for number, photos in enumerate(growth.parts) for photo in photos}
-    return [
-        (a, b, matches)
-        for a, b, matches in compared.links
-        if matches >= MIN_INLIERS or (a in part and part[a] == part.get(b))
-    ]
 
 
 def motion(compared: PhotoComparison) -> Check:
@@ -334,9 +323,7 @@ def check_capture(
     if read.skipped:
         checks.insert(0, _files_check(read.skipped, len(capture.sources)))
     names = [f["source"] for f in facts]
-    return CaptureReport(
-        capture.root, len(facts), read.skipped, checks, names, overlaps(compared, growth), growth
-    )
+    return CaptureReport(capture.root, len(facts), read.skipped, checks, names, compared.links, growth)
 
 
 def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SHARED = 10  # features of a photo that two placed photos show, from which on it is placed
+SHARED = 8  # features of a photo that two placed photos show, from which on it is placed
 SMALLEST = 3  # photos of a part
 
 

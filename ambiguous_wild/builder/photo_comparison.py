@@ -19,9 +19,9 @@ SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
 RATIO = 0.8  # Lowe's ratio test
 MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
-# The same for the prediction of growth, where other photos must confirm them. With 16, a walk of 29 photos
-# that COLMAP places whole seems to fall into 24 and 5.
-LEAST_MATCHES = 12
+# Fewer matches are enough if a third photo confirms some of them, by a feature that matches both. With 16
+# alone, a walk of 29 photos that COLMAP places whole seems to fall into 24 and 5.
+LEAST_MATCHES, CONFIRMED = 12, 2
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
 EXTRA_CANDIDATES = 60  # further candidates of a photo that overlaps with none or one of these
@@ -29,6 +29,9 @@ FOCAL = 0.9  # of the longer side, of most phones and cameras
 ALONG = 0.8  # |t_z| / |t| from which on two cameras differ by motion along the line of sight
 _PATCH = 4  # px, half a patch around a feature
 QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue over green
+
+
+Matches = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]  # two photos -> matching features, [M] each
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,11 @@ class PhotoComparison:
     offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
     partners: np.ndarray  # [N] int, number of photos that overlap with it
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
-    # Features that match in two photos, [M] each; at least `LEAST_MATCHES`.
-    matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+    matches: Matches
 
     @property
     def links(self) -> list[tuple[int, int, int]]:
-        """Matched pairs of photos with the number of their matches."""
+        """Pairs of photos that overlap, with the number of their matches."""
         return [(*pair, len(rows)) for pair, (rows, _) in sorted(self.matches.items())]
 
 
@@ -114,7 +116,7 @@ def compare_photos(
     """Match each photo with the next and the most similar ones; solve for one offset a photo."""
     count = len(features)
     graph = np.zeros((count, count), bool)
-    matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+    matches: Matches = {}
     rows: list[tuple[int, int, np.ndarray, float]] = []
     forward: list[bool] = []
 
@@ -128,7 +130,7 @@ def compare_photos(
             return
         matches[i, j] = inliers
         if len(inliers[0]) < MIN_INLIERS:
-            return
+            return  # too few for the direction of motion and the settings
         graph[i, j] = graph[j, i] = True
         forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]], features[i].size))
         difference = features[i].values[inliers[0]] - features[j].values[inliers[1]]
@@ -150,7 +152,27 @@ def compare_photos(
                 tried.add(pair)
                 enter(*pair, _match(features[pair[0]], features[pair[1]]))
     share = float(np.mean(forward)) if forward else math.nan
-    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, matches)
+    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, confirmed(matches))
+
+
+def confirmed(matches: Matches) -> Matches:
+    """Leave out pairs with fewer than `MIN_INLIERS` matches of which no third photo confirms `CONFIRMED`."""
+    partner: dict[int, dict[int, dict[int, int]]] = {}  # photo -> other photo -> feature -> its feature
+    for (a, b), (one, two) in matches.items():
+        partner.setdefault(a, {})[b] = dict(zip(one.tolist(), two.tolist()))
+        partner.setdefault(b, {})[a] = dict(zip(two.tolist(), one.tolist()))
+
+    def confirms(third: int, a: int, b: int) -> bool:
+        first, second = partner[a][third], partner[b][third]
+        both = ((first.get(f), second.get(g)) for f, g in partner[a][b].items())
+        return sum(f is not None and f == g for f, g in both) >= CONFIRMED
+
+    sure: Matches = {}
+    for (a, b), ends in matches.items():
+        third = partner[a].keys() & partner[b].keys()
+        if len(ends[0]) >= MIN_INLIERS or any(confirms(c, a, b) for c in third):
+            sure[a, b] = ends
+    return sure
 
 
 def is_forward(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder.checks import Check, check_capture, noise, refuse_failed
-from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, photo_features
+from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, confirmed, photo_features
 from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import eyes, render, texture, write_capture
 
@@ -160,3 +160,14 @@ def test_matches_are_those_of_opencv():
     wanted = [(m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < RATIO * n.distance]
     found = _ratio_matches(a, b)
     assert len(wanted) >= 80 and list(zip(*(part.tolist() for part in found))) == wanted
+
+
+def test_few_matches_count_only_where_a_third_photo_confirms_them() -> None:
+    def pair(count: int, shift: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        return np.arange(count), (np.arange(count) + shift) % 100
+
+    strong = {(0, 1): pair(40), (1, 2): pair(40)}
+    assert set(confirmed({**strong, (0, 2): pair(13)})) == {(0, 1), (1, 2), (0, 2)}
+    assert set(confirmed({**strong, (0, 2): pair(13, shift=5)})) == {(0, 1), (1, 2)}  # other features
+    assert set(confirmed({**strong, (0, 2): pair(16, shift=5)})) == {(0, 1), (1, 2), (0, 2)}
+    assert set(confirmed({(0, 1): pair(40), (0, 2): pair(13)})) == {(0, 1)}  # no photo matches both

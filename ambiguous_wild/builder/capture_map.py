@@ -27,6 +27,7 @@ WIDE, THIN = 0.15, 0.4
 LEVEL = 0.3  # length of the mean up direction below which up is unknown; shorter headings are not drawn
 COMMON = 0.4  # length of the mean heading from which on it is up on the map
 ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
+ROOM = 0.4  # of this distance: free room around such a photo
 
 Kind = Literal["train", "test", "part", "left out"]
 
@@ -136,7 +137,9 @@ def map_of_photos(
         )
         for k, source in enumerate(sources)
     ]
-    title = f"about {len(main)} of {len(sources)} photos will be placed; near = much overlap, not positions"
+    whole = len(main) == len(sources)
+    share = f"all {len(main)}" if whole else f"about {len(main)} of {len(sources)}"
+    title = f"{share} photos will be placed; near = much overlap, not positions"
     result = _with_links(CaptureMap(title, photos, [], [], [], posed=False), links)
     gaps = joins(growth, links)
     matches = {link[:2]: link[2] for link in links}
@@ -271,16 +274,12 @@ def _with_left_out(
                 best[lost] = int(matches), partner
     hypotheses = mapping.get("hypotheses", {})
     middle = np.median([photo.xy for photo in drawn.photos], axis=0)
-    beside: dict[str, int] = {}  # partner -> photos drawn beside it
     for name, reason in left_out.items():
         matches, partner = best.get(name, (0, ""))
         if name in hypotheses:
             xy = plane @ np.array(hypotheses[name], float)
         elif partner:
-            number = beside[partner] = beside.get(partner, 0) + 1
-            away = np.array(drawn.photos[at[partner]].xy) - middle
-            angle = np.arctan2(away[1], away[0]) + 0.6 * (number // 2) * (-1) ** number
-            xy = drawn.photos[at[partner]].xy + ASIDE * size * np.array([np.cos(angle), np.sin(angle)])
+            xy = _beside(np.array(drawn.photos[at[partner]].xy), middle, ASIDE * size, photos)
         reasons.setdefault(reason, []).append(labels[name])
         if name not in hypotheses and not partner:
             continue
@@ -297,6 +296,23 @@ def _with_left_out(
         advice=[*drawn.advice, *(between(name, shortlist(lost, 3)) for name, lost in wanted.items())],
         listed=[*drawn.listed, *(f"{shortlist(names, 3)}: {why}" for why, names in reasons.items())],
     )
+
+
+def _beside(
+    partner: np.ndarray,  # [2]
+    middle: np.ndarray,  # [2] of the map
+    distance: float,
+    photos: Sequence[MapPhoto],
+) -> np.ndarray:
+    """Return a free position at a distance from a photo, away from the middle of the map if possible."""
+    away = partner - middle
+    turns = np.array([0.5 * (k // 2) * (-1) ** k for k in range(1, 12)])
+    angles = np.arctan2(away[1], away[0]) + turns
+    places = partner + distance * np.column_stack([np.cos(angles), np.sin(angles)])
+    taken = np.array([photo.xy for photo in photos])
+    room = np.linalg.norm(places[:, None] - taken[None], axis=2).min(axis=1)
+    free = np.flatnonzero(room > ROOM * distance)
+    return np.asarray(places[free[0] if len(free) else int(np.argmax(room))])
 
 
 def _between(first: MapPhoto, second: MapPhoto) -> str:

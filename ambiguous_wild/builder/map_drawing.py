@@ -297,7 +297,7 @@ def _legend(drawn: CaptureMap) -> Iterator[tuple[str, str]]:
     if any(photo.unsure for photo in drawn.photos):
         yield "?", "not placed, drawn beside its best match"
     if any(photo.weak for photo in drawn.photos):
-        yield "weak photo", "overlaps with one or two photos only"
+        yield "weak photo", "overlaps with fewer than three photos"
     if any(link.kind == "strong" for link in drawn.links):
         yield "strong", "overlap (thicker: more matches)"
     if any(link.kind == "weak" for link in drawn.links):

@@ -1,24 +1,27 @@
 """Camera poses of `aw build-scene` against the truth, beside COLMAP's own mappers.
 
     python benchmarks/poses.py --data DIR --out DIR [--bases monstree ...] [--presets yard ...]
-        [--seeds 0 1 2] [--ways auto thorough colmap colmap-global before-auto ...] [--before CHECKOUT]
+        [--kinds clean cutouts patches] [--every 1 2 3 4] [--seeds 0 1 2]
+        [--ways auto thorough colmap colmap-global before-auto ...] [--before CHECKOUT] [--results NAME]
 
 --data holds a folder of clean photos a base (its photos, or images/ with them), and cut-outs in cutouts/.
 Distractors are pasted before structure from motion (`aw composite`), cut-outs and pieces of other photos;
-the truth is a careful model of the clean photos. Presets are simulated, with exact truth. Ways that begin
-with "before-" are built by --before, another checkout. Everything that is finished is kept. Writes
-benchmarks/results/poses.json and .md.
+the truth is a careful model of all clean photos, or the GPS positions in NAME-gps.json: {stem: [x, y] in m}.
+Presets are simulated, with exact truth. With --every 3 only every third photo is used, so that the photos
+overlap little. Ways that begin with "before-" are built by --before, another checkout. Everything that is
+finished is kept. Writes benchmarks/results/poses.json and .md, or those of --results.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +31,18 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import environment
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.files import write_json, write_text
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
 RESULTS = Path(__file__).parent / "results" / "poses"
 BASES = ("monstree", "sceaux", "seneca", "skull")
 WAYS = ("auto", "thorough", "colmap", "colmap-global")
+KINDS = ("cutouts", "patches")
 TURNED_DEG, MOVED_PERCENT = 1.0, 5.0  # a photo is placed rightly below both
+MOVED_M = 20.0  # the same by GPS, whose own error is several metres in a street
 COLMAP = """
 import os, sys, zlib, pycolmap
-photos, out, mapper = sys.argv[1:]
-pycolmap.set_random_seed(0)
+photos, out, mapper, seed = sys.argv[1:]
+pycolmap.set_random_seed(int(seed))
 extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=1600)
 extraction.sift.max_num_features = 3000
 database = out + "/../colmap.db"  # of both mappers
@@ -118,15 +124,40 @@ def _moved_percent(
     names: Sequence[str], fixed: Sequence[str], found: Poses, truth: Poses
 ) -> dict[str, float]:
     source, target = (np.array([poses[n][1] for n in fixed]) for poses in (found, truth))
-    mean, goal = source.mean(0), target.mean(0)
-    left, values, right = np.linalg.svd((target - goal).T @ (source - mean))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ np.diag(signs) @ right
-    scale = (values * signs).sum() / max(float(((source - mean) ** 2).sum()), 1e-30)
     path = np.array([truth[n][1] for n in names])
     radius = np.linalg.norm(path - path.mean(0), axis=1).max()
-    ends = np.array([scale * rotation @ (found[n][1] - mean) + goal for n in names])
-    return dict(zip(names, (100 * np.linalg.norm(ends - path, axis=1) / radius).tolist()))
+    apart = _moved(source, target, np.array([found[n][1] for n in names]), path)
+    return dict(zip(names, (100 * apart / radius).tolist()))
+
+
+def _moved(source: np.ndarray, target: np.ndarray, points: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Distances [N] of `points` from `goals` [N, D] after the similarity that fits `source` to `target`."""
+    mean, goal = source.mean(0), target.mean(0)
+    left, values, right = np.linalg.svd((target - goal).T @ (source - mean))
+    signs = np.ones(len(values))
+    signs[-1] = np.sign(np.linalg.det(left @ right))
+    rotation = left @ np.diag(signs) @ right
+    scale = (values * signs).sum() / max(float(((source - mean) ** 2).sum()), 1e-30)
+    return np.linalg.norm(scale * (points - mean) @ rotation.T + goal - goals, axis=1)
+
+
+def compare_gps(found: Poses, truth: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    """How far the cameras are from their GPS positions, in the plane of the cameras."""
+    names = sorted(set(found) & set(truth))
+    if len(names) < 3:
+        return {"known": len(truth), "judged": len(names), "right": 0, "wrong": {}}
+    centres, goals = np.array([found[n][1] for n in names]), np.array([truth[n] for n in names])
+    axes = np.linalg.svd(centres - centres.mean(0), full_matrices=False)[2]
+    plane = (centres - centres.mean(0)) @ axes[:2].T
+    apart = min((_moved(p, goals, p, goals) for p in (plane, plane * [1, -1])), key=np.median)
+    wrong = {n: [0.0, round(float(m), 2)] for n, m in zip(names, apart) if m > MOVED_M}
+    return {
+        "known": len(truth),
+        "judged": len(names),
+        "right": len(names) - len(wrong),
+        "wrong": wrong,  # 0, metres
+        "position_m": round(float(np.median(apart)), 2),
+    }
 
 
 def _angles_deg(rotations: np.ndarray) -> np.ndarray:
@@ -148,40 +179,81 @@ def aw(*words: object, checkout: Path | None = None) -> str:
     return last if done.returncode else ""
 
 
-def capture_of(name: str, seed: int, kind: str, args: argparse.Namespace) -> tuple[Path, Poses]:
-    """The raw capture and its truth; both are made where they are missing.
+def capture_of(
+    name: str, seed: int, kind: str, every: int, args: argparse.Namespace
+) -> tuple[Path, Callable[[Poses], dict[str, Any]]]:
+    """The raw capture and the comparison with its truth; both are made where they are missing.
 
     Raises:
         AwError: a command failed.
     """
+    thin = f"-every{every}" * (every > 1)
+    raw = (
+        args.out
+        / "captures"
+        / (f"{name}{thin}-{seed}" if kind == "simulated" else f"{name}{thin}-{kind}-{seed}")
+    )
     if kind == "simulated":
-        raw = args.out / "captures" / f"{name}-{seed}"
-        problem = "" if raw.is_dir() else aw("simulate", name, "--seed", seed, "--width", 480, "-o", raw)
+        whole = args.out / "captures" / f"{name}-{seed}"
+        problem = "" if whole.is_dir() else aw("simulate", name, "--seed", seed, "--width", 480, "-o", whole)
         if problem:
             raise AwError(problem)
-        return raw, exact_poses(raw / "truth" / "cameras.json")
-    photos = args.data / name
-    photos = photos / "images" if (photos / "images").is_dir() else photos
-    raw, truth = args.out / "captures" / f"{name}-{kind}-{seed}", args.out / "truth" / name
-    shapes = ("--patches",) if kind == "patches" else ("--cutouts", args.data / "cutouts")
+        if not raw.is_dir():
+            for side in ("train", "test"):
+                _copy_every(whole / side, raw / side, every)
+        return raw, _judge(raw, exact_poses(whole / "truth" / "cameras.json"))
+    source = args.data / name
+    source = source / "images" if (source / "images").is_dir() else source
+    photos = args.out / "photos" / f"{name}{thin}"
+    if not photos.is_dir():
+        _copy_every(source, photos, every)
+    if kind == "clean":
+        raw = raw if raw.is_dir() else Path(shutil.copytree(photos, raw))
+    elif not raw.is_dir():
+        shapes = ("--patches",) if kind == "patches" else ("--cutouts", args.data / "cutouts")
+        if problem := aw("composite", photos, "-o", raw, "--seed", seed, *shapes):
+            raise AwError(problem)
+    gps = args.data / f"{name}-gps.json"
+    if gps.is_file():
+        stems = {photo.stem for photo in _photos(raw)}
+        known = {k: v for k, v in json.loads(gps.read_text(encoding="utf-8")).items() if k in stems}
+        return raw, lambda found: compare_gps(found, known)
+    truth = args.out / "truth" / name
     careful = ("--sfm", "thorough", "--max-features", 8000, "--factor", 4)
-    problem = "" if raw.is_dir() else aw("composite", photos, "-o", raw, "--seed", seed, *shapes)
-    problem = problem or ("" if truth.is_dir() else aw("build-scene", photos, "-o", truth, *careful))
+    problem = "" if truth.is_dir() else aw("build-scene", source, "-o", truth, *careful)
     if problem:
         raise AwError(problem)
-    return raw, model_poses(truth / "sparse" / "0")
+    return raw, _judge(raw, model_poses(truth / "sparse" / "0"))
 
 
-def build(raw: Path, way: str, args: argparse.Namespace) -> dict[str, Any]:
+def _photos(raw: Path) -> list[Path]:
+    """The photos of a capture, with or without train/ and test/."""
+    folders = [raw / side for side in ("train", "test") if (raw / side).is_dir()] or [raw]
+    return [p for f in folders for p in sorted(f.iterdir()) if p.suffix.lower() in PHOTO_SUFFIXES]
+
+
+def _copy_every(source: Path, target: Path, every: int) -> None:
+    target.mkdir(parents=True)
+    for photo in _photos(source)[::every]:
+        shutil.copyfile(photo, target / photo.name)
+
+
+def _judge(raw: Path, truth: Poses) -> Callable[[Poses], dict[str, Any]]:
+    stems = {photo.stem for photo in _photos(raw)}
+    return lambda found: compare(found, {k: v for k, v in truth.items() if k in stems})
+
+
+def build(raw: Path, way: str, seed: int, args: argparse.Namespace) -> dict[str, Any]:
     """Where the model lies and what the build says; a refused one has only `refused`."""
     out = args.out / "builds" / raw.name / way
     if way.startswith("colmap"):
-        return _build_with_colmap(raw, way, out)
+        return _build_with_colmap(raw, way, seed, out)
     refused = out.with_name(f"{way}.refused")
     if not out.is_dir() and not refused.is_file():
         sfm = way.removeprefix("before-")
         checkout = args.before.resolve() if way.startswith("before-") else None
-        problem = aw("build-scene", raw, "-o", out, "--sfm", sfm, "--factor", 1, checkout=checkout)
+        words = ("-o", out, "--sfm", sfm, "--factor", 1, "--seed", seed)
+        problem = aw("build-scene", raw, *words, checkout=checkout)
         if problem:
             out.parent.mkdir(parents=True, exist_ok=True)
             write_text(refused, problem)
@@ -198,15 +270,15 @@ def build(raw: Path, way: str, args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _build_with_colmap(raw: Path, way: str, out: Path) -> dict[str, Any]:
-    photos = [p for side in ("train", "test") for p in sorted((raw / side).iterdir())]
+def _build_with_colmap(raw: Path, way: str, seed: int, out: Path) -> dict[str, Any]:
+    photos = _photos(raw)
     if not (out / "images.bin").is_file():
         shutil.rmtree(out, ignore_errors=True)
         together = out / "photos"
         together.mkdir(parents=True)
         for photo in photos:
             shutil.copyfile(photo, together / photo.name)
-        done = subprocess.run([sys.executable, "-c", COLMAP, together, out, way])
+        done = subprocess.run([sys.executable, "-c", COLMAP, together, out, way, str(seed)])
         if done.returncode not in (0, 2):
             raise AwError(f"COLMAP ended with code {done.returncode} on {raw}")
         if done.returncode:
@@ -230,7 +302,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         count = max((row.get("photos", 0) for row in mine if row), default=0)
         lines.append(f"| {capture} | {count} | {' | '.join(map(_cell, mine))} |")
     lines += ["", "Each cell: photos placed rightly of those judged; wrong ones, the worst in degrees;"]
-    lines += ["median position error in % of the path's radius; focal length error in %.", ""]
+    lines += ["median position error in % of the path's radius, or in m by GPS; focal length error in %.", ""]
     common = [c for c in captures if all((c, way) in known for way in ways)]
     lines.append(f"Over the {len(common)} captures that every way has:")
     photos = sum(max(known[c, way].get("known", 0) for way in ways) for c in common)
@@ -239,7 +311,10 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         right = sum(row.get("right", 0) for row in of_way)
         wrong = sum(row.get("judged", 0) - row.get("right", 0) for row in of_way)
         refused = sum("refused" in row for row in of_way)
-        lines.append(f"- {way}: {right} of {photos} photos right, {wrong} wrong, {refused} captures refused")
+        lines.append(
+            f"- {way}: {right} of {photos} photos right, {wrong} wrong, {photos - right - wrong} left out, "
+            f"{refused} captures refused"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -250,7 +325,9 @@ def _cell(row: dict[str, Any] | None) -> str:
         return "refused"
     text = f"{row['right']} of {row['judged']}"
     if row["wrong"]:
-        text += f"; {len(row['wrong'])} wrong, {max(turn for turn, _ in row['wrong'].values()):.1f}"
+        text += f"; {len(row['wrong'])} wrong, {max(turned for turned, _ in row['wrong'].values()):.1f}"
+    if "position_m" in row:
+        return f"{text}; {row['position_m']:.1f} m"
     if "position_percent" not in row:
         return text
     return f"{text}; {row['position_percent']:.2f} %; {row['focal_percent']:+.2f} %"
@@ -263,6 +340,8 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--bases", nargs="*", default=list(BASES))
     parser.add_argument("--presets", nargs="*", default=[])
+    parser.add_argument("--kinds", nargs="+", choices=("clean", *KINDS), default=list(KINDS))
+    parser.add_argument("--every", nargs="+", type=int, default=[1])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--ways", nargs="+", default=list(WAYS))
     parser.add_argument("--before", type=Path, metavar="CHECKOUT")
@@ -274,22 +353,23 @@ def main(words: Sequence[str] | None = None) -> None:
         parser.error(f"--before {args.before}: no checkout of this project")  # else it would compare itself
     if any(way.startswith("before-") for way in args.ways) and args.before is None:
         parser.error("ways that begin with before- need --before CHECKOUT")
-    kinds = [(n, kind) for n in args.bases for kind in ("cutouts", "patches")]
+    kinds = [(n, kind) for n in args.bases for kind in args.kinds]
+    kinds += [(n, "simulated") for n in args.presets]
     rows = []
-    for name, kind in [*kinds, *((n, "simulated") for n in args.presets)]:
-        for seed in args.seeds:
-            capture = f"{name}-{seed}" if kind == "simulated" else f"{name}-{kind}-{seed}"
-            for way in args.ways:
-                kept = args.out / "rows" / f"{capture}-{way}.json"
-                if not kept.is_file() and not args.report_only:
-                    raw, truth = capture_of(name, seed, kind, args)
-                    row = build(raw, way, args)
-                    model = row.pop("model", None)
-                    row |= compare(model_poses(model), truth) if model else {}
-                    kept.parent.mkdir(parents=True, exist_ok=True)
-                    write_json(kept, {"capture": capture, "way": way, **row})
-                if kept.is_file():
-                    rows.append(json.loads(kept.read_text(encoding="utf-8")))
+    for (name, kind), every, seed in itertools.product(kinds, args.every, args.seeds):
+        thin = f"-every{every}" * (every > 1)
+        capture = f"{name}{thin}-{seed}" if kind == "simulated" else f"{name}{thin}-{kind}-{seed}"
+        for way in args.ways:
+            kept = args.out / "rows" / f"{capture}-{way}.json"
+            if not kept.is_file() and not args.report_only:
+                raw, judge = capture_of(name, seed, kind, every, args)
+                row = build(raw, way, seed, args)
+                model = row.pop("model", None)
+                row |= judge(model_poses(model) if model else {})
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                write_json(kept, {"capture": capture, "way": way, **row})
+            if kept.is_file():
+                rows.append(json.loads(kept.read_text(encoding="utf-8")))
     write_json(
         args.results.with_name(args.results.name + ".json"), {"environment": environment("cpu"), "rows": rows}
     )

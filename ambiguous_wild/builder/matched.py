@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import heapq
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,11 @@ class Matched:
             )
         finally:
             db.close()
+
+    def copy(self) -> Matched:
+        """Return a copy with cameras of its own; features, matches and motions are shared."""
+        cameras = {camera.camera_id: copy.deepcopy(camera) for camera in self.cameras}
+        return replace(self, cameras=[cameras[camera.camera_id] for camera in self.cameras])
 
     def rays(self) -> list[np.ndarray]:
         """Return the features of every photo as x / z and y / z, [N, 2], by its present camera."""

@@ -26,6 +26,7 @@ WAYS = 3  # poses that explain one motion: a plane allows two more
 ERROR_PX = 2.0  # largest distance of a match from its motion
 CLOSED_DEG = 4.0  # largest rotation left over around a closed triplet
 ROUNDS = 4  # rounds of voting
+PRIOR = 0.1  # triplets that the share of its matches counts for in the vote on a motion
 AGREED_DEG = 5.0  # largest angle between a motion and the rotations of its photos
 SWEEPS = 10  # largest number of sweeps over all photos
 CONFIDENCE, TRIALS = 0.9999, 1000  # of RANSAC
@@ -235,22 +236,26 @@ def _inequality(matrices: np.ndarray, first: np.ndarray, second: np.ndarray) -> 
 def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray]:
     """Return the share of triplets that each motion and way of a pair closes: (a, b) -> [M, W], 0 to 1.
 
-    It is 0 where there is no triplet. Triplets are weighted by the votes of the other two motions.
+    Triplets are weighted by the votes of the other two motions. A pair in no triplet, the only link between
+    two parts of a capture perhaps, has the shares of its matches that are in each motion.
     """
     connected = sorted(pair for pair, found in pairs.items() if found)
     at = {pair: k for k, pair in enumerate(connected)}
     rotations = np.full((len(connected), MOTIONS * WAYS, 3, 3), np.nan)
+    prior = np.zeros((len(connected), MOTIONS * WAYS))
     for pair, k in at.items():
+        total = sum(len(motion.matches) for motion in pairs[pair])
         for m, motion in enumerate(pairs[pair]):
-            start = m * WAYS
-            rotations[k, start : start + len(motion.rotations)] = motion.rotations
+            ways = slice(m * WAYS, m * WAYS + len(motion.rotations))
+            rotations[k, ways] = motion.rotations
+            prior[k, ways] = len(motion.matches) / total
     exists = ~np.isnan(rotations[:, :, 0, 0])
     edges = _triplets(connected, at)
     closings = [_closed(rotations, edges, start) for start in range(0, len(edges), _CHUNK)]
     rows = np.concatenate([np.zeros((0, 4), int), *closings])
     votes = exists.astype(float)
     for _ in range(ROUNDS):
-        votes = _vote(votes, exists, edges, rows)
+        votes = _vote(votes, prior, edges, rows)
     return {pair: votes[k].reshape(MOTIONS, WAYS) for pair, k in at.items()}
 
 
@@ -272,7 +277,7 @@ def _closed(rotations: np.ndarray, edges: np.ndarray, start: int) -> np.ndarray:
     return np.argwhere(trace > trace_of(CLOSED_DEG)) + np.array((start, 0, 0, 0))
 
 
-def _vote(votes: np.ndarray, exists: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:
+def _vote(votes: np.ndarray, prior: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:
     best = votes.max(axis=1)
     count, ways = votes.shape
     gained, possible = np.zeros((count, ways)), np.zeros(count)
@@ -284,7 +289,7 @@ def _vote(votes: np.ndarray, exists: np.ndarray, edges: np.ndarray, closed: np.n
         top = np.zeros((len(edges), ways))
         np.maximum.at(top, (rows, closed[:, 1 + k]), weight)
         np.add.at(gained, edges[:, k], top)
-    return np.where(exists & (possible[:, None] > 1e-9), gained / np.maximum(possible[:, None], 1e-9), 0.0)
+    return (gained + PRIOR * prior) / (possible[:, None] + PRIOR)
 
 
 def agreed_motions(

@@ -8,12 +8,14 @@ in a small part of the picture.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
@@ -31,6 +33,7 @@ NEAR_DEG = 3.0  # largest angle of poses that may be one place found twice
 SAME_SHARE = 0.1  # of the path's radius: largest distance of positions that are one place
 GRID = 12  # cells a side of the grid on which the area of matches is measured
 LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a distractor
+LITTLE_AREA = 0.05  # the same if all placed photos that share a motion with it agree
 AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two partners are enough
 PLACES = 3  # largest number of places tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of the points of a place
@@ -72,22 +75,65 @@ class Placement:
         self.poses: dict[int, np.ndarray] = {}  # photo -> [3, 4] camera from world
         self.places: dict[int, Place] = {}  # of the placed photos
         self.left_out: dict[int, str] = {}  # photo -> reason
+        self.provisional: set[int] = set()  # placed photos with little evidence
+        self.apart: list[dict[int, np.ndarray]] = []  # poses of photos that agree among themselves alone
+        self.others: list[Placement] = []  # parts of the capture that no photo joins to this one
         self._use_model(model)
 
     def run(self) -> None:
         """Place all photos anew, one after another, until none moves, or hardly any of many."""
         outs = [0] * len(self.matched.ids)
-        turn, moved = 0, True
-        while moved and turn <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
-            before = set(self.poses)
-            self._triangulate_and_adjust(final=False)
-            moved = self._place_all(outs, only_out=turn == ROUNDS)
-            turn += not set(self.poses) > before
+        self._settle(outs)
+        while len(parts := self.components()) > 1:
+            # Each part is consistent in itself, but nothing fixes where it is from the others.
+            for part in parts[1:]:
+                poses = {photo: self.poses.pop(photo) for photo in sorted(part)}
+                if len(poses) >= LEAST_PHOTOS:
+                    self.apart.append(poses)
+                for photo in poses:
+                    outs[photo] = TAKEN_OUT
+            self._settle(outs)
         if len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
             self._triangulate_and_adjust(final=True)
+        firm = self.components(self.provisional)
+        self.provisional |= set(self.poses) - (firm[0] if firm else set())
         for photo in range(len(outs)):
             if photo not in self.poses:
                 self.left_out.setdefault(photo, "too few of its points are left")
+
+    def _settle(self, outs: list[int]) -> None:
+        """Place all photos anew until none moves; `outs` counts how often each was taken out."""
+        rounds, moved = 0, True
+        while moved and rounds <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
+            before = set(self.poses)
+            self._triangulate_and_adjust(final=False)
+            moved = self._place_all(outs, only_out=rounds == ROUNDS)
+            rounds += not set(self.poses) > before
+
+    def links(self) -> dict[Pair, int]:
+        """Return the placed pairs of which a motion fits, with the number of their matches that fit."""
+        rays, links = self.matched.rays(), {}
+        for a, b in self.matched.matches:
+            if a in self.poses and b in self.poses:
+                fits = self.matched.fit((a, b), self.poses[a], self.poses[b], rays)
+                if any(fits[motion.matches].mean() >= FITS for motion in self.matched.motions[a, b]):
+                    links[a, b] = int(np.count_nonzero(fits))
+        return links
+
+    def components(self, without: Collection[int] = ()) -> list[set[int]]:
+        """Return the placed photos that links connect, the largest group first.
+
+        Args:
+            without: photos whose links are not used.
+        """
+        photos = sorted(set(self.poses) - set(without))
+        at = {photo: k for k, photo in enumerate(photos)}
+        rows = [(at[a], at[b]) for a, b in self.links() if a in at and b in at]
+        ends = tuple(np.array(rows, int).reshape(-1, 2).T)
+        graph = coo_array((np.ones(len(rows)), ends), (len(photos), len(photos)))
+        groups = connected_components(graph, directed=False)[1]
+        parts = [{photos[k] for k in np.flatnonzero(groups == g)} for g in range(groups.max(initial=-1) + 1)]
+        return sorted(parts, key=lambda part: (-len(part), min(part)))
 
     def cameras(self) -> list[CameraFact]:
         """Return the focal length of every camera, with its standard deviation if it can be estimated."""
@@ -123,14 +169,17 @@ class Placement:
 
     def _place_all(self, outs: list[int], only_out: bool) -> bool:
         """Place all photos; tell whether more than a few changed, or an added one may help others in."""
-        rays, points = self.matched.rays(), _Points.read(self.matched, self.model)
+        rays, points = self.matched.rays(), Points.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
-        self.places, self.left_out = {}, {}
+        self.places, self.left_out, self.provisional = {}, {}, set()
         for photo in range(len(self.matched.ids)):
             pose_now = self.poses.get(photo)
             best, rival = self._best(photo, pose_now, rays, points)
             few = pose_now is None and best.area < AREA_NEW
             reason = _reason(best, rival, AGREE_NEW if few else AGREE)
+            if reason is not None and unopposed(best, rival):
+                self.provisional.add(photo)
+                reason = None
             if reason is None and pose_now is None and (only_out or outs[photo] >= TAKEN_OUT):
                 reason = "its partners do not settle on a place"
             if reason is not None:
@@ -153,11 +202,11 @@ class Placement:
         return helps or len(moves) > STILL * len(self.matched.ids)
 
     def _best(
-        self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: _Points
+        self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: Points
     ) -> tuple[Place, Place]:
         """Return the place with most weight, and the strongest place elsewhere."""
         places = [] if now is None else [self._judge(photo, now, rays)]
-        places += [self._judge(photo, pose, rays) for pose in self._resections(photo, points)]
+        places += [self._judge(photo, pose, rays) for pose in self.resections(photo, points)]
         best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
         elsewhere = []
         for place in places:
@@ -169,9 +218,7 @@ class Placement:
                 evidence = {k: rows for k, rows in evidence.items() if k not in best.evidence}
             elsewhere.append(self._place(photo, place.pose, evidence))
         elsewhere = [place for place in elsewhere if len(place.partners) >= AGREE]
-        dissent = self._rival_by_motions(photo, best.partners)
-        if len(dissent.partners) >= AGREE:
-            elsewhere.append(dissent)
+        elsewhere.append(self._rival_by_motions(photo, best.partners))
         return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
 
     def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
@@ -230,7 +277,7 @@ class Placement:
         cells = self.cells[photo]
         return len(np.unique(cells[np.concatenate(rows)])) / len(np.unique(cells))
 
-    def _resections(self, photo: int, points: _Points) -> list[np.ndarray]:
+    def resections(self, photo: int, points: Points) -> list[np.ndarray]:
         """Find poses [3, 4] of a photo from points that at least two other photos determine."""
         features, xyz = points.matched_with(photo, self.pairs[photo], self.poses)
         pixels = self.matched.features[photo][features]
@@ -305,7 +352,7 @@ class Placement:
 
 
 @dataclass
-class _Points:
+class Points:
     """Points of a model, found by the features that observe them."""
 
     matched: Matched
@@ -314,7 +361,7 @@ class _Points:
     views: np.ndarray  # [P] number of photos that observe the point
 
     @classmethod
-    def read(cls, matched: Matched, model: Any) -> _Points:
+    def read(cls, matched: Matched, model: Any) -> Points:
         at = {number: k for k, number in enumerate(matched.ids)}
         rows = [np.full(len(f), -1) for f in matched.features]
         xyz, views = np.zeros((len(model.points3D), 3)), np.zeros(len(model.points3D), int)
@@ -386,9 +433,14 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
         return f"only {len(best.partners)} placed photos agree with it on a place"
     if best.area < LEAST_AREA:
         return f"only a small part of it agrees with {len(best.partners)} placed photos"
-    if rival.weight > RIVAL * best.weight:
+    if len(rival.partners) >= AGREE and rival.weight > RIVAL * best.weight:
         return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
     return None
+
+
+def unopposed(best: Place, rival: Place) -> bool:
+    """Tell whether little evidence for a place is enough, because nothing speaks against it."""
+    return len(best.partners) >= AGREE and best.area >= LITTLE_AREA and not rival.partners
 
 
 def _cells(features: np.ndarray, width: int, height: int) -> np.ndarray:

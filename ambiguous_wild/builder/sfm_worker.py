@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.parts import join
 from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import (
@@ -249,47 +250,37 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
 
 def run_mapping(job: MappingJob) -> None:
-    """Take the largest of COLMAP's models and place every photo of it anew; write `mapping.json`.
+    """Place all photos, from COLMAP's models; write `mapping.json`.
 
-    Where photos look outwards, a wrong focal length on a bent path explains nearly all matches (yard, seed 2:
-    4.4 % too long, no photo right). So if the pairs voted for another focal length than the mapper found, the
-    mapper runs again with the voted one held fixed, and the model with more observations is kept.
+    Where COLMAP's incremental mapper leaves photos out, its global mapper is asked too: it needs no pair to
+    start from, and places photos that overlap little. Where photos look outwards, a wrong focal length on a
+    bent path explains nearly all matches (yard, seed 2: 4.4 % too long, no photo right). So if the pairs
+    voted for another focal length than the mapper found, the mapper runs again with the voted one held fixed,
+    and the model with more observations is kept.
     """
     output, database = Path(job["output"]), Path(job["database"])
     matched = Matched.read(database)
-    mapper = _map_globally if job["mapper"] == "global" else _map_incrementally
-
-    def largest(*, held: bool = False) -> Any:
-        models = mapper(job, output, matched.distorted and not held, held).values()
-        for folder in output.glob("[0-9]*"):
-            shutil.rmtree(folder)
-        return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
-
-    model = largest()
-    if model is not None and not plausible(model):
+    models = _models(job, output, matched)
+    if models and not plausible(models[0]):
         matched.distorted = False
-        model = largest()
+        models = _models(job, output, matched)
     placement = None
-    if model is not None:
-        change = matched.take_cameras(model)
-        rival = largest(held=True) if change > FOCAL_DOUBT else None
-        if rival is not None:
+    if models:
+        change = matched.take_cameras(max(models, key=_size))
+        rivals = _models(job, output, matched, held=True) if change > FOCAL_DOUBT else []
+        if rivals:
             other = Matched.read(database)  # read now, while the database has the focal length of the votes
             other.distorted = matched.distorted
         if change > FOCAL_CHANGE:
             # The poses of pairs were wrong by as much, so verify and map again with the model's focal length.
             matched.write_agreed(database, matched.find_motions(job["jobs"]))
-            model = largest() or model
+            models = _models(job, output, matched) or models
         else:
             matched.load_motions(Path(job["motions"]))
-        placement = Placement(matched, database, model, job["seed"])
-        placement.run()
-        if rival is not None:
-            other.take_cameras(rival)
+        placement = _placed(job, database, matched, models)
+        if rivals:
             other.load_motions(Path(job["motions"]))
-            second = Placement(other, database, rival, job["seed"])
-            second.run()
-            placement = max(placement, second, key=_explained)
+            placement = max(placement, _placed(job, database, other, rivals), key=_explained)
     left_out = dict.fromkeys(matched.names, "no pair of photos to start from")
     if placement is not None:
         left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
@@ -324,6 +315,57 @@ def _explained(placement: Placement) -> int:
     """Count the observations of a model; 0 where it lost its photos, because its points are then outdated."""
     enough = len(placement.poses) >= LEAST_PHOTOS
     return int(placement.model.compute_num_observations()) if enough else 0
+
+
+def _models(job: MappingJob, output: Path, matched: Matched, *, held: bool = False) -> list[Any]:
+    """Return the models of COLMAP's mapper, and of the global one if it leaves photos out; largest first."""
+    models: list[Any] = []
+    for mapper in dict.fromkeys((job["mapper"], "global")):
+        run = _map_globally if mapper == "global" else _map_incrementally
+        models += sorted(
+            run(job, output, matched.distorted and not held, held).values(), key=_size, reverse=True
+        )
+        for folder in output.glob("[0-9]*"):
+            shutil.rmtree(folder)
+        if any(model.num_reg_images() == len(matched.ids) for model in models):
+            break
+    return [model for model in models if model.num_reg_images() >= LEAST_PHOTOS]
+
+
+def _size(model: Any) -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
+
+
+def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> Placement:
+    """Place photos from the first model; where it leaves some out, from the others; join their parts."""
+    parts: list[Placement] = []
+    for model in models:
+        todo = set(range(len(matched.ids))).difference(*(part.poses for part in parts))
+        if not todo & matched.poses(model).keys():
+            continue
+        part = Placement(matched.copy(), database, model, job["seed"])
+        part.run()
+        for poses in part.apart:
+            other = Placement(matched.copy(), database, part.model, job["seed"])
+            other.poses = poses
+            other.run()
+            parts.append(other)
+        parts.append(part)
+        if len(part.poses) == len(matched.ids):
+            break
+    parts.sort(key=lambda part: -len(part.poses))
+    best, *others = parts
+    joined = True
+    while joined:
+        before = len(best.poses)
+        for other in others:
+            join(best, other)
+        joined = len(best.poses) > before
+        if joined:
+            best.run()
+            joined = len(best.poses) > before
+    best.others = [other for other in others if not other.poses.keys() & best.poses.keys()]
+    return best
 
 
 def run_triangulation(job: TriangulationJob) -> None:

@@ -11,6 +11,7 @@ import pytest
 from ambiguous_wild.builder.checks import Check, check_capture, noise, refuse_failed
 from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, confirmed, photo_features
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import image_size
 from tests.builder.capture_maker import eyes, render, texture, write_capture
 
 COUNT = 8
@@ -171,3 +172,16 @@ def test_few_matches_count_only_where_a_third_photo_confirms_them() -> None:
     assert set(confirmed({**strong, (0, 2): pair(13, shift=5)})) == {(0, 1), (1, 2)}  # other features
     assert set(confirmed({**strong, (0, 2): pair(16, shift=5)})) == {(0, 1), (1, 2), (0, 2)}
     assert set(confirmed({(0, 1): pair(40), (0, 2): pair(13)})) == {(0, 1)}  # no photo matches both
+
+
+def test_the_command_draws_which_photos_overlap(clean: list[np.ndarray], tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    from ambiguous_wild.cli.capture import screen_command
+
+    checks(tmp_path / "raw", [*clean[:4], cv2.resize(texture(9), (320, 240))])
+    drawn = check_capture(tmp_path / "raw").overlap_map()
+    assert [p.kind for p in drawn.photos] == ["train"] * 4 + ["left out"]
+    done = CliRunner().invoke(screen_command, [str(tmp_path / "raw"), "-o", str(tmp_path / "map.png")])
+    assert done.exit_code == 0, done.output
+    assert image_size(tmp_path / "map.png") == (1300, 860)

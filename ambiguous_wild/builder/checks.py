@@ -16,8 +16,11 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from ambiguous_wild.builder.capture_map import CaptureMap, joins, map_of_photos
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.fixed_to_camera import words_of
+from ambiguous_wild.builder.growth import Growth, predict_growth
+from ambiguous_wild.builder.overlap_graph import Link
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
     candidate_pairs,
@@ -43,10 +46,9 @@ ISO_RATIO = 2.0  # one stop
 FOCAL_RATIO = 1.01
 SOFT = -0.8  # log2 of fine detail on the same surfaces: a photo below it is softer than the others
 FOCUS_SPREAD = 1.2  # log2, the same percentiles
-# Share of the overlapping pairs that differ by motion along the line of sight: 0.96 in a walk down a street,
-# which cannot be built; 0.58 in internet photos of unequal lenses and below 0.4 in others, which can.
+# Share of the overlapping pairs that differ by motion along the line of sight: 0.9 in a walk down a street,
+# where depth is imprecise; 0.58 in internet photos of unequal lenses and below 0.5 in others.
 FORWARD = 0.8
-MIN_PARTNERS = 2  # overlapping photos a photo needs
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ def run_checks(
     facts: Sequence[CheckedPhoto],
     thumbnails: np.ndarray,  # [N, 1024], see `screen.thumbnail`
     compared: PhotoComparison,
+    growth: Growth,
 ) -> list[Check]:
     """Run all checks, in the order of the table."""
     return [
@@ -75,7 +78,7 @@ def run_checks(
         focal_length(facts),
         blur(facts, compared),
         near_duplicates(facts, thumbnails),
-        overlap(facts, compared),
+        overlap(facts, compared, growth),
         motion(compared),
         fixed_to_camera(compared),
     ]
@@ -213,32 +216,36 @@ def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Ch
     )
 
 
-def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
-    """Find photos that do not overlap with the rest, and photos that overlap with few others."""
-    count = len(facts)
-    apart = [f["source"] for f, g in zip(facts, compared.group) if g != 0]
-    advice = "take more photos between these, each sharing two thirds of the picture with the next"
-    if apart:
-        groups = int(compared.group.max()) + 1
-        finding = f"{len(apart)} of {count} photos do not overlap with the rest ({groups} groups): "
-        finding += shortlist(apart, 3)
-        return Check("overlap", "warning", "pixels", finding, advice, tuple(apart))
-    few = [f["source"] for f, p in zip(facts, compared.partners) if p < min(MIN_PARTNERS, count - 1)]
-    median = float(np.median(compared.partners))
-    finding = f"each overlaps with {median:.0f} others (median)"
-    if few:
-        finding = (
-            f"{len(few)} of {count} photos overlap with fewer than {MIN_PARTNERS} others: {shortlist(few, 3)}"
-        )
-    return _row("overlap", "pixels", bool(few), finding, advice, tuple(few))
+def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison, growth: Growth) -> Check:
+    """Predict how many photos will be placed, and name those that share too little with the others."""
+    names, count = [f["source"] for f in facts], len(facts)
+    if not growth.parts:
+        finding = "no three photos share enough features: none will be placed"
+        advice = "take more photos, each sharing two thirds of the picture with the next"
+        return Check("overlap", "warning", "pixels", finding, advice, tuple(names))
+    main = growth.parts[0]
+    if len(main) == count:
+        median = float(np.median(compared.partners))
+        finding = f"each overlaps with {median:.0f} others (median); all {count} photos will be placed"
+        return Check("overlap", "ok", "pixels", finding)
+    finding = f"about {len(main)} of {count} photos will be placed"
+    if len(growth.parts) > 1:
+        finding += f"; parts: {', '.join(str(len(part)) for part in growth.parts)}"
+    if growth.others:
+        finding += "; the others share too few features with two photos at once: "
+        finding += shortlist([names[k] for k in growth.others], 3)
+    gaps = [f"{names[a]} and {names[b]}" for a, b in joins(growth, compared.links)]
+    advice = f"take 2 or 3 photos between {shortlist(gaps, 3)}"
+    outside = tuple(names[k] for k in range(count) if k not in main)
+    return Check("overlap", "warning", "pixels", finding, advice, outside)
 
 
 def motion(compared: PhotoComparison) -> Check:
-    """Find motion along the viewing direction: such photos overlap but give no depth."""
+    """Find motion along the viewing direction: such photos overlap but give little parallax."""
     if math.isnan(compared.forward):
         return Check("motion", "unknown", "pixels", "no two photos overlap enough to measure it")
     finding = f"{100 * compared.forward:.0f} % of overlapping pairs differ by motion along the line of sight"
-    advice = "walk sideways or around the subject: motion along the line of sight gives no parallax"
+    advice = "walk sideways or around the subject too: motion along the line of sight leaves depth imprecise"
     return _row("motion", "pixels", compared.forward > FORWARD, finding, advice)
 
 
@@ -287,11 +294,18 @@ class CaptureReport:
     photos: int  # readable photos
     skipped: list[SkippedPhoto]  # unreadable files and copies
     checks: list[Check]
+    sources: list[str]  # of the readable photos, in the order of capture
+    links: list[Link]  # photos that overlap
+    growth: Growth
 
     @property
     def warnings(self) -> list[Check]:
         """The checks that failed."""
         return [c for c in self.checks if c.state == "warning"]
+
+    def overlap_map(self) -> CaptureMap:
+        """Lay out the photos by their overlap."""
+        return map_of_photos(self.sources, self.links, self.growth)
 
 
 def check_capture(
@@ -320,10 +334,12 @@ def check_capture(
     bar.start("comparing photos", len(candidate_pairs(features)))
     compared = compare_photos(features, bar.step, jobs)
     bar.finish()
-    checks = run_checks(facts, read.thumbnails, compared)
+    growth = predict_growth(len(facts), compared.matches)
+    checks = run_checks(facts, read.thumbnails, compared, growth)
     if read.skipped:
         checks.insert(0, _files_check(read.skipped, len(capture.sources)))
-    return CaptureReport(capture.root, len(facts), read.skipped, checks)
+    names = [f["source"] for f in facts]
+    return CaptureReport(capture.root, len(facts), read.skipped, checks, names, compared.links, growth)
 
 
 def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:

@@ -26,6 +26,7 @@ class SceneParts:
     test: list[str]
     truth_files: list[Path]  # cameras.json and capture.json of a simulated capture
     motion: Path  # file of the motion points
+    map: Path  # picture of the cameras from above
     masked: list[str]  # test photos with a mask or alpha of their own
 
 
@@ -55,7 +56,8 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
             _place(small / "truth" / part, folder / "truth" / part, link)
     for path in parts.truth_files:
         _place_file(path, folder / "truth" / path.name, link=False)
-    _place_file(parts.motion, folder / parts.motion.name, link=link)
+    for path in (parts.motion, parts.map):
+        _place_file(path, folder / path.name, link=link)
     (folder / "train_list.txt").write_text("".join(f"{n}\n" for n in parts.train), encoding="utf-8")
     (folder / "test_list.txt").write_text("".join(f"{n}\n" for n in parts.test), encoding="utf-8")
     write_json(folder / "nb-info.json", nerfbaselines_info(parts.factor, record["name"]))

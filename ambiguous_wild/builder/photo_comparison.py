@@ -18,9 +18,12 @@ import numpy as np
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
 
 SIDE = 800  # px, longer side at which photos are compared
-FEATURES = 1000
+FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
 RATIO = 0.8  # Lowe's ratio test
 MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
+# Fewer matches are enough if a third photo confirms some of them, by a feature that matches both. With 16
+# alone, a walk of 29 photos that COLMAP places whole seems to fall into 24 and 5.
+LEAST_MATCHES, CONFIRMED = 12, 2
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
 EXTRA_CANDIDATES = 60  # further candidates of a photo that overlaps with none or one of these
@@ -30,9 +33,12 @@ _PATCH = 4  # px, half a patch around a feature
 QUANTITIES = ("exposure", "red", "blue", "sharpness")  # log2 each; red and blue over green
 
 
+Matches = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]  # two photos -> matching features, [M] each
+
+
 @dataclass(frozen=True)
 class PhotoFeatures:
-    """Features and colours of one photo, about 150 kB, from which photos are compared."""
+    """Features and colours of one photo, about 300 kB, from which photos are compared."""
 
     size: tuple[int, int]  # width and height at which it is compared, px
     xy: np.ndarray  # [F, 2] float32 px
@@ -47,9 +53,14 @@ class PhotoComparison:
 
     offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
     partners: np.ndarray  # [N] int, number of photos that overlap with it
-    group: np.ndarray  # [N] int, connected groups of overlapping photos; 0 is the largest
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
     fixed: list[FixedArea]  # fixed to the camera; its features are not compared
+    matches: Matches
+
+    @property
+    def links(self) -> list[tuple[int, int, int]]:
+        """Pairs of photos that overlap, with the number of their matches."""
+        return [(*pair, len(rows)) for pair, (rows, _) in sorted(self.matches.items())]
 
 
 def photo_features(
@@ -108,25 +119,29 @@ def compare_photos(
     """Match each photo with the next and the most similar ones; solve for one offset a photo."""
     ordered = candidate_pairs(features)
     with ThreadPoolExecutor(jobs) as pool:
-        matches = dict(zip(ordered, pool.map(lambda pair: _raw_matches(features, pair), ordered)))
+        raw = dict(zip(ordered, pool.map(lambda pair: _raw_matches(features, pair), ordered)))
     sizes = [f.size for f in features]
-    fixed = find_fixed([f.xy for f in features], sizes, [0] * len(features), matches)
+    fixed = find_fixed([f.xy for f in features], sizes, [0] * len(features), raw)
     if fixed:
         features = _without(features, fixed)
-        matches = {pair: _raw_matches(features, pair) for pair in ordered}
+        raw = {pair: _raw_matches(features, pair) for pair in ordered}
     count = len(features)
     graph = np.zeros((count, count), bool)
+    matches: Matches = {}
     rows: list[tuple[int, int, np.ndarray, float]] = []
     forward: list[bool] = []
 
     def matched(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
-        matching = _match(features, pair, matches[pair])
+        matching = _match(features, pair, raw[pair])
         step()
         return matching
 
     def enter(i: int, j: int, inliers: tuple[np.ndarray, np.ndarray] | None) -> None:
         if inliers is None:
             return
+        matches[i, j] = inliers
+        if len(inliers[0]) < MIN_INLIERS:
+            return  # too few for the direction of motion and the settings
         graph[i, j] = graph[j, i] = True
         forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]], features[i].size))
         difference = features[i].values[inliers[0]] - features[j].values[inliers[1]]
@@ -147,7 +162,27 @@ def compare_photos(
                 tried.add(pair)
                 enter(*pair, _match(features, pair, _raw_matches(features, pair)))
     share = float(np.mean(forward)) if forward else math.nan
-    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), _groups(graph), share, fixed)
+    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, fixed, confirmed(matches))
+
+
+def confirmed(matches: Matches) -> Matches:
+    """Leave out pairs with fewer than `MIN_INLIERS` matches of which no third photo confirms `CONFIRMED`."""
+    partner: dict[int, dict[int, dict[int, int]]] = {}  # photo -> other photo -> feature -> its feature
+    for (a, b), (one, two) in matches.items():
+        partner.setdefault(a, {})[b] = dict(zip(one.tolist(), two.tolist()))
+        partner.setdefault(b, {})[a] = dict(zip(two.tolist(), one.tolist()))
+
+    def confirms(third: int, a: int, b: int) -> bool:
+        first, second = partner[a][third], partner[b][third]
+        both = ((first.get(f), second.get(g)) for f, g in partner[a][b].items())
+        return sum(f is not None and f == g for f, g in both) >= CONFIRMED
+
+    sure: Matches = {}
+    for (a, b), ends in matches.items():
+        third = partner[a].keys() & partner[b].keys()
+        if len(ends[0]) >= MIN_INLIERS or any(confirms(c, a, b) for c in third):
+            sure[a, b] = ends
+    return sure
 
 
 def is_forward(
@@ -203,9 +238,9 @@ def _without(features: Sequence[PhotoFeatures], fixed: Sequence[FixedArea]) -> l
 def _raw_matches(
     features: Sequence[PhotoFeatures], pair: tuple[int, int]
 ) -> np.ndarray:  # [K, 2] features of the pair's photos
-    """Match two photos, without a check of the geometry; both need `MIN_INLIERS` features."""
+    """Match two photos, without a check of the geometry; both need `LEAST_MATCHES` features."""
     a, b = (features[k] for k in pair)
-    if min(len(a.xy), len(b.xy)) < MIN_INLIERS:
+    if min(len(a.xy), len(b.xy)) < LEAST_MATCHES:
         return np.zeros((0, 2), int)
     return np.column_stack(_ratio_matches(a.descriptors, b.descriptors))
 
@@ -215,13 +250,13 @@ def _match(
     pair: tuple[int, int],
     matches: np.ndarray,  # of `_raw_matches`
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the indices of matching features in each photo; None where the photos do not overlap."""
+    """Return the indices of matching features in each photo; None where they are too few."""
     (a, b), (one, two) = (features[k] for k in pair), matches.T
-    if len(one) < MIN_INLIERS:
+    if len(one) < LEAST_MATCHES:
         return None
     cv2.setRNGSeed(0)
     _, inlier = cv2.findFundamentalMat(a.xy[one], b.xy[two], cv2.FM_RANSAC, 2.0, 0.99, 500)
-    if inlier is None or int(inlier.sum()) < MIN_INLIERS:
+    if inlier is None or int(inlier.sum()) < LEAST_MATCHES:
         return None
     keep = inlier.ravel() > 0
     return one[keep], two[keep]

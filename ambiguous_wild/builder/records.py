@@ -155,6 +155,12 @@ class MotionResult(TypedDict):
     silent: int  # photos without such features
 
 
+class MapResult(TypedDict):
+    """Result of the stage `map`."""
+
+    advice: list[str]  # where to take more photos
+
+
 class DownsampleResult(TypedDict):
     """Result of the stage `downsample`."""
 

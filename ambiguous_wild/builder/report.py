@@ -11,6 +11,7 @@ from typing import cast
 import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import words_of
+from ambiguous_wild.builder.map_drawing import FILE as MAP
 from ambiguous_wild.builder.records import (
     BuildInputs,
     BuildRecord,
@@ -21,6 +22,7 @@ from ambiguous_wild.builder.records import (
     FixedRecord,
     LostPhoto,
     MappingResult,
+    MapResult,
     MaskResult,
     MatchResult,
     MotionResult,
@@ -263,6 +265,12 @@ def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> li
     if not odd:
         return []
     return [f"focal length of {len(odd)} of {len(cameras)} cameras contradicts EXIF: {shortlist(odd, 2)}"]
+
+
+def map_warnings(result: MapResult) -> list[str]:
+    """Return one warning with the advice of the map, if there is any."""
+    advice = result["advice"]
+    return [f"the capture has weak places, see {MAP}: {shortlist(advice, 2)}"] if advice else []
 
 
 def _parallax_warnings(model: Model) -> list[str]:

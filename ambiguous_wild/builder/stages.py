@@ -18,6 +18,8 @@ import numpy as np
 from ambiguous_wild.builder import report
 from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, read_test_list, split_photos
 from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
+from ambiguous_wild.builder.map_drawing import FILE as MAP
+from ambiguous_wild.builder.map_drawing import draw_built
 from ambiguous_wild.builder.masks import (
     add_fixed,
     alphas,
@@ -277,6 +279,17 @@ class Stages:
                 {work_name: f"{stem}.png" for work_name, stem in stems.items() if f"{stem}.png" in train},
             ),
         )
+        drawn = work.run(
+            "map",
+            [inputs["versions"], mapping.key, test],
+            lambda f: draw_built(
+                f,
+                model,
+                mapping.facts,
+                {fact["work_name"]: fact["source"] for fact in facts},
+                [name for name, stem in stems.items() if f"{stem}.png" in test],
+            ),
+        )
         factor = settings.factor or auto_factor([(f["width"], f["height"]) for f in facts])
         small_key, small_folder = flat.key, None
         if factor > 1:
@@ -301,7 +314,11 @@ class Stages:
             motion=motion.facts,
             masks=mask_stage.facts if mask_stage else None,
             fixed=matches.facts["fixed"],
-            warnings=[*mask_warnings(mask_stage.facts if mask_stage else None), *split_warnings],
+            warnings=[
+                *mask_warnings(mask_stage.facts if mask_stage else None),
+                *split_warnings,
+                *report.map_warnings(drawn.facts),
+            ],
         )
         record: KeyedRecord = {
             **record_of_build,
@@ -318,6 +335,7 @@ class Stages:
             test,
             [p for p in truth_files if p.is_file()],
             motion.folder / FILE,
+            drawn.folder / MAP,
             [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts["kept_share"]],
         )
         return self._package(work, small_key, parts, record)
@@ -393,7 +411,12 @@ class Stages:
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
             best.matches.facts,
-            [*panorama_warnings(facts), *used, *report.fixed_lines(best.matches.facts["fixed"])],
+            [
+                *panorama_warnings(facts),
+                *used,
+                *report.fixed_lines(best.matches.facts["fixed"]),
+                "'aw screen PHOTOS -o map.png' draws which photos overlap",
+            ],
         )
         return best
 

@@ -96,17 +96,26 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 
 @click.command("screen")
 @click.argument("raw", type=PathName(), nargs=-1, required=True)
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Picture of which photos overlap, a PNG.")
 @click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
 @threads_option
 @click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
-def screen_command(raw: tuple[Path, ...], strict: bool, threads: int | None, as_json: bool) -> None:
+def screen_command(
+    raw: tuple[Path, ...], output: Path | None, strict: bool, threads: int | None, as_json: bool
+) -> None:
     """Check the photos in RAW before building: exposure, white balance, ISO, focus, focal length, blur,
-    near-duplicates, overlap, motion. Nothing is written."""
+    near-duplicates, overlap, motion. Nothing is written but the picture of -o."""
 
     from ambiguous_wild.builder.checks import check_capture, refuse_failed
+    from ambiguous_wild.builder.map_drawing import write_map
     from ambiguous_wild.builder.progress import Bar
+    from ambiguous_wild.io.files import check_output
 
+    if output is not None:
+        check_output(output)
     report = check_capture(raw, jobs=threads or os.cpu_count() or 1, bar=Bar(not as_json))
+    if output is not None:
+        write_map(report.overlap_map(), output)
     if as_json:
         facts = {
             "capture": str(report.root),

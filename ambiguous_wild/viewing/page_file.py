@@ -22,9 +22,11 @@ from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.viewing.model import Model, Renderer, space_of
 
 PAGE = "index.html"
+MAP = "map.png"  # in the scene's folder
 GENERATOR = '<meta name="generator" content="aw view">'
 MOST_GAUSSIANS = 150_000  # default size of a model: about 6 MB, which a phone still turns smoothly
-MOST_PHOTO_BYTES = 1_000_000  # text of all photos
+MOST_PHOTO_BYTES = 1_000_000  # text of all photos and of the map
+MOST_MAP_BYTES = 200_000
 MOST_POINTS = 20_000  # moving and static features of all photos
 MOST_MASK_BYTES = 300_000  # text of the masks of all models
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
@@ -106,11 +108,12 @@ def page_text(
     for line in page_notes:
         say(line)
     space = space_of(scene)
+    capture_map = map_uri(scene.root / MAP)
     if views[0].image_path == NO_PHOTO:
         drawn = Renderer(models[0].read(), models[0].render_settings)
         uris = [data_uri("jpeg", jpeg_bytes(narrowed(drawn(v.camera), WIDTHS[1]), _QUALITY)) for v in views]
     else:
-        uris = photo_uris(views, MOST_PHOTO_BYTES)
+        uris = photo_uris(views, MOST_PHOTO_BYTES - len(capture_map))
     data = {
         "up": space.up.tolist(),
         "middle": space.middle.tolist(),
@@ -119,6 +122,7 @@ def page_text(
         "centre": scene.place.centre,  # converts saved paths to the coordinates of the scene's files
         "scale": scene.place.scale,
         "views": [_view_facts(v, uri, points) for v, uri, points in zip(views, uris, _points(scene, views))],
+        "map": capture_map,
         "models": facts,
         "notes": page_notes,
     }
@@ -206,6 +210,7 @@ def _fill(title: str, data: Mapping[str, object], models: str) -> str:
 
 
 WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
+MAP_WIDTHS = (1300, 1000, 800)  # px
 _QUALITY = 78
 _MASK_WIDTH = 480  # px; largest width of masks
 
@@ -216,6 +221,11 @@ def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
     1000 photos or more can exceed it at the smallest width. One photo is in memory at a time.
     """
     return _as_wide_as_fits(_photo, [view.image_path for view in views], WIDTHS, most_bytes)
+
+
+def map_uri(path: Path) -> str:
+    """Return a data: address of the scene's map as JPEG, "" without one."""
+    return _as_wide_as_fits(_photo, [path], MAP_WIDTHS, MOST_MAP_BYTES)[0] if path.is_file() else ""
 
 
 def mask_uris(folder: Path, views: Sequence[View], most_bytes: int) -> dict[str, str]:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder.checks import Check, check_capture, noise, refuse_failed
-from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, photo_features
+from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, confirmed, photo_features
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import image_size
 from tests.builder.capture_maker import eyes, render, texture, write_capture
 
 COUNT = 8
@@ -81,7 +82,9 @@ def test_a_stranger_does_not_hang_together_and_a_copy_is_a_duplicate(
     stranger = cv2.resize(texture(9), (320, 240))
     again = cv2.convertScaleAbs(clean[2], alpha=0.97)
     found = checks(tmp_path / "raw", [*clean, again, stranger])
-    assert found["overlap"].photos == ("p09.png",) and "2 groups" in found["overlap"].finding
+    assert found["overlap"].photos == ("p09.png",)
+    assert found["overlap"].finding.startswith("about 9 of 10 photos will be placed; the others share")
+    assert found["overlap"].advice == "take 2 or 3 photos between p08.png and p09.png"
     assert found["near-duplicates"].photos == ("p08.png",)
 
 
@@ -136,7 +139,7 @@ def test_pairs_of_a_large_capture_grow_with_its_length() -> None:
 
 def test_featureless_photos_are_unknown_not_an_error() -> None:
     got = compare_photos([photo_features(np.full((60, 80, 3), 90, np.uint8))] * 3)
-    assert np.isnan(got.offsets).all() and got.partners.tolist() == [0, 0, 0] and got.group.max() == 2
+    assert np.isnan(got.offsets).all() and got.partners.tolist() == [0, 0, 0] and not got.matches
 
 
 def test_noise_of_a_grey_card_is_its_sigma() -> None:
@@ -158,3 +161,27 @@ def test_matches_are_those_of_opencv():
     wanted = [(m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < RATIO * n.distance]
     found = _ratio_matches(a, b)
     assert len(wanted) >= 80 and list(zip(*(part.tolist() for part in found))) == wanted
+
+
+def test_few_matches_count_only_where_a_third_photo_confirms_them() -> None:
+    def pair(count: int, shift: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        return np.arange(count), (np.arange(count) + shift) % 100
+
+    strong = {(0, 1): pair(40), (1, 2): pair(40)}
+    assert set(confirmed({**strong, (0, 2): pair(13)})) == {(0, 1), (1, 2), (0, 2)}
+    assert set(confirmed({**strong, (0, 2): pair(13, shift=5)})) == {(0, 1), (1, 2)}  # other features
+    assert set(confirmed({**strong, (0, 2): pair(16, shift=5)})) == {(0, 1), (1, 2), (0, 2)}
+    assert set(confirmed({(0, 1): pair(40), (0, 2): pair(13)})) == {(0, 1)}  # no photo matches both
+
+
+def test_the_command_draws_which_photos_overlap(clean: list[np.ndarray], tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    from ambiguous_wild.cli.capture import screen_command
+
+    checks(tmp_path / "raw", [*clean[:4], cv2.resize(texture(9), (320, 240))])
+    drawn = check_capture(tmp_path / "raw").overlap_map()
+    assert [p.kind for p in drawn.photos] == ["train"] * 4 + ["left out"]
+    done = CliRunner().invoke(screen_command, [str(tmp_path / "raw"), "-o", str(tmp_path / "map.png")])
+    assert done.exit_code == 0, done.output
+    assert image_size(tmp_path / "map.png") == (1300, 860)

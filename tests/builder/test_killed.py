@@ -61,6 +61,7 @@ REUSED = {
         "mapping",
         "undistort",
         "motion",
+        "map",
         "downsample",
         "package",
     },

@@ -76,6 +76,7 @@ def test_folder_is_what_design_says(scene):
         assert small == (round(camera.width / 2), round(camera.height / 2))
     assert (scene / "test_list.txt").read_text().split() == ["p01.png", "p04.png"]
     assert len((scene / "train_list.txt").read_text().split()) == 4
+    assert image_size(scene / "map.png") == (1300, 860)
     nb = json.loads((scene / "nb-info.json").read_text())
     assert nb["loader_kwargs"] == {"images_path": "images_2"}
 
@@ -162,7 +163,7 @@ def test_other_settings_are_refused_by_name_until_overwrite(built, raw, tmp_path
     other = replace(SETTINGS, factor=4)
     result = build_scene(raw, out, other, overwrite=True, keep_work=True)
     # Only what depends on the factor ran again.
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion", "map"}
     assert (out / "images_4").is_dir()
     assert not (out / "images_2").exists()
     # The scene deleted, the work kept: packaging runs again, nothing else.
@@ -268,7 +269,7 @@ def test_a_full_disk_keeps_what_is_done_and_goes_on(built, raw, scene, tmp_path,
             build_scene(raw, tmp_path / "scene", SETTINGS)
     assert not (tmp_path / "scene").exists()
     result = build_scene(raw, tmp_path / "scene", SETTINGS)
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion", "map"}
     assert hashes(result.scene) == hashes(scene)
 
 

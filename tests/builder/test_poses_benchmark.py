@@ -58,7 +58,10 @@ def test_the_table_tells_refused_wrong_and_missing(poses):
     text = poses.markdown(rows)
     assert "| a-0 | 9 | 8 of 8; 0.10 %; -0.20 % | 8 of 9; 1 wrong, 74.0; 0.40 %; +9.00 % |" in text
     assert "| b-0 | 0 | refused |  |" in text
-    assert "Over the 1 captures" in text and "- auto: 8 of 9 photos right, 0 wrong, 1 left out, 0 captures" in text
+    assert (
+        "Over the 1 captures" in text
+        and "- auto: 8 of 9 photos right, 0 wrong, 1 left out, 0 captures" in text
+    )
     assert "- colmap: 8 of 9 photos right, 1 wrong" in text
 
 

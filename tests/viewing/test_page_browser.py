@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.harness.trained_models import Viewer, view_runs
+from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.viewing.model import Renderer, RenderSettings
 from ambiguous_wild.viewing.video import fitted
@@ -54,6 +55,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = write_tiny_scene(root / "porch")
     write_shown_run(root / "runs", scene, "3dgs", 0, noise=20.0)
     write_shown_run(root / "runs", scene, HOSTILE, 1, noise=5.0)
+    write_png(scene / "map.png", np.full((86, 130, 3), 200, np.uint8))
     view_runs([root / "runs"], root / "view", title=HOSTILE)
     return root
 
@@ -146,6 +148,10 @@ def test_every_control(runs: Path, page: Browser, tmp_path: Path) -> None:
     settle(page)
     said = page.run("$('said').textContent")
     assert said.count(" dB") == 2 and HOSTILE in said
+    for control in ("#chart", "#map"):  # shown by the button, hidden by a click on it
+        page.click(control)
+        assert page.run("$('map').hidden") == (control == "#map")
+        assert page.run("$('chart').getAttribute('aria-pressed')") == str(control == "#chart").lower()
     both = shot(page, tmp_path)
     half = both.shape[1] // 2
     labels = facts(page, "DATA.models.map((m) => m.label)")

@@ -23,7 +23,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.spz import read_spz
 from ambiguous_wild.viewing import page_file
 from ambiguous_wild.viewing.model import RenderSettings
-from ambiguous_wild.viewing.page_file import importance, reduced
+from ambiguous_wild.viewing.page_file import MAP, importance, reduced
 from tests.command_line import aw
 from tests.harness.board_runs import change_result
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
@@ -44,6 +44,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         np.array([0, 1], np.int16),
     )
     write_motion_points(scene / FILE, {TRAIN[0]: points})
+    write_png(scene / MAP, np.full((86, 130, 3), 200, np.uint8))
     write_shown_run(root / "runs", scene, "3dgs", noise=20.0)
     write_shown_run(root / "runs", scene, HOSTILE, noise=5.0)
     return root / "runs"
@@ -63,6 +64,7 @@ def test_the_page_holds_models_photos_masks_and_numbers(runs: Path, tmp_path: Pa
     assert [v["name"] for v in data["views"]] == TEST + TRAIN
     points = {v["name"]: v["points"] for v in data["views"] if v["points"]}
     assert points == {TRAIN[0]: [499, 249, 1, 0, 999, 0]}  # what moves comes first
+    assert image_of(data["map"]).shape == (86, 130, 3)
     assert {m["label"] for m in data["models"]} == {"3dgs", HOSTILE}
     for model in data["models"]:
         assert set(model["psnr"]) == set(TEST) and model["mean"] == pytest.approx(
@@ -243,6 +245,14 @@ def test_photos_and_masks_stay_below_their_share_of_the_page(runs: Path, tmp_pat
     assert {image_of(uri).shape[:2] for uri in wide} == {(270, 480)}  # never enlarged
     least = page_file.photo_uris(views, 1)  # too little for any: the smallest
     assert {image_of(uri).shape[1] for uri in least} == {page_file.WIDTHS[-1]}
+
+
+def test_a_map_stays_below_its_share_of_the_page_and_may_be_missing(tmp_path: Path) -> None:
+    assert page_file.map_uri(tmp_path / MAP) == ""
+    write_png(tmp_path / MAP, np.random.default_rng(0).integers(0, 256, (860, 1300, 3), np.uint8))
+    assert image_of(page_file.map_uri(tmp_path / MAP)).shape[1] == page_file.MAP_WIDTHS[-1]  # noise
+    write_png(tmp_path / MAP, np.full((860, 1300, 3), 255, np.uint8))
+    assert image_of(page_file.map_uri(tmp_path / MAP)).shape[1] == 1300
 
 
 def image_of(uri: str) -> np.ndarray:

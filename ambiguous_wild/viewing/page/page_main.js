@@ -110,6 +110,12 @@ function home() {
   choose({ view: null });
 }
 
+function toggleMap() {
+  if (!DATA.map) return;
+  $("map").hidden = !$("map").hidden;
+  $("chart").setAttribute("aria-pressed", String(!$("map").hidden));
+}
+
 function addToPath() {
   state.path.push(pathEntry(camera));
   $("path").textContent = `Path (${state.path.length})`;
@@ -169,6 +175,7 @@ function onKey(event) {
   else if (key === "c") choose({ frusta: !state.frusta });
   else if (key === "m") choose({ masks: !state.masks });
   else if (key === "h") home();
+  else if (key === "t") toggleMap();
   else if (key === "p") addToPath();
   else if (key === "v") choose({ mode: { single: "beside", beside: "cut", cut: "single" }[state.mode] });
   else if (/^[1-9]$/.test(key) && Number(key) <= DATA.models.length) choose({ left: Number(key) - 1 });
@@ -191,6 +198,7 @@ function listen() {
   $("previous").addEventListener("click", () => step(-1));
   $("next").addEventListener("click", () => step(1));
   $("home").addEventListener("click", home);
+  for (const id of ["chart", "map"]) $(id).addEventListener("click", toggleMap);
   $("path").addEventListener("click", () => (state.path.length > 1 ? savePath() : busyFor("press P at two cameras or more, then save the path")));
   $("slider").addEventListener("input", () => { state.cut = Number($("slider").value); placeCut(); });
   $("help-button").addEventListener("click", () => {
@@ -232,6 +240,8 @@ async function start() {
   for (const side of ["left", "right"]) fill($(side), [...models, [PHOTO, "the photo"]]);
   fill($("view"), [["", "free"], ...DATA.views.map((v, i) => [String(i), `${v.split}: ${v.name}`])]);
   $("notes").replaceChildren(...DATA.notes.map((note) => h("li", {}, note)));
+  $("chart").hidden = !DATA.map;
+  $("map").style.backgroundImage = `url(${DATA.map})`;
   busy("starting");
   R = await loadRenderer();
   T = R.THREE;

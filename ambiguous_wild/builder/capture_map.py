@@ -1,0 +1,336 @@
+"""What a map of a capture shows: cameras from above, which photos overlap, and where to take more photos.
+
+`map_of_model` maps a built scene, `map_of_photos` photos without poses; `map_drawing` draws either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+
+from ambiguous_wild.builder.growth import Growth
+from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, lay_out, weakly_held
+from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.io.colmap_records import Model
+
+MOST_POINTS = 5000  # of the backdrop
+STRONGEST = 4  # links drawn of each photo, besides the weak ones
+LONGEST_NAME = 14  # characters
+DOWN = 0.8  # share of the mean viewing direction along the normal of the cameras' plane: nadir photos
+# Cameras lie in a plane if their second axis is longer than this share of the first, and their third shorter
+# than this share of the second.
+WIDE, THIN = 0.15, 0.4
+LEVEL = 0.3  # length of the mean up direction below which up is unknown; shorter headings are not drawn
+COMMON = 0.4  # length of the mean heading from which on it is up on the map
+ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
+ROOM = 0.4  # of this distance: free room around such a photo
+
+Kind = Literal["train", "test", "part", "left out"]
+
+
+@dataclass(frozen=True)
+class MapPhoto:
+    """A photo on the map."""
+
+    name: str
+    xy: tuple[float, float]  # x right, y up
+    kind: Kind = "train"
+    heading: tuple[float, float] | None = None  # viewing direction, at most unit length; None: unknown
+    provisional: bool = False  # placed with little evidence
+    weak: bool = False  # few partners
+    unsure: bool = False  # the position is a guess
+
+
+@dataclass(frozen=True)
+class MapLink:
+    """Two photos that overlap."""
+
+    ends: tuple[int, int]  # indices of photos
+    matches: int
+    kind: Literal["strong", "weak", "left out"] = "strong"
+
+
+@dataclass(frozen=True)
+class CaptureMap:
+    """Everything that is drawn."""
+
+    title: str
+    photos: list[MapPhoto]
+    links: list[MapLink]
+    stars: list[tuple[float, float]]  # where to take more photos
+    advice: list[str]  # what to take there
+    listed: list[str] = field(default_factory=list)  # photos that are not on the map, with the reason
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # [P, 2] backdrop
+    colours: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # [P, 3] of the points
+    posed: bool = True  # positions are those of the cameras
+
+
+def map_of_model(
+    model: Model,  # named by work names
+    mapping: Mapping[str, Any],  # `MappingResult`; what it lacks is not drawn
+    sources: Mapping[str, str],  # work name -> path in the capture, in the order of capture
+    tests: Collection[str],  # work names
+) -> CaptureMap:
+    """Return the map of a built scene."""
+    placed = {image.name: image.cam_from_world() for image in model.images.values()}
+    names = [name for name in sources if name in placed]
+    poses = np.array([placed[name] for name in names]).reshape(-1, 4, 4)
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    plane = top_view(poses[:, :3, :3], centres)
+    flat = centres @ plane.T
+    size = longer_side(flat)
+    labels = {name: photo_label(source) for name, source in sources.items()}
+    provisional = set(mapping.get("provisional", ()))
+    photos = [
+        MapPhoto(
+            labels[name],
+            as_pair(flat[k]),
+            "test" if name in tests else "train",
+            as_pair(plane @ poses[k, 2, :3]),
+            provisional=name in provisional,
+        )
+        for k, name in enumerate(names)
+    ]
+    at = {name: k for k, name in enumerate(names)}
+    links = _links(mapping.get("links", ()), at)
+    other_parts = [part for part in mapping.get("parts", ()) if not at.keys() & set(part)]
+    elsewhere = {name for part in other_parts for name in part}
+    left_out = {name: why for name, why in mapping["left_out"].items() if name in sources.keys() - elsewhere}
+    order = {name: k for k, name in enumerate(sources)}
+    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, seen from above", photos, [], [], [])
+    result = _with_links(result, links)
+    for part in other_parts:
+        members = sorted(order[name] for name in part if name in order)
+        if not members:
+            continue
+        every = list(sources)
+        loose = _links(mapping.get("unplaced_links", ()), order)
+        inside, outside = best_join([order[name] for name in names], members, loose)
+        pair = (labels[every[inside]], labels[every[outside]])
+        named = shortlist([labels[every[k]] for k in members], 3)
+        result.listed.append(f"another part, {len(members)} photos: {named}")
+        result.advice.insert(0, f"take a photo that shows both {pair[0]} and {pair[1]}, to join the parts")
+    result = _with_left_out(result, left_out, mapping, labels, at, plane, size)
+    points = model.points.xyz[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
+    colours = model.points.rgb[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
+    return replace(result, points=points @ plane.T, colours=colours)
+
+
+def map_of_photos(
+    sources: Sequence[str],  # in the order of capture
+    links: Sequence[Link],
+    growth: Growth,
+) -> CaptureMap:
+    """Return the map of photos without poses: near each other if they overlap much."""
+    main = set(growth.parts[0]) if growth.parts else set()
+    in_part = {photo for part in growth.parts[1:] for photo in part}
+    xy = lay_out(len(sources), links)
+    photos = [
+        MapPhoto(
+            photo_label(source),
+            as_pair(xy[k]),
+            "train" if k in main else "part" if k in in_part else "left out",
+        )
+        for k, source in enumerate(sources)
+    ]
+    whole = len(main) == len(sources)
+    share = f"all {len(main)}" if whole else f"about {len(main)} of {len(sources)}"
+    title = f"{share} photos will be placed; near = much overlap, not positions"
+    result = _with_links(CaptureMap(title, photos, [], [], [], posed=False), links)
+    gaps = joins(growth, links)
+    matches = {link[:2]: link[2] for link in links}
+    bridged = [
+        MapLink(pair, matches.get(_sorted(pair), 0), "weak" if _sorted(pair) in matches else "left out")
+        for pair in gaps
+    ]
+    known = {_sorted(pair) for pair in gaps}
+    return replace(
+        result,
+        links=[*(link for link in result.links if _sorted(link.ends) not in known), *bridged],
+        stars=list(dict.fromkeys([*(_middle(photos[a], photos[b]) for a, b in gaps), *result.stars])),
+        advice=list(dict.fromkeys([*(_between(photos[a], photos[b]) for a, b in gaps), *result.advice])),
+        listed=[
+            f"another part, {len(part)} photos: {shortlist([photos[k].name for k in part], 3)}"
+            for part in growth.parts[1:]
+        ]
+        + ([f"of no part: {shortlist([photos[k].name for k in growth.others])}"] if growth.others else []),
+    )
+
+
+def joins(growth: Growth, links: Sequence[Link]) -> list[tuple[int, int]]:
+    """Return pairs of photos between which more photos are needed, so that all parts join the first."""
+    if not growth.parts:
+        return []
+    inside, pairs = set(growth.parts[0]), []
+    left = [*growth.parts[1:], *([k] for k in growth.others)]
+    while left:
+        pair = best_join(inside, [photo for part in left for photo in part], links)
+        pairs.append(pair)
+        (joined,) = (part for part in left if pair[1] in part)
+        inside |= set(joined)
+        left.remove(joined)
+    return pairs
+
+
+def between(first: str, second: str) -> str:
+    """Return the advice for two photos that hardly overlap."""
+    return f"take 2 or 3 photos between {first} and {second}"
+
+
+def photo_label(source: str) -> str:
+    """Return the name of a photo for the map: without extension, its beginning left out if it is long."""
+    text = "".join(c if c.isprintable() else "?" for c in str(PurePosixPath(source).with_suffix("")))
+    return text if len(text) <= LONGEST_NAME else f"…{text[1 - LONGEST_NAME :]}"
+
+
+def top_view(
+    rotations: np.ndarray,  # [N, 3, 3] camera from world
+    centres: np.ndarray,  # [N, 3] world
+) -> np.ndarray:  # [2, 3]
+    """Return the map's axes, right and up, in the world.
+
+    The map is perpendicular to the cameras' mean up direction. Nadir photos have no common one: they are seen
+    as from behind the cameras, on the plane in which these lie. Up on the map is where most photos look; if
+    they look all round, the longest axis of the path is horizontal and the first photo on the left.
+    """
+    spread = centres - centres.mean(axis=0)
+    axes = np.linalg.svd(spread, full_matrices=False)[2] if len(centres) > 2 else np.eye(3)
+    sizes = np.sqrt(((spread @ axes.T) ** 2).mean(axis=0))
+    view, up = rotations[:, 2].mean(axis=0), -rotations[:, 1].mean(axis=0)
+    plane = sizes[1] > WIDE * sizes[0] and sizes[2] < THIN * sizes[1]
+    if plane and abs(view @ axes[2]) > DOWN:
+        normal = -axes[2] * np.sign(view @ axes[2])
+    elif np.linalg.norm(up) > LEVEL:
+        normal = up / np.linalg.norm(up)
+    else:
+        normal = axes[2] * (1 if up @ axes[2] >= 0 else -1)
+    ahead = view - (view @ normal) * normal
+    if np.linalg.norm(ahead) > COMMON:
+        ahead /= np.linalg.norm(ahead)
+        return np.stack([np.cross(ahead, normal), ahead])
+    longest = np.linalg.svd(spread - np.outer(spread @ normal, normal), full_matrices=False)[2][0]
+    right = longest - (longest @ normal) * normal
+    right /= max(float(np.linalg.norm(right)), 1e-12)
+    return np.stack([right, np.cross(normal, right)]) * (-1 if spread[0] @ right > 0 else 1)
+
+
+def _links(rows: Sequence[Sequence[Any]], at: Mapping[str, int]) -> list[Link]:
+    """Return links between known photos by index."""
+    known = [(at[a], at[b], int(m)) for a, b, m in rows if a in at and b in at]
+    return [(*_sorted((a, b)), m) for a, b, m in known]
+
+
+def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
+    """Add the strongest links of each photo and all weak ones, with advice for these."""
+    photos = drawn.photos
+    kept = [k for k, photo in enumerate(photos) if photo.kind in ("train", "test")]
+    weak_photos = set(weakly_held(kept, links)) if links else set()
+    weak = bridges(len(photos), links)
+    strongest: set[tuple[int, int]] = set()
+    of: list[list[Link]] = [[] for _ in photos]
+    for link in sorted(links, key=lambda link: (-link[2], link)):
+        for end in link[:2]:
+            if len(of[end]) < STRONGEST:
+                strongest.add(link[:2])
+            of[end].append(link)
+    # A photo with few partners needs one of its links strengthened: the strongest, where overlap is proven.
+    wanted = weak | {of[k][0][:2] for k in weak_photos if of[k]}
+    shown = [
+        MapLink((a, b), matches, "weak" if (a, b) in wanted else "strong")
+        for a, b, matches in links
+        if (a, b) in strongest | wanted
+    ]
+    asked = sorted((m, a, b) for a, b, m in links if (a, b) in wanted)
+    return replace(
+        drawn,
+        photos=[replace(photo, weak=k in weak_photos) for k, photo in enumerate(photos)],
+        links=shown,
+        stars=[_middle(photos[a], photos[b]) for _, a, b in asked],
+        advice=[_between(photos[a], photos[b]) for _, a, b in asked],
+    )
+
+
+def _with_left_out(
+    drawn: CaptureMap,
+    left_out: Mapping[str, str],  # work name -> reason
+    mapping: Mapping[str, Any],
+    labels: Mapping[str, str],
+    at: Mapping[str, int],  # work name of a placed photo -> its index
+    plane: np.ndarray,  # [2, 3]
+    size: float,
+) -> CaptureMap:
+    """Add the photos left out: at their hypothesis, else beside the placed photo that they match most."""
+    photos, links, stars = list(drawn.photos), list(drawn.links), list(drawn.stars)
+    wanted: dict[str, list[str]] = {}  # placed photo -> photos left out that match it most
+    reasons: dict[str, list[str]] = {}
+    best: dict[str, tuple[int, str]] = {}
+    for a, b, matches in mapping.get("unplaced_links", ()):
+        for lost, partner in ((a, b), (b, a)):
+            if lost in left_out and partner in at and matches > best.get(lost, (0, ""))[0]:
+                best[lost] = int(matches), partner
+    hypotheses = mapping.get("hypotheses", {})
+    middle = np.median([photo.xy for photo in drawn.photos], axis=0)
+    for name, reason in left_out.items():
+        matches, partner = best.get(name, (0, ""))
+        if name in hypotheses:
+            xy = plane @ np.array(hypotheses[name], float)
+        elif partner:
+            xy = _beside(np.array(drawn.photos[at[partner]].xy), middle, ASIDE * size, photos)
+        reasons.setdefault(reason, []).append(labels[name])
+        if name not in hypotheses and not partner:
+            continue
+        photos.append(MapPhoto(labels[name], as_pair(xy), "left out", unsure=name not in hypotheses))
+        if partner:
+            links.append(MapLink((at[partner], len(photos) - 1), matches, "left out"))
+            stars.append(_middle(photos[at[partner]], photos[-1]))
+            wanted.setdefault(labels[partner], []).append(labels[name])
+    return replace(
+        drawn,
+        photos=photos,
+        links=links,
+        stars=stars,
+        advice=[*drawn.advice, *(between(name, shortlist(lost, 3)) for name, lost in wanted.items())],
+        listed=[*drawn.listed, *(f"{shortlist(names, 3)}: {why}" for why, names in reasons.items())],
+    )
+
+
+def _beside(
+    partner: np.ndarray,  # [2]
+    middle: np.ndarray,  # [2] of the map
+    distance: float,
+    photos: Sequence[MapPhoto],
+) -> np.ndarray:
+    """Return a free position at a distance from a photo, away from the middle of the map if possible."""
+    away = partner - middle
+    turns = np.array([0.5 * (k // 2) * (-1) ** k for k in range(1, 12)])
+    angles = np.arctan2(away[1], away[0]) + turns
+    places = partner + distance * np.column_stack([np.cos(angles), np.sin(angles)])
+    taken = np.array([photo.xy for photo in photos])
+    room = np.linalg.norm(places[:, None] - taken[None], axis=2).min(axis=1)
+    free = np.flatnonzero(room > ROOM * distance)
+    return np.asarray(places[free[0] if len(free) else int(np.argmax(room))])
+
+
+def _between(first: MapPhoto, second: MapPhoto) -> str:
+    return between(first.name, second.name)
+
+
+def _sorted(pair: tuple[int, int]) -> tuple[int, int]:
+    return min(pair), max(pair)
+
+
+def _middle(first: MapPhoto, second: MapPhoto) -> tuple[float, float]:
+    return (first.xy[0] + second.xy[0]) / 2, (first.xy[1] + second.xy[1]) / 2
+
+
+def as_pair(values: np.ndarray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def longer_side(xy: np.ndarray) -> float:
+    """Return the longer side of the box around positions [N, 2]; 1 if there is none."""
+    return float(np.ptp(xy, axis=0).max()) or 1.0 if len(xy) else 1.0

@@ -1,0 +1,149 @@
+"""The graph of photos that overlap: its parts, its weak links, and a layout for photos without poses."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+import numpy as np
+
+Link = tuple[int, int, int]  # two photos, the lower number first, and their matches
+FEW_PARTNERS = 3  # a photo with fewer is held weakly
+STRESS_ROUNDS = 100  # of the layout
+SHORTEST, LONGEST = 0.6, 1.8  # length of a link on the layout; 1 = a link with the median number of matches
+
+
+def bridges(
+    count: int,  # photos
+    links: Iterable[Link],
+) -> set[tuple[int, int]]:
+    """Return the links without which a part falls into two (Tarjan, Information Processing Letters 1974)."""
+    neighbours: list[list[int]] = [[] for _ in range(count)]
+    for a, b, _ in links:
+        neighbours[a].append(b)
+        neighbours[b].append(a)
+    order, lowest = [-1] * count, [0] * count
+    result, clock = set(), 0
+    for root in range(count):
+        if order[root] >= 0:
+            continue
+        stack = [(root, -1, iter(neighbours[root]))]
+        order[root] = lowest[root] = clock
+        clock += 1
+        while stack:
+            photo, parent, rest = stack[-1]
+            other = next(rest, None)
+            if other is None:
+                stack.pop()
+                if parent >= 0:
+                    lowest[parent] = min(lowest[parent], lowest[photo])
+                    if lowest[photo] > order[parent]:
+                        result.add((min(photo, parent), max(photo, parent)))
+            elif order[other] < 0:
+                order[other] = lowest[other] = clock
+                clock += 1
+                stack.append((other, photo, iter(neighbours[other])))
+            elif other != parent:
+                lowest[photo] = min(lowest[photo], order[other])
+    return result
+
+
+def weakly_held(
+    photos: Sequence[int],
+    links: Iterable[Link],
+) -> list[int]:
+    """Return the photos that overlap with fewer than `FEW_PARTNERS` others, or with fewer than there are."""
+    partners = dict.fromkeys(photos, 0)
+    for a, b, _ in links:
+        if a in partners and b in partners:
+            partners[a] += 1
+            partners[b] += 1
+    return [k for k in photos if partners[k] < min(FEW_PARTNERS, len(photos) - 1)]
+
+
+def best_join(inside: Collection[int], outside: Collection[int], links: Iterable[Link]) -> tuple[int, int]:
+    """Return the photo inside and the one outside with most matches; without matches the nearest in order."""
+    strongest = (0, -1, -1)
+    for a, b, matches in links:
+        if a in outside and b in inside:
+            a, b = b, a
+        if a in inside and b in outside and matches > strongest[0]:
+            strongest = (matches, a, b)
+    if strongest[0]:
+        return strongest[1:]
+    return min(((a, b) for a in inside for b in outside), key=lambda pair: (abs(pair[0] - pair[1]), pair))
+
+
+def groups(
+    count: int,  # photos
+    links: Iterable[Link],
+) -> list[list[int]]:
+    """Return the connected parts, the largest first."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.array([link[:2] for link in links], int).reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count))
+    label = connected_components(graph, directed=False)[1]
+    parts: dict[int, list[int]] = {}
+    for photo, number in enumerate(label.tolist()):
+        parts.setdefault(number, []).append(photo)
+    return sorted(parts.values(), key=lambda part: (-len(part), part))
+
+
+def lay_out(
+    count: int,  # photos, in the order of capture
+    links: Sequence[Link],
+) -> np.ndarray:  # [count, 2] x right, y up
+    """Lay the photos out so that distances follow the overlap: the more matches, the nearer.
+
+    Each connected part is laid out by stress majorisation (Gansner et al., Graph Drawing 2004); parts stand
+    side by side, photos without a link in rows below.
+    """
+    xy = np.zeros((count, 2))
+    parts = groups(count, links)
+    right = 0.0
+    for part in parts:
+        if len(part) > 1:
+            own = _lay_out_part(part, links)
+            own -= own.min(axis=0)
+            xy[part] = own + np.array([right, -own[:, 1].max() / 2])
+            right = float(xy[part, 0].max()) + 1.5
+    single = [part[0] for part in parts if len(part) == 1]
+    low = float(xy[:, 1].min()) - 1.5 if len(single) < count else 0.0
+    columns = max(int(right), int(np.ceil(np.sqrt(2 * len(single)))), 1)
+    for number, photo in enumerate(sorted(single)):
+        xy[photo] = number % columns, low - number // columns
+    return xy
+
+
+def _lay_out_part(part: Sequence[int], links: Sequence[Link]) -> np.ndarray:
+    """Lay out one connected part, [len(part), 2]: its long axis horizontal, its first photo left."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import shortest_path
+
+    at = {photo: k for k, photo in enumerate(part)}
+    rows = np.array([(at[a], at[b], m) for a, b, m in links if a in at and b in at], float)
+    lengths = np.clip(np.sqrt(np.median(rows[:, 2]) / rows[:, 2]), SHORTEST, LONGEST)
+    ends = (rows[:, 0].astype(int), rows[:, 1].astype(int))
+    apart = shortest_path(coo_array((lengths, ends), (len(part), len(part))).tocsr(), directed=False)
+    # Classical scaling is the start: it depends on no random numbers.
+    centring = np.eye(len(part)) - 1 / len(part)
+    values, vectors = np.linalg.eigh(-centring @ apart**2 @ centring / 2)
+    xy = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, :-3:-1]
+    weights = 1 / np.maximum(apart, 1e-9) ** 2
+    np.fill_diagonal(weights, 0.0)
+    laplacian = np.diag(weights.sum(axis=1)) - weights
+    inverse = np.linalg.pinv(laplacian)
+    for _ in range(STRESS_ROUNDS):
+        drawn = np.linalg.norm(xy[:, None] - xy[None], axis=2)
+        pull = -weights * apart / np.maximum(drawn, 1e-9)
+        np.fill_diagonal(pull, 0.0)
+        np.fill_diagonal(pull, -pull.sum(axis=1))
+        xy = inverse @ pull @ xy
+    xy -= xy.mean(axis=0)
+    axes = np.linalg.svd(xy, full_matrices=False)[2]
+    xy = xy @ axes.T
+    # The signs of an SVD are arbitrary.
+    xy[:, 0] *= -1 if xy[0, 0] > 0 else 1
+    xy[:, 1] *= -1 if xy[int(np.argmax(np.abs(xy[:, 1]))), 1] < 0 else 1
+    return xy

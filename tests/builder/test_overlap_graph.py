@@ -1,0 +1,48 @@
+"""The overlap graph against brute force, and layouts whose shape is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ambiguous_wild.builder.overlap_graph import best_join, bridges, groups, lay_out, weakly_held
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_bridge_is_a_link_without_which_a_part_falls_into_two(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ends = {tuple(sorted(rng.choice(12, 2, replace=False).tolist())) for _ in range(14)}
+    links = [(a, b, 20) for a, b in sorted(ends)]
+    parts = len(groups(12, links))
+    wanted = {link[:2] for link in links if len(groups(12, [k for k in links if k != link])) > parts}
+    assert bridges(12, links) == wanted and wanted
+
+
+def test_photos_with_one_or_two_partners_are_weakly_held() -> None:
+    full = [(a, b, 20) for a in range(4) for b in range(a + 1, 4)]
+    assert weakly_held(range(6), [*full, (3, 4, 20), (2, 4, 20)]) == [4, 5]
+    assert weakly_held(range(3), [*full[:2], (1, 2, 20)]) == []  # a capture of three has no more partners
+
+
+def test_parts_are_joined_where_most_matches_are_else_in_the_order_of_capture() -> None:
+    links = [(0, 5, 17), (1, 4, 30), (2, 3, 16)]
+    assert best_join([0, 1, 2], [3, 4, 5], links) == (1, 4)
+    assert best_join([3, 4, 5], [0, 1, 2], links) == (4, 1)
+    assert best_join([0, 1, 2], [4, 5], []) == (2, 4)
+
+
+def test_a_ring_is_laid_out_as_a_ring_and_a_walk_as_a_line() -> None:
+    ring = [(min(k, (k + 1) % 12), max(k, (k + 1) % 12), 50) for k in range(12)]
+    xy = lay_out(12, ring)
+    radius = np.linalg.norm(xy - xy.mean(axis=0), axis=1)
+    assert radius.std() < 0.05 * radius.mean()
+    walk = lay_out(9, [(k, k + 1, 50) for k in range(8)])
+    assert (np.diff(walk[:, 0]) > 0.5).all() and np.ptp(walk[:, 1]) < 0.1
+
+
+def test_parts_and_single_photos_do_not_cover_each_other() -> None:
+    links = [(0, 1, 40), (1, 2, 40), (0, 2, 40), (4, 5, 30), (5, 6, 30)]
+    xy = lay_out(9, links)
+    apart = np.linalg.norm(xy[:, None] - xy[None], axis=2) + 9 * np.eye(9)
+    assert apart.min() > 0.5 and (lay_out(9, links) == xy).all()
+    assert np.isfinite(lay_out(3, [])).all() and len({tuple(p) for p in lay_out(3, [])}) == 3

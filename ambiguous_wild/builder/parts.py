@@ -1,20 +1,21 @@
 """Join parts of a capture that were placed alone.
 
 The relative pose of two parts needs several photos at once: a single pair may show a distractor, and gives no
-scale. A photo that has a pose in both parts is a hypothesis for the similarity between them, and the pairs
-across the parts that fit it are the evidence, as for a photo in `placing`.
+scale. A photo that has a pose in both parts is a hypothesis for the similarity between them, and so are the
+pairs across the parts that agree on one rotation. The pairs that fit a hypothesis are the evidence, as for a
+photo in `placing`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
-from ambiguous_wild.builder.placing import ALIKE_DEG, FITS, LEAST_PHOTOS, Placement, Points
+from ambiguous_wild.builder.placing import ALIKE_DEG, FITS, LEAST_PHOTOS, Placement, Points, centre_of
 
 JOINED_BY = (
     2  # smallest number of pairs across two parts that must fit, and of photos that they involve a side
@@ -43,26 +44,83 @@ def join(first: Placement, second: Placement) -> bool:
     added = {photo: pose for photo, pose in second.poses.items() if photo not in first.poses}
     if not added or min(len(first.poses), len(second.poses)) < LEAST_PHOTOS:
         return False
+    rotations = _rotations(first, second)
     best: tuple[int, Similarity] | None = None
-    for similarity in _similarities(first, second):
+    for similarity in (*_by_photos(first, second), *_by_pairs(first, second, rotations)):
         moved = {photo: similarity.moved(pose) for photo, pose in added.items()}
         fitting = _fitting(first, moved)
-        inside = {a if a in moved else b for a, b in fitting}
-        outside = {b if a in moved else a for a, b in fitting}
-        if len(fitting) < JOINED_BY or len(inside | outside) < JOINED_BY + 1:
+        if len(fitting) < JOINED_BY or len({photo for pair in fitting for photo in pair}) <= JOINED_BY:
             continue
-        if _largest_rival(first, moved, fitting) > RIVALS * len(fitting):
-            continue
-        if best is None or len(fitting) > best[0]:
+        others = [row for row in rotations if row.pair not in fitting]
+        rivals = max((len({row.pair for row in alike}) for alike in _alike(others)), default=0)
+        if rivals <= RIVALS * len(fitting) and (best is None or len(fitting) > best[0]):
             best = len(fitting), similarity
     if best is None:
         return False
     first.poses.update((photo, best[1].moved(pose)) for photo, pose in added.items())
+    first.joined.append(frozenset(added))
     return True
 
 
-def _similarities(first: Placement, second: Placement) -> Iterator[Similarity]:
-    """Yield a hypothesis for each pose of a photo in both parts."""
+@dataclass(frozen=True)
+class Across:
+    """The rotation of the second part to the first that one motion of a pair across them implies."""
+
+    pair: Pair
+    here: int  # photo of the first part
+    there: int  # photo of the second part
+    rotation: np.ndarray  # [3, 3] first from second
+    direction: np.ndarray  # [3] from the photo of the first part to that of the second, in the first part
+
+
+def _rotations(first: Placement, second: Placement) -> list[Across]:
+    """Return the implied rotations of all motions of the pairs across two parts."""
+    rows = []
+    for pair, motions in first.matched.motions.items():
+        for here, there in (pair, pair[::-1]):
+            if here not in first.poses or there not in second.poses or {here, there} <= first.poses.keys():
+                continue
+            mine, theirs = first.poses[here][:, :3], second.poses[there][:, :3]
+            for motion in motions:
+                for rotation, shift in zip(motion.rotations, motion.translations):
+                    centre = -rotation.T @ shift if here == pair[0] else shift
+                    relative = rotation if here == pair[0] else rotation.T  # there from here
+                    rows.append(Across(pair, here, there, mine.T @ relative.T @ theirs, mine.T @ centre))
+    return rows
+
+
+def _alike(rows: Sequence[Across]) -> Iterator[list[Across]]:
+    """Yield for each row all rows that imply the same rotation."""
+    if not rows:
+        return
+    stack = np.array([row.rotation for row in rows]).reshape(-1, 9)
+    for same in stack @ stack.T > trace_of(ALIKE_DEG):
+        yield [row for row, use in zip(rows, same) if use]
+
+
+def _by_pairs(first: Placement, second: Placement, rotations: Sequence[Across]) -> Iterator[Similarity]:
+    """Yield the similarities on which pairs across the parts agree, the rotation first, then directions."""
+    known: set[frozenset[tuple[int, int]]] = set()
+    for alike in _alike(rotations):
+        ends = frozenset((row.here, row.there) for row in alike)
+        if len(ends) < JOINED_BY or ends in known:
+            continue
+        known.add(ends)
+        left, _, right = np.linalg.svd(sum(row.rotation for row in alike))
+        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        # The photo of the second part lies on a ray from that of the first: cross(ray, s Q y + t - x) = 0.
+        rows, values = [], []
+        for row in alike:
+            ray = np.cross(np.eye(3), row.direction).T  # ray @ v = cross(direction, v)
+            rows.append(np.column_stack([ray @ rotation @ centre_of(second.poses[row.there]), ray]))
+            values.append(ray @ centre_of(first.poses[row.here]))
+        scale, *shift = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values), rcond=None)[0]
+        if scale > 0:
+            yield Similarity(float(scale), rotation, np.array(shift))
+
+
+def _by_photos(first: Placement, second: Placement) -> Iterator[Similarity]:
+    """Yield the similarity that each pose of a photo in both parts implies."""
     here, there = Points.read(first.matched, first.model), Points.read(second.matched, second.model)
     for photo in sorted({*first.poses, *second.poses}):
         mine = [first.poses[photo]] if photo in first.poses else first.resections(photo, here)
@@ -75,8 +133,7 @@ def _similarities(first: Placement, second: Placement) -> Iterator[Similarity]:
                     continue
                 scale = float(np.median([near[k] / far[k] for k in both]))
                 rotation = pose[:, :3].T @ other[:, :3]
-                centre, from_ = (-p[:, :3].T @ p[:, 3] for p in (pose, other))
-                yield Similarity(scale, rotation, centre - scale * rotation @ from_)
+                yield Similarity(scale, rotation, centre_of(pose) - scale * rotation @ centre_of(other))
 
 
 def _depths(photo: int, poses: list[np.ndarray], part: Placement, points: Points) -> list[dict[int, float]]:
@@ -86,39 +143,15 @@ def _depths(photo: int, poses: list[np.ndarray], part: Placement, points: Points
     return [{int(f): float(z) for f, z in zip(features, row) if z > 0} for row in depths]
 
 
-def _across(first: Placement, moved: Mapping[int, np.ndarray]) -> Iterator[tuple[Pair, bool]]:
-    """Yield the pairs across the parts that have a motion, and whether the second photo is a moved one."""
-    for a, b in first.matched.matches:
-        if first.matched.motions[a, b] and (a in moved) != (b in moved) and {a, b} & first.poses.keys():
-            yield (a, b), b in moved
-
-
 def _fitting(first: Placement, moved: Mapping[int, np.ndarray]) -> set[Pair]:
     """Return the pairs across the parts of which a motion fits."""
     matched: Matched = first.matched
     rays, poses = matched.rays(), {**moved, **first.poses}
     fitting = set()
-    for (a, b), _ in _across(first, moved):
+    for (a, b), motions in matched.motions.items():
+        if not motions or (a in moved) == (b in moved) or not {a, b} <= poses.keys():
+            continue
         near = matched.misfit((a, b), poses[a], poses[b], rays) <= ROUGHLY
-        if any(near[motion.matches].mean() >= FITS for motion in matched.motions[a, b]):
+        if any(near[motion.matches].mean() >= FITS for motion in motions):
             fitting.add((a, b))
     return fitting
-
-
-def _largest_rival(first: Placement, moved: Mapping[int, np.ndarray], fitting: set[Pair]) -> int:
-    """Count the other pairs across the parts that agree on one other rotation between them."""
-    owners, rotations = [], []
-    for number, (pair, second_moved) in enumerate(_across(first, moved)):
-        if pair in fitting:
-            continue
-        mine, theirs = (pair[0], pair[1]) if second_moved else (pair[1], pair[0])
-        for motion in first.matched.motions[pair]:
-            for rotation in motion.rotations:
-                relative = rotation if second_moved else rotation.T
-                owners.append(number)
-                rotations.append(moved[theirs][:, :3].T @ relative @ first.poses[mine][:, :3])
-    if not owners:
-        return 0
-    stack, owner = np.array(rotations).reshape(-1, 9), np.array(owners)
-    alike = stack @ stack.T > trace_of(ALIKE_DEG)
-    return max(len(np.unique(owner[row])) for row in alike)

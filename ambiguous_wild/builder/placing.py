@@ -36,6 +36,7 @@ LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a di
 # The same if all placed photos that share a motion with it agree, and the matches are spread over the photo
 # at least so much of what as many features drawn at random would be: those of a distractor are crowded.
 LITTLE_AREA, LITTLE_SPREAD = 0.05, 0.2
+FIRMLY_JOINED = 4  # pairs across two parts of a capture; with fewer, the smaller part is provisional
 LEAST_POINTS = 6  # points, which two others observe, that fix how far a photo with one partner is from it
 AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two partners are enough
 PLACES = 3  # largest number of places tried for a photo
@@ -80,7 +81,9 @@ class Placement:
         self.places: dict[int, Place] = {}  # of the placed photos
         self.left_out: dict[int, str] = {}  # photo -> reason
         self.provisional: set[int] = set()  # placed photos with little evidence
+        self.hypotheses: dict[int, np.ndarray] = {}  # best pose of photos, those left out among them
         self.apart: list[dict[int, np.ndarray]] = []  # poses of photos that agree among themselves alone
+        self.joined: list[frozenset[int]] = []  # photos of parts that were placed alone and then joined
         self.others: list[Placement] = []  # parts of the capture that no photo joins to this one
         self._use_model(model)
 
@@ -98,6 +101,11 @@ class Placement:
         firm = self.components(self.provisional)[:1]
         firm = [part for part in firm if len(part) >= LEAST_PHOTOS]
         self.provisional = set(self.poses).difference(*firm)
+        for part in self.joined:
+            across = [pair for pair in self.links() if (pair[0] in part) != (pair[1] in part)]
+            if len(across) < FIRMLY_JOINED:
+                smaller = min(part & self.poses.keys(), self.poses.keys() - part, key=len)
+                self.provisional |= smaller
         for photo in range(len(outs)):
             if photo not in self.poses:
                 self.left_out.setdefault(photo, "too few of its points are left")
@@ -183,10 +191,12 @@ class Placement:
         """Place all photos; tell whether more than a few changed, or an added one may help others in."""
         rays, points = self.matched.rays(), Points.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
-        self.places, self.left_out, self.provisional = {}, {}, set()
+        self.places, self.left_out, self.provisional, self.hypotheses = {}, {}, set(), {}
         for photo in range(len(self.matched.ids)):
             pose_now = self.poses.get(photo)
             best, rival = self._best(photo, pose_now, rays, points)
+            if best.pose is not None:
+                self.hypotheses[photo] = best.pose
             few = pose_now is None and best.area < AREA_NEW
             reason = _reason(best, rival, AGREE_NEW if few else AGREE)
             if reason is not None and self._unopposed(photo, best, rival, points):
@@ -295,7 +305,7 @@ class Placement:
         """Tell whether two poses are one place."""
         if first is None or second is None:
             return False
-        apart = float(np.linalg.norm(_centre(first) - _centre(second)))
+        apart = float(np.linalg.norm(centre_of(first) - centre_of(second)))
         return _turn_deg(first, second) < SAME_DEG and apart < SAME_SHARE * self.radius
 
     def _area(self, photo: int, rows: Sequence[np.ndarray]) -> float:
@@ -388,7 +398,7 @@ class Placement:
         self.model = model
         self.matched.take_cameras(model)
         self.poses = self.matched.poses(model)
-        centres = np.array([_centre(pose) for pose in self.poses.values()]).reshape(-1, 3)
+        centres = np.array([centre_of(pose) for pose in self.poses.values()]).reshape(-1, 3)
         apart = np.linalg.norm(centres - np.median(centres, axis=0), axis=1) if len(centres) else np.zeros(1)
         self.radius = float(np.median(apart))  # radius of the path of cameras
 
@@ -486,7 +496,7 @@ def _cells(features: np.ndarray, width: int, height: int) -> np.ndarray:
     return column * GRID + row
 
 
-def _centre(pose: np.ndarray) -> np.ndarray:
+def centre_of(pose: np.ndarray) -> np.ndarray:
     """Return the position of a camera with pose [3, 4], camera from world."""
     return -pose[:, :3].T @ pose[:, 3]
 

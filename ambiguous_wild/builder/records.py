@@ -137,6 +137,11 @@ class MappingResult(TypedDict):
     model: ModelSummary | None
     left_out: dict[str, str]  # work name of a photo that is not placed -> reason
     partners: dict[str, int]  # work name -> photos that agree with its place
+    provisional: list[str]  # work names of photos placed with little evidence
+    hypotheses: dict[str, list[float]]  # work name of a photo that is left out -> likely position
+    links: list[tuple[str, str, int]]  # pairs of placed photos that agree, with their matches that fit
+    unplaced_links: list[tuple[str, str, int]]  # other pairs, with the matches of their main motion
+    parts: list[list[str]]  # work names of parts that no photo joins, the largest first
     cameras: list[CameraFact]
     plan: str  # "fast", "wider" or "thorough"
 
@@ -220,6 +225,7 @@ class ScenePhoto(TypedDict):
     mean_luma: float
     features: int
     partners: int  # photos that agree with its place; 0: not in the scene
+    provisional: bool  # placed with little evidence
     notes: list[str]
     exif: ExifRecord  # without GPS
 

@@ -110,11 +110,11 @@ def scene_record(
             *screened["warnings"],
             *_focal_warnings(cameras, facts),
             *_parallax_warnings(model),
+            *part_lines(mapping["parts"], sources),
+            *_provisional_warnings([sources[name] for name in mapping["provisional"]]),
             *warnings,
         ],
-        "photos": {
-            f"{f['stem']}.png": _photo(f, sides, features["features"], mapping["partners"]) for f in facts
-        },
+        "photos": {f"{f['stem']}.png": _photo(f, sides, features["features"], mapping) for f in facts},
         "masks": masks,
         "fixed_to_camera": [
             {
@@ -235,7 +235,7 @@ def _lost_photos(
 
 
 def _photo(
-    fact: ScreenedPhoto, sides: dict[str, str], features: dict[str, int], partners: dict[str, int]
+    fact: ScreenedPhoto, sides: dict[str, str], features: dict[str, int], mapping: MappingResult
 ) -> ScenePhoto:
     # Scenes are published: GPS positions stay out of them.
     exif = {k: v for k, v in fact["exif"].items() if k not in ("latitude_deg", "longitude_deg", "altitude_m")}
@@ -248,7 +248,8 @@ def _photo(
         "blur": fact["blur"],
         "mean_luma": fact["mean_luma"],
         "features": features.get(fact["work_name"], 0),
-        "partners": partners.get(fact["work_name"], 0),
+        "partners": mapping["partners"].get(fact["work_name"], 0),
+        "provisional": fact["work_name"] in mapping["provisional"],
         "notes": fact["notes"],
         "exif": cast(ExifRecord, exif),
     }
@@ -265,6 +266,26 @@ def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> li
     if not odd:
         return []
     return [f"focal length of {len(odd)} of {len(cameras)} cameras contradicts EXIF: {shortlist(odd, 2)}"]
+
+
+def part_lines(parts: Sequence[Sequence[str]], sources: Mapping[str, str]) -> list[str]:
+    """Return one line if the photos fall into parts (work names each) that no photo joins, else none."""
+    if len(parts) < 2:
+        return []
+    named = [f"{len(part)} ({shortlist([sources[name] for name in part], 2)})" for part in parts]
+    return [
+        f"the photos fall into {len(parts)} parts that no photo joins: {', '.join(named)}; take photos that "
+        "show two of them at once, or build another with --part 2"
+    ]
+
+
+def _provisional_warnings(photos: Sequence[str]) -> list[str]:
+    if not photos:
+        return []
+    return [
+        f"{counted(len(photos), 'photo')} placed with little evidence, perhaps imprecisely or wrongly "
+        f"('provisional' in scene.json): {shortlist(photos)}"
+    ]
 
 
 def map_warnings(result: MapResult) -> list[str]:

@@ -21,7 +21,8 @@ Effort = Literal["auto", "fast", "thorough"]
 
 WIDER = 40  # partners in the second attempt of a photo that was left out
 ENOUGH = 0.9  # placed share that ends the attempts: more pairs seldom place the rest
-HALF = 0.5  # placed share below which all pairs are matched in the end: it cannot make the model worse
+HALF = 0.5  # the same of more than `FEW` photos, before all pairs are matched
+MANY_FEATURES = 8000  # of a photo in the last attempt at a small capture, whose photos may overlap little
 MOST_FEATURES = 100_000  # largest --max-features; SIFT finds fewer in any photo
 
 
@@ -34,7 +35,8 @@ class BuildSettings:
     sfm: Effort = "auto"  # auto: fast, then more where it leaves photos out
     matcher: Matcher = "auto"  # auto: exhaustive up to 25 photos (thorough: 200), then retrieval
     mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
-    max_features: int = 3000  # SIFT features a photo, as COLMAP counts: up to 5400
+    part: int = 1  # of a capture that falls into parts, the one to build; 1 is the largest
+    max_features: int = 3000  # SIFT features a photo, as COLMAP counts: up to 5400; thorough: at least 8000
     max_side: int = 1600  # px; photos are reduced to this for SIFT only
     seed: int = 0  # of every random choice inside COLMAP
     masks_missing: Literal["error", "keep"] = "error"  # a photo without a mask: refuse, or use it whole
@@ -50,6 +52,8 @@ class BuildSettings:
                 f"--max-features must be between 100, to match anything, and {MOST_FEATURES}, "
                 f"got {self.max_features}"
             )
+        if self.part < 1:
+            raise AwError(f"--part must be 1 or more, got {self.part}")
         if not 0 <= self.seed < 2**31:
             raise AwError(f"--seed must be between 0 and 2147483647, got {self.seed}")
 
@@ -60,6 +64,7 @@ class SfmPlan:
 
     name: str  # "fast", "wider" or "thorough"
     sift: str  # implementation: "opencv", or "colmap", which takes three to five times as long
+    max_features: int  # a photo
     matcher: str  # "exhaustive", "retrieval" or "sequential"
     similar: int  # photos that each is matched with, for "retrieval"
     neighbours: int  # next photos in the order of capture, for "retrieval"
@@ -81,9 +86,9 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
     if settings.sfm == "fast":
         return [fast]
     if fast.matcher != "retrieval":
-        return [fast, replace(thorough, below=ENOUGH)]
+        return [fast, thorough]
     wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True, below=ENOUGH)
-    return [fast, wider, replace(thorough, below=HALF)]
+    return [fast, wider, replace(thorough, below=ENOUGH if len(photos) <= FEW else HALF)]
 
 
 def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
@@ -92,6 +97,7 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
     return SfmPlan(
         "fast",
         sift="opencv",
+        max_features=settings.max_features,
         matcher=matcher,
         similar=16 if many else 14,
         neighbours=5 if many else 2,
@@ -108,6 +114,7 @@ def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
     return SfmPlan(
         "thorough",
         sift="colmap",
+        max_features=max(settings.max_features, MANY_FEATURES * (count <= FEW)),
         matcher=_matcher(count, settings, EXHAUSTIVE_LIMIT),
         similar=16,
         neighbours=5,

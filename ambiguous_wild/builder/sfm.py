@@ -84,6 +84,7 @@ class MappingJob(TypedDict):
     output: str  # folder
     progress: str  # file that holds the number of placed photos
     mapper: str
+    part: int  # of the capture, from 1
     growth: float  # of `SfmPlan`, as the four below
     refinements: int
     tolerance: float
@@ -206,7 +207,7 @@ def extract_features(
         if camera in ("per-device", "per-folder")
         else [],
         "masks": str(masks) if masks else None,
-        "max_features": settings.max_features,
+        "max_features": plan.max_features,
         "max_side": settings.max_side,
         "sift": plan.sift,
         "seed": settings.seed,
@@ -311,6 +312,7 @@ def map_scene(
         "output": str(folder),
         "progress": str(progress),
         "mapper": settings.mapper,
+        "part": settings.part,
         "growth": plan.growth,
         "refinements": plan.refinements,
         "tolerance": plan.tolerance,

@@ -23,16 +23,15 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import FIXED, FixedArea, find_fixed, moving_matches
+from ambiguous_wild.builder.mapping import run_mapping
 from ambiguous_wild.builder.matched import Matched
-from ambiguous_wild.builder.parts import join
-from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
-from ambiguous_wild.builder.records import FixedMask, ModelSummary
+from ambiguous_wild.builder.placing import pipeline_options
+from ambiguous_wild.builder.records import FixedMask
 from ambiguous_wild.builder.retrieval import (
     MOTIONS,
     PAIRS,
@@ -43,7 +42,6 @@ from ambiguous_wild.builder.retrieval import (
 )
 from ambiguous_wild.builder.sfm import (
     FeatureJob,
-    MappingJob,
     MatchJob,
     MotionJob,
     SfmJob,
@@ -134,8 +132,6 @@ def features_of(
             waiting += [pool.submit(one, name) for name in islice(todo, 1)]
 
 
-FOCAL_CHANGE = 0.05  # relative change of half of the focal lengths after which pairs are verified again
-FOCAL_DOUBT = 0.015  # relative change after which a rival model is built; votes lie on a grid of 2 %
 _PR_SET_PDEATHSIG = 1
 
 
@@ -293,125 +289,6 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
         database.close()
 
 
-def run_mapping(job: MappingJob) -> None:
-    """Place all photos, from COLMAP's models; write `mapping.json`.
-
-    Where COLMAP's incremental mapper leaves photos out, its global mapper is asked too: it needs no pair to
-    start from, and places photos that overlap little. Where photos look outwards, a wrong focal length on a
-    bent path explains nearly all matches (yard, seed 2: 4.4 % too long, no photo right). So if the pairs
-    voted for another focal length than the mapper found, the mapper runs again with the voted one held fixed,
-    and the model with more observations is kept.
-    """
-    output, database = Path(job["output"]), Path(job["database"])
-    matched = Matched.read(database)
-    models = _models(job, output, matched)
-    if models and not plausible(models[0]):
-        matched.distorted = False
-        models = _models(job, output, matched)
-    placement = None
-    if models:
-        change = matched.take_cameras(max(models, key=_size))
-        rivals = _models(job, output, matched, held=True) if change > FOCAL_DOUBT else []
-        if rivals:
-            other = Matched.read(database)  # read now, while the database has the focal length of the votes
-            other.distorted = matched.distorted
-        if change > FOCAL_CHANGE:
-            # The poses of pairs were wrong by as much, so verify and map again with the model's focal length.
-            matched.write_agreed(database, matched.find_motions(job["jobs"]))
-            models = _models(job, output, matched) or models
-        else:
-            matched.load_motions(Path(job["motions"]))
-        placement = _placed(job, database, matched, models)
-        if rivals:
-            other.load_motions(Path(job["motions"]))
-            placement = max(placement, _placed(job, database, other, rivals), key=_explained)
-    left_out = dict.fromkeys(matched.names, "no pair of photos to start from")
-    if placement is not None:
-        left_out = {matched.names[photo]: reason for photo, reason in placement.left_out.items()}
-    if placement is None or len(placement.poses) < LEAST_PHOTOS:
-        empty: dict[str, object] = {"model": None, "left_out": left_out, "partners": {}, "cameras": []}
-        write_json(output / "mapping.json", empty)
-        return
-    placement.matched.save_motions(output / MOTIONS)
-    model = placement.model
-    model.tear_down()
-    model.extract_colors_for_all_images(job["photos"])
-    (output / "0").mkdir()
-    model.write(str(output / "0"))
-    summary: ModelSummary = {
-        "images": model.num_reg_images(),
-        "points": model.num_points3D(),
-        "error_px": round(model.compute_mean_reprojection_error(), 4),
-        "track_length": round(model.compute_mean_track_length(), 3),
-    }
-    write_json(
-        output / "mapping.json",
-        {
-            "model": summary,
-            "left_out": dict(sorted(left_out.items())),
-            "partners": {matched.names[k]: len(place.partners) for k, place in placement.places.items()},
-            "cameras": placement.cameras(),
-        },
-    )
-
-
-def _explained(placement: Placement) -> int:
-    """Count the observations of a model; 0 where it lost its photos, because its points are then outdated."""
-    enough = len(placement.poses) >= LEAST_PHOTOS
-    return int(placement.model.compute_num_observations()) if enough else 0
-
-
-def _models(job: MappingJob, output: Path, matched: Matched, *, held: bool = False) -> list[Any]:
-    """Return the models of COLMAP's mapper, and of the global one if it leaves photos out; largest first."""
-    models: list[Any] = []
-    for mapper in dict.fromkeys((job["mapper"], "global")):
-        run = _map_globally if mapper == "global" else _map_incrementally
-        models += sorted(
-            run(job, output, matched.distorted and not held, held).values(), key=_size, reverse=True
-        )
-        for folder in output.glob("[0-9]*"):
-            shutil.rmtree(folder)
-        if any(model.num_reg_images() == len(matched.ids) for model in models):
-            break
-    return [model for model in models if model.num_reg_images() >= LEAST_PHOTOS]
-
-
-def _size(model: Any) -> tuple[int, int]:
-    return model.num_reg_images(), model.num_points3D()
-
-
-def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> Placement:
-    """Place photos from the first model; where it leaves some out, from the others; join their parts."""
-    parts: list[Placement] = []
-    for model in models:
-        todo = set(range(len(matched.ids))).difference(*(part.poses for part in parts))
-        if not todo & matched.poses(model).keys():
-            continue
-        part = Placement(matched.copy(), database, model, job["seed"])
-        part.run()
-        for poses in part.apart:
-            other = Placement(matched.copy(), database, part.model, job["seed"])
-            other.poses = poses
-            other.run()
-            parts.append(other)
-        parts.append(part)
-        if len(part.poses) == len(matched.ids):
-            break
-    parts.sort(key=lambda part: -len(part.poses))
-    best, *others = parts
-    joined = True
-    while joined:
-        before = len(best.poses)
-        for other in others:
-            join(best, other)
-        joined = len(best.poses) > before
-        if joined:
-            best.run()
-            joined = len(best.poses) > before
-    best.others = [other for other in others if not other.poses.keys() & best.poses.keys()]
-    return best
-
-
 def run_triangulation(job: TriangulationJob) -> None:
     """Triangulate points from the matches that fit the poses; poses and intrinsics do not change."""
     posed = pycolmap.Reconstruction(job["model"])
@@ -435,55 +312,6 @@ def run_motions(job: MotionJob) -> None:
     matched.take_cameras(pycolmap.Reconstruction(job["model"]))
     matched.find_motions(job["jobs"])
     matched.save_motions(Path(job["output"]))
-
-
-def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: bool) -> dict[int, Any]:
-    options = pipeline_options(job["seed"])
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not held
-    options.min_model_size = LEAST_PHOTOS
-    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
-    options.ba_global_max_refinements = job["refinements"]
-    options.ba_global_function_tolerance = job["tolerance"]
-    options.ba_local_max_refinements = job["local_refinements"]
-    options.mapper.ba_local_num_images = job["local_cameras"]
-    counter = Path(job["progress"])
-    state = {"best": 0, "now": 0}
-
-    def first() -> None:
-        state["now"] = 2
-
-    def following() -> None:
-        # COLMAP may build several models, each from two photos: the bar shows the largest so far.
-        state["now"] += 1
-        state["best"] = max(state["best"], state["now"])
-        counter.write_text(str(state["best"]))
-
-    return pycolmap.incremental_mapping(
-        job["database"],
-        job["photos"],
-        str(output),
-        options=options,
-        initial_image_pair_callback=first,
-        next_image_callback=following,
-    )
-
-
-def _map_globally(job: MappingJob, output: Path, distorted: bool, held: bool) -> dict[int, Any]:
-    options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = job["seed"]
-    options.mapper.rotation_averaging.random_seed = job["seed"]
-    options.mapper.global_positioning.random_seed = job["seed"]
-    options.mapper.global_positioning.use_gpu = False
-    options.mapper.retriangulation.random_seed = job["seed"]
-    adjustment = options.mapper.bundle_adjustment.ceres
-    adjustment.use_gpu = False
-    options.mapper.bundle_adjustment.refine_extra_params = distorted
-    options.mapper.bundle_adjustment.refine_focal_length = not held
-    adjustment.min_num_residuals_for_cpu_multi_threading = 10**9
-    options.min_model_size = LEAST_PHOTOS
-    return pycolmap.global_mapping(job["database"], job["photos"], str(output), options=options)
 
 
 def main() -> None:

@@ -113,6 +113,7 @@ def check_registered(
     skipped: int,
     database: Path,
     matches: MatchResult,
+    part: int = 1,
     remarks: Sequence[str] = (),
 ) -> None:
     """Refuse a reconstruction that holds too few photos or points to be a scene.
@@ -123,13 +124,14 @@ def check_registered(
         skipped: number of photos left out before.
         database: COLMAP's database with features and matches.
         matches: result of the matching stage.
+        part: of the capture, by size; from the second on, the user asked for it however small it is.
         remarks: other possible causes, added to the error.
 
     Raises:
         AwError: with the counts, the figures of the matching, the likely cause and what to try.
     """
     registered, points = (model["images"], model["points"]) if model else (0, 0)
-    needed = max(MIN_PHOTOS, math.ceil(MIN_SHARE * photos))
+    needed = max(MIN_PHOTOS, math.ceil(MIN_SHARE * photos) if part == 1 else 0)
     few = points < MIN_POINTS * registered
     if registered >= needed and not few:
         return
@@ -197,9 +199,8 @@ class SfmStages:
 
     @property
     def placed(self) -> int:
-        """Number of photos in the model."""
-        model = self.mapping.facts["model"]
-        return model["images"] if model else 0
+        """Number of photos in the largest part."""
+        return max(map(len, self.mapping.facts["parts"]), default=0)
 
 
 @dataclass
@@ -402,7 +403,9 @@ class Stages:
             attempts.append(self._attempt(work, screened, masks, plan, attempts[-1] if attempts else None))
         # Of attempts that place equally many photos the last is taken, which is the most precise.
         best = max(reversed(attempts), key=lambda attempt: attempt.placed)
-
+        parts = report.part_lines(best.mapping.facts["parts"], {f["work_name"]: f["source"] for f in facts})
+        if self.settings.part > max(1, len(best.mapping.facts["parts"])):
+            raise AwError(f"--part {self.settings.part}: " + "; ".join(parts or ["the photos form one part"]))
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
         used = mask_warnings(masks.facts if masks else None) or used
         check_registered(
@@ -411,10 +414,12 @@ class Stages:
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
             best.matches.facts,
+            self.settings.part,
             [
                 *panorama_warnings(facts),
                 *used,
                 *report.fixed_lines(best.matches.facts["fixed"]),
+                *parts,
                 "'aw screen PHOTOS -o map.png' draws which photos overlap",
             ],
         )
@@ -435,7 +440,7 @@ class Stages:
 
         features = work.run(
             "features",
-            [screened.key, masks and masks.key, camera, settings.max_features, settings.max_side, plan.sift,
+            [screened.key, masks and masks.key, camera, plan.max_features, settings.max_side, plan.sift,
              settings.seed],
             lambda f: extract_features(
                 f, photos, facts, settings, plan, self.jobs, camera, mask_folder, self.bar
@@ -454,7 +459,7 @@ class Stages:
         )  # fmt: skip
         mapping = work.run(
             "mapping",
-            [matches.key, settings.mapper, to_plain(plan), settings.seed],
+            [matches.key, settings.mapper, settings.part, to_plain(plan), settings.seed],
             lambda f: map_scene(f, matches.folder, photos, len(facts), settings, plan, self.jobs, self.bar),
         )
         return SfmStages(features, matches, mapping)

@@ -80,6 +80,9 @@ def _compiled() -> bool:
     show_default=True,
     help="COLMAP's mapper; global is faster on many photos, weaker on few.",
 )
+@click.option(
+    "--part", type=int, default=1, show_default=True, help="Part to build, if photos fall into several."
+)
 @click.option("--max-features", type=int, default=3000, show_default=True, help="SIFT features per photo.")
 @click.option(
     "--keep-masks",

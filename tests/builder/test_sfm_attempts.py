@@ -80,7 +80,7 @@ def test_photos_that_are_left_out_look_for_more_partners(monkeypatch, tmp_path):
     """Pairs that are matched already stay, and are not matched again."""
     write_capture(tmp_path / "raw", 8)
     # a partner each: the photos do not chain
-    fast = SfmPlan("fast", "opencv", "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4)
+    fast = SfmPlan("fast", "opencv", 3000, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4)
     wider = dataclasses.replace(fast, name="wider", similar=7, continues=True)
     monkeypatch.setattr(stages, "plans", lambda photos, settings: [fast, wider])
     info = build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(factor=2), jobs=2).info

@@ -1,0 +1,226 @@
+"""Map matched photos with COLMAP, place every photo anew, and join the parts of the capture."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.parts import join
+from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
+from ambiguous_wild.builder.records import ModelSummary
+from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.sfm import MappingJob
+from ambiguous_wild.io.files import write_json
+from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+FOCAL_CHANGE = 0.05  # relative change of half of the focal lengths after which pairs are verified again
+FOCAL_DOUBT = 0.015  # relative change after which a rival model is built; votes lie on a grid of 2 %
+
+
+def run_mapping(job: MappingJob) -> None:
+    """Place all photos, from COLMAP's models; write `mapping.json`.
+
+    Where COLMAP's incremental mapper leaves photos out, its global mapper is asked too: it needs no pair to
+    start from, and places photos that overlap little. Where photos look outwards, a wrong focal length on a
+    bent path explains nearly all matches (yard, seed 2: 4.4 % too long, no photo right). So if the pairs
+    voted for another focal length than the mapper found, the mapper runs again with the voted one held fixed,
+    and the model with more observations is kept.
+    """
+    output, database = Path(job["output"]), Path(job["database"])
+    matched = Matched.read(database)
+    models = _models(job, output, matched)
+    if models and not plausible(models[0]):
+        matched.distorted = False
+        models = _models(job, output, matched)
+    placement = None
+    if models:
+        change = matched.take_cameras(max(models, key=_size))
+        rivals = _models(job, output, matched, held=True) if change > FOCAL_DOUBT else []
+        if rivals:
+            other = Matched.read(database)  # read now, while the database has the focal length of the votes
+            other.distorted = matched.distorted
+        if change > FOCAL_CHANGE:
+            # The poses of pairs were wrong by as much, so verify and map again with the model's focal length.
+            matched.write_agreed(database, matched.find_motions(job["jobs"]))
+            models = _models(job, output, matched) or models
+        else:
+            matched.load_motions(Path(job["motions"]))
+        placement = _placed(job, database, matched, models)
+        if rivals:
+            other.load_motions(Path(job["motions"]))
+            placement = max(placement, _placed(job, database, other, rivals), key=_explained)
+    parts = [] if placement is None else [placement, *placement.others]
+    chosen = parts[job["part"] - 1] if len(parts) >= job["part"] else None
+    if chosen is None or len(chosen.poses) < LEAST_PHOTOS:
+        reason = "no pair of photos to start from"
+        left_out = dict.fromkeys(matched.names, reason) | (_left_out(parts[0], parts) if parts else {})
+        names = [_names(part, part.poses) for part in parts]
+        empty = {"model": None, "left_out": left_out, "partners": {}, "cameras": [], "parts": names}
+        write_json(
+            output / "mapping.json",
+            {**empty, "links": [], "unplaced_links": [], "provisional": [], "hypotheses": {}},
+        )
+        return
+    chosen.matched.save_motions(output / MOTIONS)
+    model = chosen.model
+    model.tear_down()
+    model.extract_colors_for_all_images(job["photos"])
+    (output / "0").mkdir()
+    model.write(str(output / "0"))
+    summary: ModelSummary = {
+        "images": model.num_reg_images(),
+        "points": model.num_points3D(),
+        "error_px": round(model.compute_mean_reprojection_error(), 4),
+        "track_length": round(model.compute_mean_track_length(), 3),
+    }
+    links = chosen.links()
+    name = matched.names
+    write_json(
+        output / "mapping.json",
+        {
+            "model": summary,
+            "left_out": dict(sorted(_left_out(chosen, parts).items())),
+            "partners": {name[k]: len(place.partners) for k, place in chosen.places.items()},
+            "provisional": _names(chosen, chosen.provisional),
+            "hypotheses": {
+                name[k]: (-pose[:, :3].T @ pose[:, 3]).tolist()
+                for k, pose in chosen.hypotheses.items()
+                if k not in chosen.poses
+            },
+            "links": [[name[a], name[b], count] for (a, b), count in links.items()],
+            "unplaced_links": [
+                [name[a], name[b], len(motions[0].matches)]
+                for (a, b), motions in chosen.matched.motions.items()
+                if motions and not {a, b} <= chosen.poses.keys()
+            ],
+            "parts": [_names(part, part.poses) for part in parts],
+            "cameras": chosen.cameras(),
+        },
+    )
+
+
+def _names(placement: Placement, photos: Collection[int]) -> list[str]:
+    return [placement.matched.names[photo] for photo in sorted(photos)]
+
+
+def _left_out(placement: Placement, parts: Sequence[Placement]) -> dict[str, str]:
+    """Return the name of each photo that is left out, with the reason."""
+    reasons = dict(placement.left_out)
+    for number, part in enumerate(parts, 1):
+        if part is not placement:
+            why = f"in part {number}: {len(part.poses)} photos that no photo joins to the others"
+            reasons |= dict.fromkeys(part.poses.keys() - placement.poses.keys(), why)
+    return {placement.matched.names[photo]: reason for photo, reason in reasons.items()}
+
+
+def _explained(placement: Placement) -> int:
+    """Count the observations of a model; 0 where it lost its photos, because its points are then outdated."""
+    enough = len(placement.poses) >= LEAST_PHOTOS
+    return int(placement.model.compute_num_observations()) if enough else 0
+
+
+def _models(job: MappingJob, output: Path, matched: Matched, *, held: bool = False) -> list[Any]:
+    """Return the models of COLMAP's mapper, and of the global one if it leaves photos out; largest first."""
+    models: list[Any] = []
+    for mapper in dict.fromkeys((job["mapper"], "global")):
+        run = _map_globally if mapper == "global" else _map_incrementally
+        models += sorted(
+            run(job, output, matched.distorted and not held, held).values(), key=_size, reverse=True
+        )
+        for folder in output.glob("[0-9]*"):
+            shutil.rmtree(folder)
+        if any(model.num_reg_images() == len(matched.ids) for model in models):
+            break
+    return [model for model in models if model.num_reg_images() >= LEAST_PHOTOS]
+
+
+def _size(model: Any) -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
+
+
+def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> Placement:
+    """Place photos from the first model; where it leaves some out, from the others; join their parts."""
+    parts: list[Placement] = []
+    for model in models:
+        todo = set(range(len(matched.ids))).difference(*(part.poses for part in parts))
+        if not todo & matched.poses(model).keys():
+            continue
+        part = Placement(matched.copy(), database, model, job["seed"])
+        part.run()
+        for poses in part.apart:
+            other = Placement(matched.copy(), database, part.model, job["seed"])
+            other.poses = poses
+            other.run()
+            parts.append(other)
+        parts.append(part)
+        if len(part.poses) == len(matched.ids):
+            break
+    parts.sort(key=lambda part: -len(part.poses))
+    best, *others = parts
+    joined = True
+    while joined:
+        before = len(best.poses)
+        for other in others:
+            join(best, other)
+        joined = len(best.poses) > before
+        if joined:
+            best.run()
+            joined = len(best.poses) > before
+    placed = set(best.poses)
+    for other in others:
+        if len(other.poses.keys() - placed) >= LEAST_PHOTOS:
+            best.others.append(other)
+            placed |= other.poses.keys()
+    return best
+
+
+def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: bool) -> dict[int, Any]:
+    options = pipeline_options(job["seed"])
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not held
+    options.min_model_size = LEAST_PHOTOS
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
+    options.ba_global_max_refinements = job["refinements"]
+    options.ba_global_function_tolerance = job["tolerance"]
+    options.ba_local_max_refinements = job["local_refinements"]
+    options.mapper.ba_local_num_images = job["local_cameras"]
+    counter = Path(job["progress"])
+    state = {"best": 0, "now": 0}
+
+    def first() -> None:
+        state["now"] = 2
+
+    def following() -> None:
+        # COLMAP may build several models, each from two photos: the bar shows the largest so far.
+        state["now"] += 1
+        state["best"] = max(state["best"], state["now"])
+        counter.write_text(str(state["best"]))
+
+    return pycolmap.incremental_mapping(
+        job["database"],
+        job["photos"],
+        str(output),
+        options=options,
+        initial_image_pair_callback=first,
+        next_image_callback=following,
+    )
+
+
+def _map_globally(job: MappingJob, output: Path, distorted: bool, held: bool) -> dict[int, Any]:
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = job["seed"]
+    options.mapper.rotation_averaging.random_seed = job["seed"]
+    options.mapper.global_positioning.random_seed = job["seed"]
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.retriangulation.random_seed = job["seed"]
+    adjustment = options.mapper.bundle_adjustment.ceres
+    adjustment.use_gpu = False
+    options.mapper.bundle_adjustment.refine_extra_params = distorted
+    options.mapper.bundle_adjustment.refine_focal_length = not held
+    adjustment.min_num_residuals_for_cpu_multi_threading = 10**9
+    options.min_model_size = LEAST_PHOTOS
+    return pycolmap.global_mapping(job["database"], job["photos"], str(output), options=options)

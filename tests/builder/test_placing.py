@@ -258,6 +258,7 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
             self.matched = SimpleNamespace(ids=range(1000), motions=defaultdict(lambda: [1]), rays=list)
             self.pairs = [[(k - 1, k)] * (k > 0) + [(k, k + 1)] * (k < 999) for k in range(1000)]
             self.poses = dict.fromkeys(range(980), np.eye(3, 4))
+            self.apart, self.joined = [], []
 
         def _best(self, photo, now, rays, points):
             pose = None if photo > len(self.poses) else np.eye(3, 4)
@@ -267,7 +268,10 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
         def _same(self, first, second):
             return second is not None
 
-        def _triangulate_and_adjust(self, *, final):
+        def links(self):
+            return {pair: 1 for pairs in self.pairs for pair in pairs if set(pair) <= self.poses.keys()}
+
+        def _triangulate_and_adjust(self, *, final, pairs=True):
             pass
 
     monkeypatch.setattr(Points, "read", lambda matched, model: None)
@@ -280,7 +284,7 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
 def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypatch):
     """Photos are taken out until too few are left: one line, not a crash of COLMAP."""
     write_capture(tmp_path / "raw", 6)
-    set_in_worker(monkeypatch, "placing.AGREE = placing.AGREE_NEW = 99")
+    set_in_worker(monkeypatch, "placing.AGREE = placing.AGREE_NEW = placing.LITTLE_AREA = 99")
     with pytest.raises(AwError, match="placed 0 of 6 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500, sfm="fast"))
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]

@@ -25,11 +25,13 @@ def attempts(monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: in
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
         model = {"images": placed[plan.name], "points": 9999} if placed[plan.name] else None
-        part = SimpleNamespace(folder=Path("nowhere"), facts={"model": model, "plan": plan.name, "fixed": []})
+        facts = {"model": model, "plan": plan.name, "fixed": [], "parts": [["p.jpg"] * placed[plan.name]]}
+        part = SimpleNamespace(folder=Path("nowhere"), facts=facts)
         return SfmStages(part, part, part)
 
     monkeypatch.setattr(Stages, "_attempt", attempt)
-    facts = {"photos": [{"width": 1000, "height": 800}] * photos, "skipped": []}
+    one = {"width": 1000, "height": 800, "work_name": "p.jpg", "source": "p.jpg"}
+    facts = {"photos": [one] * photos, "skipped": []}
     self = Stages(SimpleNamespace(), BuildSettings(), None, None, 1, Bar(enabled=False), False)
     return tried, self._sfm(SimpleNamespace(), SimpleNamespace(facts=facts), None).mapping.facts["plan"]
 
@@ -42,17 +44,23 @@ def test_fast_is_enough_where_it_places_everything(monkeypatch):
     ("fast", "wider", "thorough", "tried", "chosen"),
     [
         (20, 28, 30, 2, "wider"),
-        (26, 25, 30, 2, "fast"),
+        (26, 25, 20, 3, "fast"),
         (28, 30, 30, 1, "fast"),  # two of thirty may have no clear place
-        (26, 26, 30, 2, "wider"),  # of equal ones the later
+        (26, 26, 26, 3, "thorough"),  # of equal ones the later
         (0, 14, 12, 3, "wider"),
         (0, 14, 28, 3, "thorough"),
     ],
 )
 def test_the_attempt_that_places_more_is_kept(monkeypatch, fast, wider, thorough, tried, chosen):
-    """All pairs are matched only if less than half is placed."""
+    """All pairs are matched only if less than nine tenths are placed."""
     names, kept = attempts(monkeypatch, {"fast": fast, "wider": wider, "thorough": thorough}, 30)
     assert names == ["fast", "wider", "thorough"][:tried] and kept == chosen
+
+
+def test_all_pairs_of_many_photos_are_matched_only_if_less_than_half_is_placed(monkeypatch):
+    assert attempts(monkeypatch, {"fast": 70, "wider": 70}, 120) == (["fast", "wider"], "wider")
+    placed = {"fast": 50, "wider": 50, "thorough": 90}
+    assert attempts(monkeypatch, placed, 120) == (["fast", "wider", "thorough"], "thorough")
 
 
 def test_few_photos_are_matched_thoroughly_at_once(monkeypatch):

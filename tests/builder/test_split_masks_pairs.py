@@ -173,7 +173,7 @@ def test_fast_comes_before_thorough_and_each_may_be_asked_for():
     names = {w: [p.name for p in plans(photos_of(40), BuildSettings(sfm=w))] for w in wanted}
     assert names == {"auto": ["fast", "wider", "thorough"], "fast": ["fast"], "thorough": ["thorough"]}
     few = plans(photos_of(25), BuildSettings())  # all pairs are matched at once: there are no more
-    assert [p.name for p in few] == ["fast", "thorough"] and few[1].below == 0.9
+    assert [p.name for p in few] == ["fast", "thorough"] and few[1].below == 1.0
     assert [plans(photos_of(k), BuildSettings())[0].tolerance > 0 for k in (100, 101)] == [False, True]
 
 

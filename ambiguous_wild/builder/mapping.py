@@ -83,7 +83,9 @@ def run_mapping(job: MappingJob) -> None:
         {
             "model": summary,
             "left_out": dict(sorted(_left_out(chosen, parts).items())),
-            "partners": {name[k]: len(place.partners) for k, place in chosen.places.items()},
+            "partners": {
+                name[k]: len(place.partners) for k, place in chosen.places.items() if k in chosen.poses
+            },
             "provisional": _names(chosen, chosen.provisional),
             "hypotheses": {
                 name[k]: (-pose[:, :3].T @ pose[:, 3]).tolist()

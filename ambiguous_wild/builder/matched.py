@@ -232,6 +232,16 @@ class Matched:
                 self.motions[a, b].append(Motion(*motion))
 
 
+def largest_group(pairs: Collection[Pair]) -> int:
+    """Return the largest number of photos that pairs connect."""
+    if not pairs:
+        return 0
+    ends = np.array(list(pairs)).T
+    count = int(ends.max()) + 1
+    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), (count, count))
+    return int(np.bincount(connected_components(graph, directed=False)[1]).max())
+
+
 def _well_connected(pairs: Collection[Pair]) -> set[int]:
     """Choose photos so that each photo has `MAPPED_PARTNERS` chosen partners, or all that it has.
 

@@ -17,9 +17,10 @@ from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.placing import ALIKE_DEG, FITS, LEAST_PHOTOS, Placement, Points, centre_of
 
-JOINED_BY = (
-    2  # smallest number of pairs across two parts that must fit, and of photos that they involve a side
-)
+JOINED_BY = 2  # smallest number of pairs across two parts that must fit; they involve one more photo
+# Smallest singular value of the equations for scale and shift, relative to the largest: along a straight path
+# every scale fits.
+LEAST_SPREAD = 0.02
 LEAST_DEPTHS = 8  # features of a photo with a depth in both parts, for the scale
 ROUGHLY = 4.0  # a match fits within this many times the usual distance: the join is not adjusted yet
 RIVALS = 0.5  # share of pairs that agree on another rotation, relative to those that fit, that refuses a join
@@ -114,9 +115,11 @@ def _by_pairs(first: Placement, second: Placement, rotations: Sequence[Across]) 
             ray = np.cross(np.eye(3), row.direction).T  # ray @ v = cross(direction, v)
             rows.append(np.column_stack([ray @ rotation @ centre_of(second.poses[row.there]), ray]))
             values.append(ray @ centre_of(first.poses[row.here]))
-        scale, *shift = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values), rcond=None)[0]
-        if scale > 0:
-            yield Similarity(float(scale), rotation, np.array(shift))
+        system = np.concatenate(rows) * [1 / second.radius, 1.0, 1.0, 1.0]
+        scale, *shift = np.linalg.lstsq(system, np.concatenate(values), rcond=None)[0]
+        spread = np.linalg.svd(system, compute_uv=False)
+        if scale > 0 and spread[-1] > LEAST_SPREAD * spread[0]:
+            yield Similarity(float(scale) / second.radius, rotation, np.array(shift))
 
 
 def _by_photos(first: Placement, second: Placement) -> Iterator[Similarity]:

@@ -42,6 +42,7 @@ AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two 
 PLACES = 3  # largest number of places tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of the points of a place
 ROUNDS = 8  # rounds of placing anew, besides those that only add photos
+SPLITS = 5  # times at most that photos without a link to the others are taken out
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
@@ -90,14 +91,20 @@ class Placement:
     def run(self) -> None:
         """Place all photos anew, one after another, until none moves, or hardly any of many."""
         outs = [0] * len(self.matched.ids)
-        parts: list[dict[int, np.ndarray]] = [{}]
-        while parts and len(self.poses) >= LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
+        for _ in range(SPLITS):
+            if len(self.poses) < LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
+                break
             self._settle(outs)
             parts = self._keep_largest()
             if not parts and len(self.poses) >= LEAST_PHOTOS:
                 self._triangulate_and_adjust(final=True)
                 parts = self._keep_largest()
+            if not parts:
+                break
             self.apart += [part for part in parts if len(part) >= LEAST_PHOTOS]
+        else:
+            if len(self.poses) >= LEAST_PHOTOS:
+                self._triangulate_and_adjust(final=True)
         firm = self.components(self.provisional)[:1]
         firm = [part for part in firm if len(part) >= LEAST_PHOTOS]
         self.provisional = set(self.poses).difference(*firm)

@@ -111,6 +111,7 @@ class MatchResult(TypedDict):
     pairs: int  # pairs tried
     verified: int  # pairs with a motion that other pairs confirm
     planar: int  # verified pairs whose matches lie on one plane
+    connected: int  # photos that verified pairs connect, so that no more can be placed
     fixed: list[FixedMask]  # fixed to the camera; none of its features is matched
 
 

@@ -74,6 +74,7 @@ class SfmPlan:
     local_refinements: int  # rounds of the adjustment after a photo was placed, at most
     local_cameras: int  # cameras in that adjustment: the new one and those that share most points with it
     continues: bool = False  # only photos left out so far look for partners, besides the pairs matched so far
+    worth: float = 0.0  # share of the photos that pairs must connect, else nothing is mapped
     below: float = 1.0  # the plan runs only if a smaller share of the photos is placed so far
 
 
@@ -85,6 +86,7 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
     fast = _fast(photos, settings)
     if settings.sfm == "fast":
         return [fast]
+    fast = replace(fast, worth=HALF)
     if fast.matcher != "retrieval":
         return [fast, thorough]
     wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True, below=ENOUGH)

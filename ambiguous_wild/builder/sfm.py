@@ -284,7 +284,11 @@ def match(
     run_job(job, folder, lambda: bar.at(_count(database, "matches")))
     bar.finish()
     pairs = every if matcher == "exhaustive" else len(listed.read_text(encoding="utf-8").splitlines())
-    counts = {"verified": 0, "planar": 0} if posed else json.loads((folder / "pairs.json").read_text())
+    counts = (
+        dict.fromkeys(("verified", "planar", "connected"), 0)
+        if posed
+        else json.loads((folder / "pairs.json").read_text())
+    )
     fixed = json.loads((folder / FIXED).read_text(encoding="utf-8")) if photos else []
     return cast(MatchResult, {"matcher": matcher, "pairs": pairs, **counts, "fixed": fixed})
 
@@ -294,12 +298,23 @@ def map_scene(
     matches: Path,
     photos: Path,
     count: int,
+    connected: int,
     settings: BuildSettings,
     plan: SfmPlan,
     jobs: int,
     bar: Bar,
 ) -> MappingResult:
-    """Build the model into `folder/0`."""
+    """Build the model into `folder/0`; it has none if pairs connect too few photos for the plan."""
+    if connected < plan.worth * count:
+        nothing: dict[str, object] = {
+            "model": None,
+            "left_out": {},
+            "partners": {},
+            "provisional": [],
+            "hypotheses": {},
+        }
+        nothing |= {"links": [], "unplaced_links": [], "parts": [], "cameras": [], "plan": plan.name}
+        return cast(MappingResult, nothing)
     progress = folder / "progress"
     bar.start("placing photos", count if settings.mapper == "incremental" else None)
     database = folder / DATABASE

@@ -29,7 +29,7 @@ import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import FIXED, FixedArea, find_fixed, moving_matches
 from ambiguous_wild.builder.mapping import run_mapping
-from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.placing import pipeline_options
 from ambiguous_wild.builder.records import FixedMask
 from ambiguous_wild.builder.retrieval import (
@@ -215,7 +215,8 @@ def run_matches(job: MatchJob) -> None:
     matched.write_agreed(database, agreed)
     matched.save_motions(database.with_name(MOTIONS))
     planar = [len(matched.motions[pair][number].rotations) > 1 for pair, (number, _) in agreed.items()]
-    write_json(database.with_name("pairs.json"), {"verified": len(agreed), "planar": sum(planar)})
+    counts = {"verified": len(agreed), "planar": sum(planar), "connected": largest_group(agreed)}
+    write_json(database.with_name("pairs.json"), counts)
 
 
 def _take_out_fixed(job: MatchJob, matched: Matched) -> bool:

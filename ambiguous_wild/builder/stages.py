@@ -447,7 +447,7 @@ class Stages:
             ),
         )  # fmt: skip
         earlier = before if plan.continues else None
-        left_out = sorted(earlier.mapping.facts["left_out"]) if earlier else None
+        left_out = (sorted(earlier.mapping.facts["left_out"]) or None) if earlier else None
         matches = work.run(
             "matches",
             [features.key, plan.matcher, plan.similar, plan.neighbours, earlier and earlier.matches.key,
@@ -460,7 +460,17 @@ class Stages:
         mapping = work.run(
             "mapping",
             [matches.key, settings.mapper, settings.part, to_plain(plan), settings.seed],
-            lambda f: map_scene(f, matches.folder, photos, len(facts), settings, plan, self.jobs, self.bar),
+            lambda f: map_scene(
+                f,
+                matches.folder,
+                photos,
+                len(facts),
+                matches.facts["connected"],
+                settings,
+                plan,
+                self.jobs,
+                self.bar,
+            ),
         )
         return SfmStages(features, matches, mapping)
 

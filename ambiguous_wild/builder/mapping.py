@@ -58,7 +58,14 @@ def run_mapping(job: MappingJob) -> None:
         reason = "no pair of photos to start from"
         left_out = dict.fromkeys(matched.names, reason) | (_left_out(parts[0], parts) if parts else {})
         names = [_names(part, part.poses) for part in parts]
-        empty = {"model": None, "left_out": left_out, "partners": {}, "cameras": [], "parts": names}
+        empty = {
+            "model": None,
+            "left_out": left_out,
+            "partners": {},
+            "cameras": [],
+            "parts": names,
+            "firm": 0,
+        }
         write_json(
             output / "mapping.json",
             {**empty, "links": [], "unplaced_links": [], "provisional": [], "hypotheses": {}},
@@ -99,6 +106,7 @@ def run_mapping(job: MappingJob) -> None:
                 if motions and not {a, b} <= chosen.poses.keys()
             ],
             "parts": [_names(part, part.poses) for part in parts],
+            "firm": len(parts[0].poses.keys() - parts[0].provisional),
             "cameras": chosen.cameras(),
         },
     )

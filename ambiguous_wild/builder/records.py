@@ -143,6 +143,7 @@ class MappingResult(TypedDict):
     links: list[tuple[str, str, int]]  # pairs of placed photos that agree, with their matches that fit
     unplaced_links: list[tuple[str, str, int]]  # other pairs, with the matches of their main motion
     parts: list[list[str]]  # work names of parts that no photo joins, the largest first
+    firm: int  # photos of the largest part that are not provisional
     cameras: list[CameraFact]
     plan: str  # "fast", "wider" or "thorough"
 

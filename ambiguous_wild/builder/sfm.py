@@ -313,7 +313,14 @@ def map_scene(
             "provisional": [],
             "hypotheses": {},
         }
-        nothing |= {"links": [], "unplaced_links": [], "parts": [], "cameras": [], "plan": plan.name}
+        nothing |= {
+            "links": [],
+            "unplaced_links": [],
+            "parts": [],
+            "firm": 0,
+            "cameras": [],
+            "plan": plan.name,
+        }
         return cast(MappingResult, nothing)
     progress = folder / "progress"
     bar.start("placing photos", count if settings.mapper == "incremental" else None)

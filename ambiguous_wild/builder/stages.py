@@ -402,7 +402,7 @@ class Stages:
                 self.bar.say(f"{placed} of {len(facts)} photos placed: trying harder")
             attempts.append(self._attempt(work, screened, masks, plan, attempts[-1] if attempts else None))
         # Of attempts that place equally many photos the last is taken, which is the most precise.
-        best = max(reversed(attempts), key=lambda attempt: attempt.placed)
+        best = max(reversed(attempts), key=lambda a: (a.mapping.facts["firm"], a.placed))
         parts = report.part_lines(best.mapping.facts["parts"], {f["work_name"]: f["source"] for f in facts})
         if self.settings.part > max(1, len(best.mapping.facts["parts"])):
             raise AwError(f"--part {self.settings.part}: " + "; ".join(parts or ["the photos form one part"]))

@@ -25,7 +25,8 @@ def attempts(monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: in
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
         model = {"images": placed[plan.name], "points": 9999} if placed[plan.name] else None
-        facts = {"model": model, "plan": plan.name, "fixed": [], "parts": [["p.jpg"] * placed[plan.name]]}
+        facts = {"model": model, "plan": plan.name, "fixed": [], "firm": placed[plan.name]}
+        facts["parts"] = [["p.jpg"] * placed[plan.name]]
         part = SimpleNamespace(folder=Path("nowhere"), facts=facts)
         return SfmStages(part, part, part)
 

@@ -266,6 +266,7 @@ def build(raw: Path, way: str, seed: int, args: argparse.Namespace) -> dict[str,
         "placed": info["counts"]["registered"],
         "points": info["counts"]["points"],
         "chosen": info["chosen"]["sfm"],
+        "provisional": [Path(name).stem for name, p in info["photos"].items() if p.get("provisional")],
         "seconds": {stage: info["seconds"].get(stage) for stage in ("features", "matches", "mapping")},
     }
 
@@ -311,8 +312,10 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         right = sum(row.get("right", 0) for row in of_way)
         wrong = sum(row.get("judged", 0) - row.get("right", 0) for row in of_way)
         refused = sum("refused" in row for row in of_way)
+        named = sum(len(row.get("wrong", {}).keys() & set(row.get("provisional", ()))) for row in of_way)
         lines.append(
-            f"- {way}: {right} of {photos} photos right, {wrong} wrong, {photos - right - wrong} left out, "
+            f"- {way}: {right} of {photos} photos right, {wrong} wrong ({named} of them named as provisional), "
+            f"{photos - right - wrong} left out, "
             f"{refused} captures refused"
         )
     return "\n".join(lines) + "\n"

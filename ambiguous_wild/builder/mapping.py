@@ -7,6 +7,8 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.parts import join
 from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
@@ -97,7 +99,7 @@ def run_mapping(job: MappingJob) -> None:
             "hypotheses": {
                 name[k]: (-pose[:, :3].T @ pose[:, 3]).tolist()
                 for k, pose in chosen.hypotheses.items()
-                if k not in chosen.poses
+                if k not in chosen.poses and np.isfinite(pose).all()
             },
             "links": [[name[a], name[b], count] for (a, b), count in links.items()],
             "unplaced_links": [

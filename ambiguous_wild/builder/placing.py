@@ -172,11 +172,12 @@ class Placement:
         for number, photos in numbers.items():
             params = self.model.cameras[number].params
             spread = covariance.get_other_params_cov(params) if covariance else None
+            deviation = np.inf if spread is None else float(np.sqrt(spread[0][0]))
             facts.append(
                 {
                     "photos": [self.matched.names[photo] for photo in photos],
                     "focal_px": round(self.matched.focal_px(photos[0]), 2),
-                    "focal_sd_px": None if spread is None else round(float(np.sqrt(spread[0][0])), 2),
+                    "focal_sd_px": round(deviation, 2) if np.isfinite(deviation) else None,
                 }
             )
         return facts

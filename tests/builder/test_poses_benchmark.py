@@ -52,17 +52,14 @@ def test_the_table_tells_refused_wrong_and_missing(poses):
         {"capture": "a-0", "way": "auto", "photos": 9, "known": 9, "judged": 8, "right": 8, "wrong": {},
          "position_percent": 0.1, "focal_percent": -0.2},
         {"capture": "a-0", "way": "colmap", "photos": 9, "known": 9, "judged": 9, "right": 8,
-         "wrong": {"p": [74.0, 90.0]}, "position_percent": 0.4, "focal_percent": 9.0},
+         "wrong": {"p": [74.0, 90.0]}, "provisional": ["p", "q"], "position_percent": 0.4, "focal_percent": 9.0},
         {"capture": "b-0", "way": "auto", "refused": "too few"},
     ]  # fmt: skip
     text = poses.markdown(rows)
     assert "| a-0 | 9 | 8 of 8; 0.10 %; -0.20 % | 8 of 9; 1 wrong, 74.0; 0.40 %; +9.00 % |" in text
     assert "| b-0 | 0 | refused |  |" in text
-    assert (
-        "Over the 1 captures" in text
-        and "- auto: 8 of 9 photos right, 0 wrong, 1 left out, 0 captures" in text
-    )
-    assert "- colmap: 8 of 9 photos right, 1 wrong" in text
+    assert "Over the 1 captures" in text and "- auto: 8 of 9 photos right, 0 wrong (0 of them" in text
+    assert "- colmap: 8 of 9 photos right, 1 wrong (1 of them named as provisional), 0 left out" in text
 
 
 def test_ways_of_before_need_a_checkout(poses, tmp_path, capsys):

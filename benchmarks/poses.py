@@ -314,9 +314,8 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         refused = sum("refused" in row for row in of_way)
         named = sum(len(row.get("wrong", {}).keys() & set(row.get("provisional", ()))) for row in of_way)
         lines.append(
-            f"- {way}: {right} of {photos} photos right, {wrong} wrong ({named} of them named as provisional), "
-            f"{photos - right - wrong} left out, "
-            f"{refused} captures refused"
+            f"- {way}: {right} of {photos} photos right, {wrong} wrong ({named} of them named as "
+            f"provisional), {photos - right - wrong} left out, {refused} captures refused"
         )
     return "\n".join(lines) + "\n"
 

@@ -52,7 +52,8 @@ def test_the_table_tells_refused_wrong_and_missing(poses):
         {"capture": "a-0", "way": "auto", "photos": 9, "known": 9, "judged": 8, "right": 8, "wrong": {},
          "position_percent": 0.1, "focal_percent": -0.2},
         {"capture": "a-0", "way": "colmap", "photos": 9, "known": 9, "judged": 9, "right": 8,
-         "wrong": {"p": [74.0, 90.0]}, "provisional": ["p", "q"], "position_percent": 0.4, "focal_percent": 9.0},
+         "wrong": {"p": [74.0, 90.0]}, "provisional": ["p", "q"],
+         "position_percent": 0.4, "focal_percent": 9.0},
         {"capture": "b-0", "way": "auto", "refused": "too few"},
     ]  # fmt: skip
     text = poses.markdown(rows)

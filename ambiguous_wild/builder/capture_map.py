@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ambiguous_wild.builder.growth import Growth
+from ambiguous_wild.builder.growth import GrowthForecast
 from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, lay_out, weakly_held
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import Model
@@ -123,7 +123,7 @@ def map_of_model(
 def map_of_photos(
     sources: Sequence[str],  # in the order of capture
     links: Sequence[Link],
-    growth: Growth,
+    growth: GrowthForecast,
 ) -> CaptureMap:
     """Return the map of photos without poses: near each other if they overlap much."""
     main = set(growth.parts[0]) if growth.parts else set()
@@ -161,7 +161,7 @@ def map_of_photos(
     )
 
 
-def joins(growth: Growth, links: Sequence[Link]) -> list[tuple[int, int]]:
+def joins(growth: GrowthForecast, links: Sequence[Link]) -> list[tuple[int, int]]:
     """Return pairs of photos between which more photos are needed, so that all parts join the first."""
     if not growth.parts:
         return []

@@ -19,7 +19,7 @@ import numpy as np
 from ambiguous_wild.builder.capture_map import CaptureMap, joins, map_of_photos
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.fixed_to_camera import words_of
-from ambiguous_wild.builder.growth import Growth, predict_growth
+from ambiguous_wild.builder.growth import GrowthForecast, predict_growth
 from ambiguous_wild.builder.overlap_graph import Link
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
@@ -67,7 +67,7 @@ def run_checks(
     facts: Sequence[CheckedPhoto],
     thumbnails: np.ndarray,  # [N, 1024], see `screen.thumbnail`
     compared: PhotoComparison,
-    growth: Growth,
+    growth: GrowthForecast,
 ) -> list[Check]:
     """Run all checks, in the order of the table."""
     return [
@@ -216,7 +216,7 @@ def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Ch
     )
 
 
-def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison, growth: Growth) -> Check:
+def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison, growth: GrowthForecast) -> Check:
     """Predict how many photos will be placed, and name those that share too little with the others."""
     names, count = [f["source"] for f in facts], len(facts)
     if not growth.parts:
@@ -296,7 +296,7 @@ class CaptureReport:
     checks: list[Check]
     sources: list[str]  # of the readable photos, in the order of capture
     links: list[Link]  # photos that overlap
-    growth: Growth
+    growth: GrowthForecast
 
     @property
     def warnings(self) -> list[Check]:

@@ -16,7 +16,7 @@ SMALLEST = 3  # photos of a part
 
 
 @dataclass(frozen=True)
-class Growth:
+class GrowthForecast:
     """Prediction for a capture."""
 
     parts: list[list[int]]  # photos of each part, the largest first; the first is what will be built
@@ -26,7 +26,7 @@ class Growth:
 def predict_growth(
     count: int,  # photos
     matches: Mapping[tuple[int, int], tuple[np.ndarray, np.ndarray]],  # features of both photos, [M] each
-) -> Growth:
+) -> GrowthForecast:
     """Grow parts from the pairs with the most matches, until no photo can be added."""
     features = [0] * count
     for pair, ends in matches.items():
@@ -50,7 +50,7 @@ def predict_growth(
         parts.append(sorted(grown))
         free -= grown
     parts.sort(key=lambda part: (-len(part), part))
-    return Growth(parts, sorted(free))
+    return GrowthForecast(parts, sorted(free))
 
 
 def _grow(

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.builder.joining import join
 from ambiguous_wild.builder.matched import Matched
-from ambiguous_wild.builder.parts import join
 from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import MOTIONS

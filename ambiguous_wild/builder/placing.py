@@ -197,7 +197,7 @@ class Placement:
 
     def _place_all(self, outs: list[int], only_out: bool) -> bool:
         """Place all photos; tell whether more than a few changed, or an added one may help others in."""
-        rays, points = self.matched.rays(), Points.read(self.matched, self.model)
+        rays, points = self.matched.rays(), PointLookup.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
         self.places, self.left_out, self.provisional, self.hypotheses = {}, {}, set(), {}
         for photo in range(len(self.matched.ids)):
@@ -232,7 +232,7 @@ class Placement:
         return helps or len(moves) > STILL * len(self.matched.ids)
 
     def _best(
-        self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: Points
+        self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: PointLookup
     ) -> tuple[Place, Place]:
         """Return the place with most weight, and the strongest place elsewhere."""
         places = [] if now is None else [self._judge(photo, now, rays)]
@@ -251,7 +251,7 @@ class Placement:
         elsewhere.append(self._rival_by_motions(photo, best.partners))
         return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
 
-    def _unopposed(self, photo: int, best: Place, rival: Place, points: Points) -> bool:
+    def _unopposed(self, photo: int, best: Place, rival: Place, points: PointLookup) -> bool:
         """Tell whether little evidence for a place is enough, because nothing speaks against it."""
         if rival.partners or best.area < LITTLE_AREA or best.spread < LITTLE_SPREAD:
             return False
@@ -332,7 +332,7 @@ class Placement:
         shares = np.bincount(cells) / len(cells)
         return len(np.unique(cells[chosen])) / float((1 - (1 - shares) ** len(chosen)).sum())
 
-    def resections(self, photo: int, points: Points) -> list[np.ndarray]:
+    def resections(self, photo: int, points: PointLookup) -> list[np.ndarray]:
         """Find poses [3, 4] of a photo from points that at least two other photos determine."""
         features, xyz = points.matched_with(photo, self.pairs[photo], self.poses)
         pixels = self.matched.features[photo][features]
@@ -412,7 +412,7 @@ class Placement:
 
 
 @dataclass
-class Points:
+class PointLookup:
     """Points of a model, found by the features that observe them."""
 
     matched: Matched
@@ -421,7 +421,7 @@ class Points:
     views: np.ndarray  # [P] number of photos that observe the point
 
     @classmethod
-    def read(cls, matched: Matched, model: Any) -> Points:
+    def read(cls, matched: Matched, model: Any) -> PointLookup:
         at = {number: k for k, number in enumerate(matched.ids)}
         rows = [np.full(len(f), -1) for f in matched.features]
         xyz, views = np.zeros((len(model.points3D), 3)), np.zeros(len(model.points3D), int)

@@ -18,7 +18,7 @@ from ambiguous_wild.builder.capture_map import (
     photo_label,
     top_view,
 )
-from ambiguous_wild.builder.growth import Growth
+from ambiguous_wild.builder.growth import GrowthForecast
 from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, write_map
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import read_png_rgb
@@ -171,7 +171,9 @@ def test_photos_without_poses_show_the_prediction() -> None:
         (5, 6, 30),
         (3, 4, 14),
     ]
-    drawn = map_of_photos([f"{k}.jpg" for k in range(8)], links, Growth([[0, 1, 2, 3], [4, 5, 6]], [7]))
+    drawn = map_of_photos(
+        [f"{k}.jpg" for k in range(8)], links, GrowthForecast([[0, 1, 2, 3], [4, 5, 6]], [7])
+    )
     assert [p.kind for p in drawn.photos] == ["train"] * 4 + ["part"] * 3 + ["left out"]
     assert drawn.advice == ["take 2 or 3 photos between 3 and 4", "take 2 or 3 photos between 6 and 7"]
     assert [(link.ends, link.kind) for link in drawn.links if link.kind != "strong"] == [

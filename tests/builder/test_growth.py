@@ -1,4 +1,4 @@
-"""Growth of parts on tracks that are made up, so that what each photo shares is known."""
+"""GrowthForecast of parts on tracks that are made up, so that what each photo shares is known."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from ambiguous_wild.builder import sfm
 from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placing import Place, Placement, Points, _reason, adjustment_options
+from ambiguous_wild.builder.placing import Place, Placement, PointLookup, _reason, adjustment_options
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -274,7 +274,7 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
         def _triangulate_and_adjust(self, *, final, pairs=True):
             pass
 
-    monkeypatch.setattr(Points, "read", lambda matched, model: None)
+    monkeypatch.setattr(PointLookup, "read", lambda matched, model: None)
     monkeypatch.setattr(Path, "model", None, raising=False)
     placement = Path()
     placement.run()

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.joining import Similarity, join
 from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.motions import Motion
-from ambiguous_wild.builder.parts import Similarity, join
-from ambiguous_wild.builder.placing import Place, Placement, Points
+from ambiguous_wild.builder.placing import Place, Placement, PointLookup
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FOCAL, WIDTH, HEIGHT = 500.0, 640, 480
@@ -133,7 +133,7 @@ def test_only_the_largest_part_that_links_connect_is_kept():
 
 def test_little_evidence_is_enough_only_where_nothing_speaks_against_it():
     part, _ = parts({})
-    points = Points(part.matched, [np.full(len(POINTS), -1)] * 6, np.zeros((0, 3)), np.zeros(0, int))
+    points = PointLookup(part.matched, [np.full(len(POINTS), -1)] * 6, np.zeros((0, 3)), np.zeros(0, int))
 
     def place(partners: int, area: float, spread: float) -> Place:
         return Place(pose(0), frozenset(range(partners)), area, spread)
@@ -145,7 +145,7 @@ def test_little_evidence_is_enough_only_where_nothing_speaks_against_it():
     assert not part._unopposed(0, place(7, 0.01, 0.5), nobody, points)
     assert not part._unopposed(0, place(1, 0.9, 0.9), nobody, points)  # no point fixes its distance
     rows = np.arange(len(POINTS))
-    observed = Points(part.matched, [rows] * 6, POINTS, np.full(len(POINTS), 3))
+    observed = PointLookup(part.matched, [rows] * 6, POINTS, np.full(len(POINTS), 3))
     assert part._unopposed(0, place(1, 0.9, 0.9), nobody, observed)
 
 

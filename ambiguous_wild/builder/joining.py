@@ -15,7 +15,7 @@ import numpy as np
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
-from ambiguous_wild.builder.placing import ALIKE_DEG, FITS, LEAST_PHOTOS, Placement, Points, centre_of
+from ambiguous_wild.builder.placing import ALIKE_DEG, FITS, LEAST_PHOTOS, Placement, PointLookup, centre_of
 
 JOINED_BY = 2  # smallest number of pairs across two parts that must fit; they involve one more photo
 # Smallest singular value of the equations for scale and shift, relative to the largest: along a straight path
@@ -124,7 +124,7 @@ def _by_pairs(first: Placement, second: Placement, rotations: Sequence[Across]) 
 
 def _by_photos(first: Placement, second: Placement) -> Iterator[Similarity]:
     """Yield the similarity that each pose of a photo in both parts implies."""
-    here, there = Points.read(first.matched, first.model), Points.read(second.matched, second.model)
+    here, there = PointLookup.read(first.matched, first.model), PointLookup.read(second.matched, second.model)
     for photo in sorted({*first.poses, *second.poses}):
         mine = [first.poses[photo]] if photo in first.poses else first.resections(photo, here)
         theirs = [second.poses[photo]] if photo in second.poses else second.resections(photo, there)
@@ -139,7 +139,9 @@ def _by_photos(first: Placement, second: Placement) -> Iterator[Similarity]:
                 yield Similarity(scale, rotation, centre_of(pose) - scale * rotation @ centre_of(other))
 
 
-def _depths(photo: int, poses: list[np.ndarray], part: Placement, points: Points) -> list[dict[int, float]]:
+def _depths(
+    photo: int, poses: list[np.ndarray], part: Placement, points: PointLookup
+) -> list[dict[int, float]]:
     """Return for each pose of a photo the depths of its features in a part, by feature."""
     features, xyz = points.matched_with(photo, part.pairs[photo], part.poses)
     depths = [xyz @ pose[2, :3] + pose[2, 3] for pose in poses]

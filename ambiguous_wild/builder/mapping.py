@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.builder.adjustment import pipeline_options, plausible
 from ambiguous_wild.builder.joining import join
 from ambiguous_wild.builder.matched import Matched
-from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement, pipeline_options, plausible
+from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement
 from ambiguous_wild.builder.records import ModelSummary
 from ambiguous_wild.builder.retrieval import MOTIONS
 from ambiguous_wild.builder.sfm import MappingJob

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ambiguous_wild.builder.adjustment import adjustment_options, pipeline_options, plausible
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.records import CameraFact
@@ -44,7 +45,6 @@ RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of 
 ROUNDS = 8  # rounds of placing anew, besides those that only add photos
 SPLITS = 5  # times at most that photos without a link to the others are taken out
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
-DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 ADJUSTMENTS = 3  # joint adjustments at most
@@ -449,38 +449,6 @@ class PointLookup:
         both = np.unique(np.concatenate(links), axis=0)
         both = both[self.views[both[:, 1]] - own[both[:, 1]] >= 2]
         return both[:, 0], self.xyz[both[:, 1]]
-
-
-def pipeline_options(seed: int) -> Any:
-    """Return COLMAP's options on one thread, because bundle adjustment sums in the order of its threads."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    return options
-
-
-def plausible(model: Any) -> bool:
-    """Tell whether the distortion is that of a lens: few or flat photos leave it undetermined."""
-    low, high = DISTORTIONS
-    return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
-
-
-def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
-    """Return options of a joint adjustment on one thread in which a match that does not fit counts little."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_extra_params = distorted
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.max_num_iterations = 50 if final else 10
-    options.ceres.solver_options.function_tolerance = 1e-6 if final else 1e-4
-    options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
-    if photos > FEW:
-        options.ceres.auto_select_solver_type = False
-        solver: Any = options.ceres.solver_options  # its enumerations take names
-        solver.linear_solver_type, solver.preconditioner_type = "ITERATIVE_SCHUR", "SCHUR_JACOBI"
-    return options
 
 
 def _reason(best: Place, rival: Place, needed: int) -> str | None:

@@ -27,10 +27,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ambiguous_wild.builder.adjustment import pipeline_options
 from ambiguous_wild.builder.fixed_to_camera import FIXED, FixedArea, find_fixed, moving_matches
 from ambiguous_wild.builder.mapping import run_mapping
 from ambiguous_wild.builder.matched import Matched, largest_group
-from ambiguous_wild.builder.placing import pipeline_options
 from ambiguous_wild.builder.records import FixedMask
 from ambiguous_wild.builder.retrieval import (
     MOTIONS,

@@ -5,10 +5,6 @@ A reconstruction that holds too few photos or points is refused here, with the l
 
 from __future__ import annotations
 
-import math
-import sqlite3
-from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.builder import report
-from ambiguous_wild.builder.collect import MIN_PHOTOS, Capture, read_test_list, split_photos
+from ambiguous_wild.builder.collect import Capture, read_test_list, split_photos
+from ambiguous_wild.builder.diagnosis import check_registered
 from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
 from ambiguous_wild.builder.map_drawing import FILE as MAP
 from ambiguous_wild.builder.map_drawing import draw_built
@@ -38,7 +35,6 @@ from ambiguous_wild.builder.records import (
     MappingResult,
     MaskResult,
     MatchResult,
-    ModelSummary,
     PackageResult,
     ScreenedPhoto,
     ScreenResult,
@@ -62,131 +58,6 @@ from ambiguous_wild.io.colmap_records import Model
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.motion_points import FILE
-from ambiguous_wild.io.safe_pycolmap import pycolmap
-
-MIN_SHARE = 0.3  # share of the readable photos that must be placed, or most of the scene is missing
-MIN_POINTS = 10  # per placed photo; fewer determine neither poses nor surfaces
-_STRONG_PAIRS = 60  # pairs with the most inliers, used for the diagnosis
-_MAX_PAIR_ID = 2147483647  # COLMAP: pair id = id1 * this + id2
-
-
-@dataclass(frozen=True)
-class PairFacts:
-    """Figures of the matching, from COLMAP's database."""
-
-    features: float  # median per photo
-    tried: int
-    verified: int
-    inliers: float  # median over verified pairs
-    degenerate: float  # share of verified pairs that show one plane only
-    forward: float  # median |t_z| / |t| of the strongest pairs; 1 = straight along the view axis
-    angle_deg: float  # median triangulation angle of the strongest pairs
-
-    def sentence(self) -> str:
-        """Describe the matching in figures, for an error message."""
-        text = f"median {self.features:.0f} features a photo, {self.verified} of {self.tried} pairs verified"
-        if self.verified:
-            text += f" (median {self.inliers:.0f} inliers)"
-        if math.isfinite(self.forward):
-            text += f", motion {100 * self.forward:.0f} % along the view, parallax {self.angle_deg:.1f} deg"
-        return text
-
-    def reason(self, photos: int) -> str:
-        """Return the likeliest cause of a failure and what to try."""
-        if self.features < 200:
-            return "too little texture or too much blur; try --max-features 8000 or sharper photos"
-        if self.verified < photos - 1:
-            return "photos overlap too little; take more photos, each sharing two thirds with the next"
-        if math.isfinite(self.forward) and self.forward > 0.8:
-            return (
-                "the camera moved straight ahead, which fixes no depth; walk sideways or round the subject, "
-                "or try --mapper global"
-            )
-        if self.degenerate > 0.8 or (math.isfinite(self.angle_deg) and self.angle_deg < 2.0):
-            return "a flat scene or a camera that only turned; move the camera between photos"
-        return "matched pairs do not chain; add photos between the ones that fail, or try --max-features 8000"
-
-
-def check_registered(
-    model: ModelSummary | None,
-    photos: int,
-    skipped: int,
-    database: Path,
-    matches: MatchResult,
-    part: int = 1,
-    remarks: Sequence[str] = (),
-) -> None:
-    """Refuse a reconstruction that holds too few photos or points to be a scene.
-
-    Args:
-        model: COLMAP's best model; None if it built none.
-        photos: number of photos that COLMAP got.
-        skipped: number of photos left out before.
-        database: COLMAP's database with features and matches.
-        matches: result of the matching stage.
-        part: of the capture, by size; from the second on, the user asked for it however small it is.
-        remarks: other possible causes, added to the error.
-
-    Raises:
-        AwError: with the counts, the figures of the matching, the likely cause and what to try.
-    """
-    registered, points = (model["images"], model["points"]) if model else (0, 0)
-    needed = max(MIN_PHOTOS, math.ceil(MIN_SHARE * photos) if part == 1 else 0)
-    few = points < MIN_POINTS * registered
-    if registered >= needed and not few:
-        return
-    facts = pair_facts(database, matches)
-    unread = f", {skipped} were left out" if skipped else ""
-    placed = f"{registered} of {photos} photos" + f" with {points} points" * few
-    wanted = f"{needed}" + f" and {MIN_POINTS} points a photo" * few
-    raise AwError(
-        f"structure from motion placed {placed}{unread}; a scene needs {wanted}: "
-        f"{facts.sentence()}; likely {facts.reason(photos)}" + "".join(f"; {remark}" for remark in remarks)
-    )
-
-
-def pair_facts(database: Path, matches: MatchResult) -> PairFacts:
-    """Measure features, matches, and motion between the pairs with the most inliers."""
-    with closing(sqlite3.connect(database)) as db:
-        features = [r[0] for r in db.execute("SELECT rows FROM keypoints")]
-        pairs = db.execute(
-            "SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0 ORDER BY rows DESC, pair_id"
-        ).fetchall()
-    forward, angles = _motion(database, [pair_id for pair_id, _ in pairs[:_STRONG_PAIRS]])
-    return PairFacts(
-        features=float(np.median(features)) if features else 0.0,
-        tried=matches["pairs"],
-        verified=len(pairs),
-        inliers=float(np.median([rows for _, rows in pairs])) if pairs else 0.0,
-        degenerate=matches["planar"] / len(pairs) if pairs else math.nan,
-        forward=float(np.median(forward)) if forward else math.nan,
-        angle_deg=float(np.median(angles)) if angles else math.nan,
-    )
-
-
-def _motion(database: Path, pair_ids: list[int]) -> tuple[list[float], list[float]]:
-    """Return |t_z| / |t| and the triangulation angle in degrees of each pair whose pose can be estimated."""
-    forward, angles = [], []
-    db = pycolmap.Database.open(str(database))
-    try:
-        for pair_id in pair_ids:
-            first, second = (db.read_image(i) for i in divmod(pair_id, _MAX_PAIR_ID))
-            geometry = db.read_two_view_geometry(first.image_id, second.image_id)
-            points = [db.read_keypoints(i.image_id)[:, :2].astype(np.float64) for i in (first, second)]
-            cameras = [db.read_camera(i.camera_id) for i in (first, second)]
-            posed = pycolmap.estimate_two_view_geometry_pose(
-                cameras[0], points[0], cameras[1], points[1], geometry
-            )
-            if not posed or geometry.cam2_from_cam1 is None:
-                continue
-            translation = np.asarray(geometry.cam2_from_cam1.translation)
-            length = float(np.linalg.norm(translation))
-            if length > 0:
-                forward.append(abs(float(translation[2])) / length)
-                angles.append(math.degrees(geometry.tri_angle))
-    finally:
-        db.close()
-    return forward, angles
 
 
 @dataclass(frozen=True)

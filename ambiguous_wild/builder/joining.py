@@ -8,7 +8,7 @@ photo in `placing`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ JOINED_BY = 2  # smallest number of pairs across two parts that must fit; they i
 # Smallest singular value of the equations for scale and shift, relative to the largest: along a straight path
 # every scale fits.
 LEAST_SPREAD = 0.02
+MOST_PAIRS = 200  # pairs across two parts that are used, those with most matches
 LEAST_DEPTHS = 8  # features of a photo with a depth in both parts, for the scale
 ROUGHLY = 4.0  # a match fits within this many times the usual distance: the join is not adjusted yet
 RIVALS = 0.5  # share of pairs that agree on another rotation, relative to those that fit, that refuses a join
@@ -46,21 +47,34 @@ def join(first: Placement, second: Placement) -> bool:
     if not added or min(len(first.poses), len(second.poses)) < LEAST_PHOTOS:
         return False
     rotations = _rotations(first, second)
+    alike = _alike(rotations)
+    before = [list(camera.params) for camera in first.matched.cameras]  # params are a view
+    _take_cameras(first, second, added)
     best: tuple[int, Similarity] | None = None
-    for similarity in (*_by_photos(first, second), *_by_pairs(first, second, rotations)):
+    for similarity in (*_by_photos(first, second), *_by_pairs(first, second, rotations, alike)):
         moved = {photo: similarity.moved(pose) for photo, pose in added.items()}
         fitting = _fitting(first, moved)
         if len(fitting) < JOINED_BY or len({photo for pair in fitting for photo in pair}) <= JOINED_BY:
             continue
-        others = [row for row in rotations if row.pair not in fitting]
-        rivals = max((len({row.pair for row in alike}) for alike in _alike(others)), default=0)
-        if rivals <= RIVALS * len(fitting) and (best is None or len(fitting) > best[0]):
+        if best is not None and len(fitting) <= best[0]:
+            continue
+        if _rivals(rotations, alike, similarity, fitting) <= RIVALS * len(fitting):
             best = len(fitting), similarity
     if best is None:
+        for camera, params in zip(first.matched.cameras, before):
+            camera.params = params
         return False
     first.poses.update((photo, best[1].moved(pose)) for photo, pose in added.items())
     first.joined.append(frozenset(added))
     return True
+
+
+def _take_cameras(first: Placement, second: Placement, added: Collection[int]) -> None:
+    """Use the second part's cameras that no photo of the first has."""
+    own = {first.matched.cameras[photo].camera_id for photo in first.poses}
+    for photo in added:
+        if first.matched.cameras[photo].camera_id not in own:
+            first.matched.cameras[photo].params = second.matched.cameras[photo].params
 
 
 @dataclass(frozen=True)
@@ -75,9 +89,12 @@ class Across:
 
 
 def _rotations(first: Placement, second: Placement) -> list[Across]:
-    """Return the implied rotations of all motions of the pairs across two parts."""
-    rows = []
-    for pair, motions in first.matched.motions.items():
+    """Return the implied rotations of all motions of the pairs across two parts, the strongest pairs."""
+    rows: list[Across] = []
+    strongest = sorted(first.matched.motions.items(), key=lambda item: -sum(len(m.matches) for m in item[1]))
+    for pair, motions in strongest:
+        if len({row.pair for row in rows}) >= MOST_PAIRS:
+            break
         for here, there in (pair, pair[::-1]):
             if here not in first.poses or there not in second.poses or {here, there} <= first.poses.keys():
                 continue
@@ -90,19 +107,35 @@ def _rotations(first: Placement, second: Placement) -> list[Across]:
     return rows
 
 
-def _alike(rows: Sequence[Across]) -> Iterator[list[Across]]:
-    """Yield for each row all rows that imply the same rotation."""
-    if not rows:
-        return
+def _alike(rows: Sequence[Across]) -> np.ndarray:
+    """Tell which rows imply the same rotation, [N, N] bool."""
     stack = np.array([row.rotation for row in rows]).reshape(-1, 9)
-    for same in stack @ stack.T > trace_of(ALIKE_DEG):
-        yield [row for row, use in zip(rows, same) if use]
+    return stack @ stack.T > trace_of(ALIKE_DEG)
 
 
-def _by_pairs(first: Placement, second: Placement, rotations: Sequence[Across]) -> Iterator[Similarity]:
+def _rivals(
+    rows: Sequence[Across], alike: np.ndarray, similarity: Similarity, fitting: Collection[Pair]
+) -> int:
+    """Return the largest number of pairs that agree on one rotation other than that of the similarity."""
+    others = [
+        k
+        for k, row in enumerate(rows)
+        if row.pair not in fitting and np.sum(row.rotation * similarity.rotation) < trace_of(ALIKE_DEG)
+    ]
+    if not others:
+        return 0
+    owners = np.unique([rows[k].pair for k in others], axis=0, return_inverse=True)[1].ravel()
+    owned = np.eye(owners.max() + 1)[owners]  # [N, P], the pair of each row
+    return int((alike[np.ix_(others, others)] @ owned > 0).sum(axis=1).max())
+
+
+def _by_pairs(
+    first: Placement, second: Placement, across: Sequence[Across], same: np.ndarray
+) -> Iterator[Similarity]:
     """Yield the similarities on which pairs across the parts agree, the rotation first, then directions."""
     known: set[frozenset[tuple[int, int]]] = set()
-    for alike in _alike(rotations):
+    for which in same:
+        alike = [row for row, use in zip(across, which) if use]
         ends = frozenset((row.here, row.there) for row in alike)
         if len(ends) < JOINED_BY or ends in known:
             continue

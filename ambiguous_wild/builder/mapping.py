@@ -11,10 +11,11 @@ import numpy as np
 
 from ambiguous_wild.builder.adjustment import pipeline_options, plausible
 from ambiguous_wild.builder.joining import join
-from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.matched import Matched, connected_photos
 from ambiguous_wild.builder.placing import LEAST_PHOTOS, Placement
-from ambiguous_wild.builder.records import ModelSummary
-from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.records import ModelSummary, no_model
+from ambiguous_wild.builder.retrieval import FEW, MOTIONS
+from ambiguous_wild.builder.settings import ENOUGH
 from ambiguous_wild.builder.sfm import MappingJob
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -57,21 +58,13 @@ def run_mapping(job: MappingJob) -> None:
             placement = max(placement, _placed(job, database, other, rivals), key=_explained)
     parts = [] if placement is None else [placement, *placement.others]
     chosen = parts[job["part"] - 1] if len(parts) >= job["part"] else None
+    firm = len(parts[0].poses.keys() - parts[0].provisional) if parts else 0
     if chosen is None or len(chosen.poses) < LEAST_PHOTOS:
-        reason = "no pair of photos to start from"
-        left_out = dict.fromkeys(matched.names, reason) | (_left_out(parts[0], parts) if parts else {})
-        names = [_names(part, part.poses) for part in parts]
-        empty = {
-            "model": None,
-            "left_out": left_out,
-            "partners": {},
-            "cameras": [],
-            "parts": names,
-            "firm": 0,
-        }
+        left_out = dict.fromkeys(matched.names, "no pair of photos to start from")
+        left_out |= _left_out(parts[0], parts) if parts else {}
+        names = [_names(part, part.poses) for part in parts if part.poses]
         write_json(
-            output / "mapping.json",
-            {**empty, "links": [], "unplaced_links": [], "provisional": [], "hypotheses": {}},
+            output / "mapping.json", {**no_model(), "left_out": left_out, "parts": names, "firm": firm}
         )
         return
     chosen.matched.save_motions(output / MOTIONS)
@@ -109,7 +102,7 @@ def run_mapping(job: MappingJob) -> None:
                 if motions and not {a, b} <= chosen.poses.keys()
             ],
             "parts": [_names(part, part.poses) for part in parts],
-            "firm": len(parts[0].poses.keys() - parts[0].provisional),
+            "firm": firm,
             "cameras": chosen.cameras(),
         },
     )
@@ -138,6 +131,8 @@ def _explained(placement: Placement) -> int:
 def _models(job: MappingJob, output: Path, matched: Matched, *, held: bool = False) -> list[Any]:
     """Return the models of COLMAP's mapper, and of the global one if it leaves photos out; largest first."""
     models: list[Any] = []
+    connected = connected_photos(Path(job["database"]))
+    enough = connected if len(matched.ids) <= FEW else ENOUGH * connected
     for mapper in dict.fromkeys((job["mapper"], "global")):
         run = _map_globally if mapper == "global" else _map_incrementally
         models += sorted(
@@ -145,7 +140,7 @@ def _models(job: MappingJob, output: Path, matched: Matched, *, held: bool = Fal
         )
         for folder in output.glob("[0-9]*"):
             shutil.rmtree(folder)
-        if any(model.num_reg_images() == len(matched.ids) for model in models):
+        if any(model.num_reg_images() >= enough for model in models):
             break
     return [model for model in models if model.num_reg_images() >= LEAST_PHOTOS]
 
@@ -161,27 +156,30 @@ def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[
         todo = set(range(len(matched.ids))).difference(*(part.poses for part in parts))
         if not todo & matched.poses(model).keys():
             continue
-        part = Placement(matched.copy(), database, model, job["seed"])
-        part.run()
-        for poses in part.apart:
-            other = Placement(matched.copy(), database, part.model, job["seed"])
-            other.poses = poses
-            other.run()
-            parts.append(other)
-        parts.append(part)
-        if len(part.poses) == len(matched.ids):
+        waiting = [Placement(matched.copy(), database, model, job["seed"])]
+        while waiting:
+            part = waiting.pop()
+            part.run()
+            parts.append(part)
+            for poses in part.apart:
+                waiting.append(Placement(matched.copy(), database, part.model, job["seed"]))
+                waiting[-1].poses = poses
+        if len(parts[-1].poses) == len(matched.ids):
             break
     parts.sort(key=lambda part: -len(part.poses))
     best, *others = parts
     joined = True
     while joined:
-        before = len(best.poses)
+        before, cameras = dict(best.poses), best.matched.copy()
         for other in others:
             join(best, other)
-        joined = len(best.poses) > before
+        joined = len(best.poses) > len(before)
         if joined:
             best.run()
-            joined = len(best.poses) > before
+            joined = len(best.poses) > len(before)
+        if len(best.poses) < len(before):  # what was joined did not hold
+            best.matched, best.poses, best.joined = cameras, before, []
+            best.run()
     placed = set(best.poses)
     for other in others:
         if len(other.poses.keys() - placed) >= LEAST_PHOTOS:

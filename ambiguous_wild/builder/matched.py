@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import heapq
 import math
+import sqlite3
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -240,6 +242,13 @@ def largest_group(pairs: Collection[Pair]) -> int:
     count = int(ends.max()) + 1
     graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), (count, count))
     return int(np.bincount(connected_components(graph, directed=False)[1]).max())
+
+
+def connected_photos(database: Path) -> int:
+    """Return the largest number of photos that the verified pairs of COLMAP's database connect."""
+    with closing(sqlite3.connect(database)) as db:
+        numbers = [row[0] for row in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")]
+    return largest_group([pycolmap.pair_id_to_image_pair(number) for number in numbers])
 
 
 def _well_connected(pairs: Collection[Pair]) -> set[int]:

@@ -115,7 +115,7 @@ class Placement:
                 self.provisional |= smaller
         for photo in range(len(outs)):
             if photo not in self.poses:
-                self.left_out.setdefault(photo, "too few of its points are left")
+                self.left_out.setdefault(photo, "too few placed photos agree with it in the end")
 
     def _settle(self, outs: list[int]) -> None:
         """Place all photos anew until none moves; `outs` counts how often each was taken out."""
@@ -203,7 +203,7 @@ class Placement:
         for photo in range(len(self.matched.ids)):
             pose_now = self.poses.get(photo)
             best, rival = self._best(photo, pose_now, rays, points)
-            if best.pose is not None:
+            if best.pose is not None and best.partners:
                 self.hypotheses[photo] = best.pose
             few = pose_now is None and best.area < AREA_NEW
             reason = _reason(best, rival, AGREE_NEW if few else AGREE)
@@ -267,7 +267,7 @@ class Placement:
         return bool(np.count_nonzero(off < RESECTION_PX) >= LEAST_POINTS)
 
     def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
-        """Collect placed partners' evidence for a place; a partner agrees if one of its motions fits."""
+        """Score a pose hypothesis: a placed photo supports it if most matches of a relative pose fit."""
         evidence = {}
         for pair in self.pairs[photo]:
             other = pair[0] + pair[1] - photo

@@ -148,6 +148,14 @@ class MappingResult(TypedDict):
     plan: str  # "fast", "wider" or "thorough"
 
 
+def no_model() -> MappingResult:
+    """Return the result of a mapping that placed no photo."""
+    return {
+        "model": None, "left_out": {}, "partners": {}, "provisional": [], "hypotheses": {}, "links": [],
+        "unplaced_links": [], "parts": [], "firm": 0, "cameras": [], "plan": "",
+    }  # fmt: skip
+
+
 class UndistortResult(TypedDict):
     """Result of the stage `undistort`."""
 

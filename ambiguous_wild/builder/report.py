@@ -110,7 +110,7 @@ def scene_record(
             *screened["warnings"],
             *_focal_warnings(cameras, facts),
             *_parallax_warnings(model),
-            *part_lines(mapping["parts"], sources),
+            *part_lines(mapping["parts"], sources, settings.part),
             *_provisional_warnings([sources[name] for name in mapping["provisional"]]),
             *warnings,
         ],
@@ -165,7 +165,7 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
     """Return one line with the counts and the next command."""
     counts = info["counts"]
     points = f"{counts['points']:,}".replace(",", " ")
-    named = f", {len(info['lost'])} left out without a clear place" if info["lost"] else ""
+    named = f", {len(info['lost'])} left out" if info["lost"] else ""
     few = counts["registered"] < ENOUGH_PHOTOS
     ready = f"few photos, about {ENOUGH_PHOTOS} are needed for a good model" if few else "ready"
     return (
@@ -268,14 +268,24 @@ def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> li
     return [f"focal length of {len(odd)} of {len(cameras)} cameras contradicts EXIF: {shortlist(odd, 2)}"]
 
 
-def part_lines(parts: Sequence[Sequence[str]], sources: Mapping[str, str]) -> list[str]:
-    """Return one line if the photos fall into parts (work names each) that no photo joins, else none."""
+def part_lines(parts: Sequence[Sequence[str]], sources: Mapping[str, str], built: int) -> list[str]:
+    """Return one line if the photos fall into parts (work names each) that no photo joins, else none.
+
+    Args:
+        parts: work names of each part, the largest part first.
+        sources: work name -> path in the capture.
+        built: number of the part that is built, from 1.
+    """
     if len(parts) < 2:
         return []
-    named = [f"{len(part)} ({shortlist([sources[name] for name in part], 2)})" for part in parts]
+    named = [
+        f"part {number} of {len(part)} ({shortlist([sources[name] for name in part], 2)})"
+        for number, part in enumerate(parts, 1)
+    ]
+    other = 1 if built > 1 else 2
     return [
         f"the photos fall into {len(parts)} parts that no photo joins: {', '.join(named)}; take photos that "
-        "show two of them at once, or build another with --part 2"
+        f"show two of them at once; --part {other} builds part {other}"
     ]
 
 

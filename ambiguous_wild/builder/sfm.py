@@ -24,6 +24,7 @@ from ambiguous_wild.builder.records import (
     MatchResult,
     PhotoRecord,
     ScreenedPhoto,
+    no_model,
 )
 from ambiguous_wild.builder.retrieval import MOTIONS, PAIRS
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
@@ -306,22 +307,7 @@ def map_scene(
 ) -> MappingResult:
     """Build the model into `folder/0`; it has none if pairs connect too few photos for the plan."""
     if connected < plan.worth * count:
-        nothing: dict[str, object] = {
-            "model": None,
-            "left_out": {},
-            "partners": {},
-            "provisional": [],
-            "hypotheses": {},
-        }
-        nothing |= {
-            "links": [],
-            "unplaced_links": [],
-            "parts": [],
-            "firm": 0,
-            "cameras": [],
-            "plan": plan.name,
-        }
-        return cast(MappingResult, nothing)
+        return {**no_model(), "plan": plan.name}
     progress = folder / "progress"
     bar.start("placing photos", count if settings.mapper == "incremental" else None)
     database = folder / DATABASE

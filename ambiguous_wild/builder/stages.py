@@ -274,9 +274,10 @@ class Stages:
             attempts.append(self._attempt(work, screened, masks, plan, attempts[-1] if attempts else None))
         # Of attempts that place equally many photos the last is taken, which is the most precise.
         best = max(reversed(attempts), key=lambda a: (a.mapping.facts["firm"], a.placed))
-        parts = report.part_lines(best.mapping.facts["parts"], {f["work_name"]: f["source"] for f in facts})
-        if self.settings.part > max(1, len(best.mapping.facts["parts"])):
-            raise AwError(f"--part {self.settings.part}: " + "; ".join(parts or ["the photos form one part"]))
+        sources, wanted = {f["work_name"]: f["source"] for f in facts}, self.settings.part
+        parts = report.part_lines(best.mapping.facts["parts"], sources, wanted)
+        if wanted > len(best.mapping.facts["parts"]) > 0:
+            raise AwError(f"no part {wanted}: {'; '.join(parts) or 'the photos form one part'}; omit --part")
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
         used = mask_warnings(masks.facts if masks else None) or used
         check_registered(

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -185,7 +186,7 @@ def _match_posed(
     camera = "single" if len(model.cameras) == 1 else "per-image"
     for part in ("features", "matches", "known"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    plan = plans(facts, settings)[0]
+    plan = replace(plans(facts, settings)[0], max_features=settings.max_features)
     extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
     _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
     match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)

@@ -1,5 +1,6 @@
 """Parts of a capture that were placed alone are joined where several pairs agree, and only there."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -9,7 +10,7 @@ import pytest
 from ambiguous_wild.builder.joining import Similarity, join
 from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.motions import Motion
-from ambiguous_wild.builder.placing import Place, Placement, PointLookup
+from ambiguous_wild.builder.placing import Place, Placement, PointLookup, centre_of
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FOCAL, WIDTH, HEIGHT = 500.0, 640, 480
@@ -90,6 +91,54 @@ def test_two_pairs_that_agree_join_two_parts_exactly():
     turned, moved = errors(first)
     assert turned < 1e-3 and moved < 1e-3
     assert first.joined == [frozenset(THERE)]
+
+
+def test_pairs_that_agree_on_the_rotation_are_no_rivals():
+    """Before the parts are adjusted together, many pairs of the right rotation do not fit."""
+    same = np.eye(3)
+    first, second = parts({(2, 3): None, (1, 4): None, (0, 3): same, (1, 3): same})
+    assert join(first, second)
+
+
+def test_lenses_that_only_the_second_part_has_come_with_it():
+    first, second = parts({(2, 3): None, (1, 4): None})
+    own = [pycolmap.Camera(camera_id=k, model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT,
+                           params=[550.0, 320, 240, 0]) for k in range(6)]  # fmt: skip
+    first.matched = replace(first.matched, cameras=own)
+    for k in HERE:
+        own[k].params = [FOCAL, 320, 240, 0]
+    assert join(first, second)
+    assert [camera.params[0] for camera in own] == [FOCAL] * 6
+    first, second = parts({(2, 3): None})
+    own[4].params = [550.0, 320, 240, 0]
+    first.matched = replace(first.matched, cameras=own)
+    assert not join(first, second) and own[4].params[0] == 550.0
+
+
+def test_a_photo_with_a_pose_in_both_parts_joins_them_along_a_straight_path():
+    first, second = parts({(1, 3): None, (2, 3): None, (2, 4): None}, bend=0.0)
+    for part in (first, second):
+        part.model = SimpleNamespace(points3D=observed(part))
+    first.matched.ids[:] = range(6)
+    assert join(first, second)
+    moved = [np.linalg.norm(centre_of(first.poses[k]) - centre_of(pose(k, 0.0))) for k in range(6)]
+    assert max(moved) < 0.05
+
+
+def observed(part: Placement) -> dict[int, SimpleNamespace]:
+    """The points that the photos of a part show, in its world."""
+    there = 3 in part.poses
+    back = (POINTS - WORLD.shift) @ WORLD.rotation / WORLD.scale if there else POINTS
+    seen: dict[int, set[int]] = {k: set() for k in part.poses}
+    for (a, b), rows in part.matched.matches.items():
+        for k in {a, b} & seen.keys():
+            seen[k] |= set(rows[:, 0].tolist())
+    found = {}
+    for row, xyz in enumerate(back):
+        elements = [SimpleNamespace(image_id=k, point2D_idx=row) for k in seen if row in seen[k]]
+        if len(elements) >= 2:
+            found[row] = SimpleNamespace(xyz=xyz, track=SimpleNamespace(elements=elements))
+    return found
 
 
 def test_a_straight_path_leaves_the_scale_open():

@@ -3,11 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.report import _lost_photos, _parallax_warnings, parallax_deg
-from ambiguous_wild.builder.stages import (
-    PairFacts,
-    check_registered,
-)
+from ambiguous_wild.builder import diagnosis
+from ambiguous_wild.builder.diagnosis import PairFacts, check_registered
+from ambiguous_wild.builder.report import _lost_photos, _parallax_warnings, parallax_deg, part_lines
 from ambiguous_wild.core import AwError
 from tests.io.model_maker import make_model
 
@@ -48,7 +46,7 @@ def test_the_reason_follows_the_figures(change, reason):
 def test_enough_photos_pass_and_the_share_counts(tmp_path):
     check_registered(summary(3), 10, 0, tmp_path / "unused.db", {"pairs": 45})
     check_registered(summary(3), 3, 0, tmp_path / "unused.db", {"pairs": 3})
-    import ambiguous_wild.builder.stages as module
+    import ambiguous_wild.builder.diagnosis as module
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "pair_facts", lambda *_: FACTS)
@@ -59,7 +57,7 @@ def test_enough_photos_pass_and_the_share_counts(tmp_path):
 
 
 def test_photos_placed_without_points_are_no_scene(tmp_path):
-    import ambiguous_wild.builder.stages as module
+    import ambiguous_wild.builder.diagnosis as module
 
     turned = dataclasses.replace(FACTS, verified=12, degenerate=1.0, angle_deg=0.3)
     with pytest.MonkeyPatch.context() as patch:
@@ -93,3 +91,20 @@ def test_parallax_is_the_angle_under_which_points_are_seen():
         np.isnan(parallax_deg(make_model(names, points=0)))
         and _parallax_warnings(make_model(names, points=0)) == []
     )
+
+
+def test_parts_are_named_with_the_option_that_builds_another():
+    sources = {name: f"{name}.jpg" for name in "abcdefg"}
+    line = part_lines([list("abcd"), list("efg")], sources, 1)[0]
+    assert "2 parts" in line and "part 1 of 4 (a.jpg" in line and "part 2 of 3 (e.jpg" in line
+    assert "--part 2 builds part 2" in line
+    assert "--part 1 builds part 1" in part_lines([list("abcd"), list("efg")], sources, 2)[0]
+    assert part_lines([list("abcd")], sources, 1) == []
+
+
+def test_a_part_that_the_user_asks_for_may_be_small(tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnosis, "pair_facts", lambda *_: FACTS)
+    model = summary(4, 400)
+    check_registered(model, 40, 0, tmp_path / "unused.db", {}, 2)
+    with pytest.raises(AwError, match="placed 4 of 40 photos"):  # the first part is most of the place
+        check_registered(model, 40, 0, tmp_path / "unused.db", {}, 1)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ambiguous_wild.builder import stages
+from ambiguous_wild.builder import sfm, stages
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
@@ -17,7 +17,9 @@ from ambiguous_wild.builder.stages import SfmStages, Stages
 from tests.builder.capture_maker import write_capture
 
 
-def attempts(monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: int) -> tuple[list[str], Any]:
+def attempts(
+    monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: int, firm: dict[str, int] | None = None
+) -> tuple[list[str], Any]:
     """The plans that were tried, and what was chosen, where each places so many photos."""
     tried: list[str] = []
 
@@ -25,7 +27,7 @@ def attempts(monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: in
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
         model = {"images": placed[plan.name], "points": 9999} if placed[plan.name] else None
-        facts = {"model": model, "plan": plan.name, "fixed": [], "firm": placed[plan.name]}
+        facts = {"model": model, "plan": plan.name, "fixed": [], "firm": (firm or placed)[plan.name]}
         facts["parts"] = [["p.jpg"] * placed[plan.name]]
         part = SimpleNamespace(folder=Path("nowhere"), facts=facts)
         return SfmStages(part, part, part)
@@ -56,6 +58,20 @@ def test_the_attempt_that_places_more_is_kept(monkeypatch, fast, wider, thorough
     """All pairs are matched only if less than nine tenths are placed."""
     names, kept = attempts(monkeypatch, {"fast": fast, "wider": wider, "thorough": thorough}, 30)
     assert names == ["fast", "wider", "thorough"][:tried] and kept == chosen
+
+
+def test_photos_placed_without_doubt_count_first(monkeypatch):
+    placed, firm = {"fast": 10, "thorough": 12}, {"fast": 10, "thorough": 3}
+    assert attempts(monkeypatch, placed, 25, firm) == (["fast", "thorough"], "fast")
+
+
+def test_nothing_is_mapped_where_pairs_connect_too_few_photos(tmp_path):
+    plan = SfmPlan("fast", "opencv", 3000, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4, worth=0.5)
+    settings, bar = BuildSettings(), Bar(enabled=False)
+    result = sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 4, settings, plan, 1, bar)
+    assert result["model"] is None and result["parts"] == [] and result["plan"] == "fast"
+    with pytest.raises(FileNotFoundError):  # five are enough to try, and there is no database here
+        sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 5, settings, plan, 1, bar)
 
 
 def test_all_pairs_of_many_photos_are_matched_only_if_less_than_half_is_placed(monkeypatch):

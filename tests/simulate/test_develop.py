@@ -125,7 +125,7 @@ def test_labels_agree_with_what_the_spec_holds() -> None:
     for spec in PRESETS.values():
         label = spec.designed
         named = {name for name in KINDS if getattr(spec.effects, name) is not None}
-        someone = bool(spec.distractors) or "moving_shadow" in named
+        someone = bool(spec.distractors) or "moving_shadow" in named or spec.fixed is not None
         assert ("masks" in label.effects) == someone, spec.name
         assert ("appearance" in label.effects) == bool(named & set(appearance)), spec.name
         assert ("sh" in label.effects) == ("specular" in named), spec.name

@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from ambiguous_wild.builder.adjustment import adjustment_options, pipeline_options, plausible
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
+from ambiguous_wild.builder.overlap_graph import bridges
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -38,6 +39,7 @@ LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a di
 # at least so much of what as many features drawn at random would be: those of a distractor are crowded.
 LITTLE_AREA, LITTLE_SPREAD = 0.05, 0.2
 FIRMLY_JOINED = 4  # pairs across two parts of a capture; with fewer, the smaller part is provisional
+CROWDED = 0.28  # spread of matches below which `AREA_NEW` of a photo must agree
 LEAST_POINTS = 6  # points, which two others observe, that fix how far a photo with one partner is from it
 AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two partners are enough
 PLACES = 3  # largest number of places tried for a photo
@@ -150,16 +152,29 @@ class Placement:
     def components(self, without: Collection[int] = ()) -> list[set[int]]:
         """Return the placed photos that links connect, the largest group first.
 
+        A single link between two groups of photos does not connect them: it may show a distractor, and it
+        gives no scale. It does connect one or two photos with a group.
+
         Args:
             without: photos whose links are not used.
         """
         photos = sorted(set(self.poses) - set(without))
         at = {photo: k for k, photo in enumerate(photos)}
-        rows = [(at[a], at[b]) for a, b in self.links() if a in at and b in at]
+        links = [(at[a], at[b], n) for (a, b), n in self.links().items() if a in at and b in at]
+        weak = bridges(len(photos), links)
+        rows = [(a, b) for a, b, _ in links if (a, b) not in weak]
         ends = tuple(np.array(rows, int).reshape(-1, 2).T)
         graph = coo_array((np.ones(len(rows)), ends), (len(photos), len(photos)))
         groups = connected_components(graph, directed=False)[1]
-        parts = [{photos[k] for k in np.flatnonzero(groups == g)} for g in range(groups.max(initial=-1) + 1)]
+        large = set(np.flatnonzero(np.bincount(groups, minlength=1) >= LEAST_PHOTOS).tolist())
+        for _, a, b in sorted((-n, a, b) for a, b, n in links if (a, b) in weak):
+            first, second = int(groups[a]), int(groups[b])
+            if not {first, second} <= large:
+                kept, gone = (second, first) if second in large else (first, second)
+                groups[groups == gone] = kept
+                if np.count_nonzero(groups == kept) >= LEAST_PHOTOS:
+                    large.add(kept)
+        parts = [{photos[k] for k in np.flatnonzero(groups == g)} for g in np.unique(groups)]
         return sorted(parts, key=lambda part: (-len(part), min(part)))
 
     def cameras(self) -> list[CameraFact]:
@@ -207,6 +222,8 @@ class Placement:
                 self.hypotheses[photo] = best.pose
             few = pose_now is None and best.area < AREA_NEW
             reason = _reason(best, rival, AGREE_NEW if few else AGREE)
+            if reason is None and len(best.partners) < AGREE_NEW:
+                self.provisional.add(photo)
             if reason is not None and self._unopposed(photo, best, rival, points):
                 self.provisional.add(photo)
                 reason = None
@@ -459,7 +476,7 @@ def _reason(best: Place, rival: Place, needed: int) -> str | None:
         return "only one placed photo agrees with it on a place"
     if len(best.partners) < needed:
         return f"only {len(best.partners)} placed photos agree with it on a place"
-    if best.area < LEAST_AREA:
+    if best.area < LEAST_AREA or (best.area < AREA_NEW and best.spread < CROWDED):
         return f"only a small part of it agrees with {len(best.partners)} placed photos"
     if len(rival.partners) >= AGREE and rival.weight > RIVAL * best.weight:
         return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from ambiguous_wild import __version__
 from ambiguous_wild.builder.capture_map import (
     LEVEL,
     CaptureMap,
@@ -20,11 +21,13 @@ from ambiguous_wild.builder.capture_map import (
     map_of_model,
 )
 from ambiguous_wild.builder.records import MappingResult, MapResult
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.files import atomic_path, check_output
 from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
 
 FILE = "map.png"  # in the scene's folder
+SOFTWARE = "ambiguous_wild"  # text chunk `Software` of the file, followed by the version
 SIZE_PX, PANEL_PX, TITLE_PX = (1300, 860), 380, 40  # of the picture, its side panel and its title
 DPI = 100
 MOST_ADVICE, MOST_LISTED = 7, 8  # sentences at the side
@@ -126,7 +129,47 @@ def write_map(drawn: CaptureMap, path: Path) -> None:
             parse_math=False,
         )  # fmt: skip
         with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png", metadata={"Software": None})
+            figure.savefig(temporary, format="png", metadata={"Software": f"{SOFTWARE} {__version__}"})
+
+
+def check_target(path: Path, raw: Sequence[Path]) -> None:
+    """Check, before long work, that a map can be written to `path` without a loss.
+
+    Raises:
+        AwError: `path` lies in a folder of the capture, is no .png, or holds anything but a map.
+    """
+    target = path.resolve()
+    for folder in raw:
+        if target.is_relative_to(folder.resolve()):
+            raise AwError(
+                f"{path} lies in the capture {folder}, where it would be taken for a photo: "
+                "choose an -o outside it"
+            )
+    if target.suffix.lower() != ".png":
+        raise AwError(f"{path} is no .png: the map is a PNG; choose an -o such as map.png")
+    if target.exists() and not target.is_file():
+        raise AwError(f"{path} is no regular file; choose another -o")
+    if target.exists() and not is_map(target):
+        raise AwError(f"{path} exists and is no map that aw drew: move it away, or choose another -o")
+    check_output(path)
+
+
+def is_map(path: Path) -> bool:
+    """Tell whether a file is a map of `write_map`, by its text chunk (PNG specification, 11.3.3.3)."""
+    try:
+        with open(path, "rb") as file:
+            if file.read(8) != b"\x89PNG\r\n\x1a\n":
+                return False
+            while len(head := file.read(8)) == 8 and head[4:] not in (b"IDAT", b"IEND"):
+                length = int.from_bytes(head[:4], "big")
+                if head[4:] == b"tEXt" and length < 1000:
+                    if file.read(length).startswith(f"Software\0{SOFTWARE} ".encode()):
+                        return True
+                    length = 0
+                file.seek(length + 4, 1)  # the checksum is 4 bytes
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}; choose another -o") from error
+    return False
 
 
 def _points(px: float) -> float:

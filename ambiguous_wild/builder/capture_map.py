@@ -20,10 +20,16 @@ from ambiguous_wild.io.colmap_records import Model
 MOST_POINTS = 5000  # of the backdrop
 STRONGEST = 4  # links drawn of each photo, besides the weak ones
 LONGEST_NAME = 14  # characters
-DOWN = 0.8  # share of the mean viewing direction along the normal of the cameras' plane: nadir photos
+DOWN = 0.8  # share of the mean viewing direction along the normal of a plane from which on cameras face it
 # Cameras lie in a plane if their second axis is longer than this share of the first, and their third shorter
 # than this share of the second.
 WIDE, THIN = 0.15, 0.4
+CORE = 80  # percent of the points, the nearest to their median, by which their thinnest axis is measured
+AGREE = 0.9  # length of the mean viewing direction from which on all cameras look the same way
+# Length of the mean up direction from which on up is determined. It is 0.34 to 0.67 for nadir strips flown
+# back and forth (seneca), 0.96 or more for photos taken by hand (monstree, sceaux, statue, reichstag).
+UPRIGHT = 0.7
+TALL = 0.3  # of the cameras' spread sideways: spread along up of a path that a view from above would hide
 LEVEL = 0.3  # length of the mean up direction below which up is unknown; shorter headings are not drawn
 COMMON = 0.4  # length of the mean heading from which on it is up on the map
 ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
@@ -80,7 +86,7 @@ def map_of_model(
     names = [name for name in sources if name in placed]
     poses = np.array([placed[name] for name in names]).reshape(-1, 4, 4)
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    plane = top_view(poses[:, :3, :3], centres)
+    plane = top_view(poses[:, :3, :3], centres, model.points.xyz)
     flat = centres @ plane.T
     size = longer_side(flat)
     labels = {name: photo_label(source) for name, source in sources.items()}
@@ -101,7 +107,10 @@ def map_of_model(
     elsewhere = {name for part in other_parts for name in part}
     left_out = {name: why for name, why in mapping["left_out"].items() if name in sources.keys() - elsewhere}
     order = {name: k for k, name in enumerate(sources)}
-    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, seen from above", photos, [], [], [])
+    up = -poses[:, 1, :3].mean(axis=0)
+    hidden = np.linalg.norm(up) > UPRIGHT and np.cross(*plane) @ up < np.linalg.norm(up) / 2
+    seen = "seen in the viewing direction" if hidden else "seen from above"
+    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, {seen}", photos, [], [], [])
     result = _with_links(result, links)
     for part in other_parts:
         members = sorted(order[name] for name in part if name in order)
@@ -190,25 +199,29 @@ def photo_label(source: str) -> str:
 def top_view(
     rotations: np.ndarray,  # [N, 3, 3] camera from world
     centres: np.ndarray,  # [N, 3] world
+    points: np.ndarray | None = None,  # [P, 3] world, of the model
 ) -> np.ndarray:  # [2, 3]
     """Return the map's axes, right and up, in the world.
 
-    The map is perpendicular to the cameras' mean up direction. Nadir photos have no common one: they are seen
-    as from behind the cameras, on the plane in which these lie. Up on the map is where most photos look; if
-    they look all round, the longest axis of the path is horizontal and the first photo on the left.
+    The map is perpendicular to the cameras' mean up direction. Nadir photos are seen as from behind the
+    cameras (`_nadir_axis`). Up on the map is where most photos look, else up in the photos; if both are unknown, the
+    longest axis of the path is horizontal and the first photo on the left.
     """
     spread = centres - centres.mean(axis=0)
     axes = np.linalg.svd(spread, full_matrices=False)[2] if len(centres) > 2 else np.eye(3)
     sizes = np.sqrt(((spread @ axes.T) ** 2).mean(axis=0))
     view, up = rotations[:, 2].mean(axis=0), -rotations[:, 1].mean(axis=0)
-    plane = sizes[1] > WIDE * sizes[0] and sizes[2] < THIN * sizes[1]
-    if plane and abs(view @ axes[2]) > DOWN:
-        normal = -axes[2] * np.sign(view @ axes[2])
+    flat = bool(sizes[1] > WIDE * sizes[0] and sizes[2] < THIN * sizes[1])
+    nadir = _nadir_axis(spread, view, up, axes[2] if flat else None, points)
+    if nadir is not None:
+        normal = -nadir * np.sign(view @ nadir)
     elif np.linalg.norm(up) > LEVEL:
         normal = up / np.linalg.norm(up)
     else:
         normal = axes[2] * (1 if up @ axes[2] >= 0 else -1)
     ahead = view - (view @ normal) * normal
+    if np.linalg.norm(ahead) <= COMMON and np.linalg.norm(up) > UPRIGHT:
+        ahead = up - (up @ normal) * normal
     if np.linalg.norm(ahead) > COMMON:
         ahead /= np.linalg.norm(ahead)
         return np.stack([np.cross(ahead, normal), ahead])
@@ -216,6 +229,49 @@ def top_view(
     right = longest - (longest @ normal) * normal
     right /= max(float(np.linalg.norm(right)), 1e-12)
     return np.stack([right, np.cross(normal, right)]) * (-1 if spread[0] @ right > 0 else 1)
+
+
+def _nadir_axis(
+    spread: np.ndarray,  # [N, 3] centres less their mean
+    view: np.ndarray,  # [3] mean viewing direction
+    up: np.ndarray,  # [3] mean up direction
+    cameras_axis: np.ndarray | None,  # [3] normal of the plane in which the cameras lie
+    points: np.ndarray | None,  # [P, 3]
+) -> np.ndarray | None:  # [3] unit length
+    """Return the axis along which nadir photos look; None for photos that are seen better from above.
+
+    Photos that all look the same way without a common up direction are nadir photos. With one, a strip flown
+    one way and a walk along a facade differ in their path: a strip goes along up in the photos, and a view
+    along up would hide it. A strip flown sideways cannot be told from a walk, and is drawn as one.
+    """
+    agreeing = bool(np.linalg.norm(view) > AGREE)
+    axis = cameras_axis if cameras_axis is not None and abs(view @ cameras_axis) > DOWN else None
+    if axis is None and agreeing and points is not None:
+        normal = _thin_axis(points)
+        if normal is not None and abs(view @ normal) > DOWN * np.linalg.norm(view):
+            axis = normal
+    if np.linalg.norm(up) <= UPRIGHT:
+        return view / np.linalg.norm(view) if axis is None and agreeing else axis
+    if axis is None:
+        return None
+    upwards = up - (up @ axis) * axis
+    upwards /= max(float(np.linalg.norm(upwards)), 1e-12)
+    directions = np.array([upwards, np.cross(axis, upwards), axis])
+    tall, wide, deep = np.sqrt(((spread @ directions.T) ** 2).mean(axis=0))
+    return axis if tall > TALL * wide and deep < THIN * tall else None
+
+
+def _thin_axis(
+    points: np.ndarray,  # [P, 3]
+) -> np.ndarray | None:  # [3] unit length
+    """Return the normal of the plane in which most points lie; None if they lie in no plane."""
+    if len(points) < 4:
+        return None
+    apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    core = points[apart <= np.percentile(apart, CORE)]
+    values, axes = np.linalg.eigh(np.cov(core.T))  # ascending
+    sizes = np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(axes[:, 0]) if sizes[0] < THIN * sizes[1] and sizes[1] > WIDE * sizes[2] else None
 
 
 def _links(rows: Sequence[Sequence[Any]], at: Mapping[str, int]) -> list[Link]:

@@ -82,6 +82,55 @@ def test_nadir_photos_are_seen_as_from_the_aircraft(world: np.ndarray) -> None:
     assert np.cross(plane[0], plane[1]) @ down == pytest.approx(-1, abs=1e-2)
 
 
+def ground(world: np.ndarray) -> np.ndarray:
+    """Points [P, 3] near a plane 4 below the cameras of the nadir tests."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-4, 9, (300, 2)), rng.normal(-4, 0.2, 300)])
+    return np.concatenate([points, rng.normal(size=(20, 3)) * 30]) @ world.T
+
+
+def nadir_photos(places: np.ndarray, ups: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and centres of cameras at places [N, 3] that look down, their up towards ups [N, 3]."""
+    centres, down = places @ world.T, world @ np.array([0.03, 0.02, -1.0])
+    return np.array([looking(c, c + down, world @ u) for c, u in zip(centres, ups)]), centres
+
+
+STRIP = np.array([(0.1 * (k % 2), k, 0.2 * (k % 3)) for k in range(6)], float)
+
+
+@pytest.mark.parametrize("back", [1.0, -1.0])
+def test_a_nadir_strip_is_seen_as_from_the_aircraft(world: np.ndarray, back: float) -> None:
+    places = STRIP if back > 0 else np.concatenate([STRIP, STRIP[::-1] + np.array([0.5, 0.0, 0.0])])
+    ups = np.array([(0.0, 1.0 if k < 6 else back, 0.0) for k in range(len(places))])
+    rotations, centres = nadir_photos(places, ups, world)
+    plane = top_view(rotations, centres, ground(world))
+    assert np.cross(*plane) @ world @ np.array([0.0, 0.0, 1.0]) > 0.95
+    assert np.ptp(centres @ plane.T, axis=0).max() == pytest.approx(5, rel=0.05)
+
+
+def test_a_nadir_strip_flown_back_and_forth_needs_no_points(world: np.ndarray) -> None:
+    ups = np.array([(0.0, (-1.0) ** k, 0.0) for k in range(6)])
+    plane = top_view(*nadir_photos(STRIP, ups, world))
+    assert np.cross(*plane) @ world @ np.array([0.0, 0.0, 1.0]) > 0.95
+
+
+def test_a_nadir_grid_at_mixed_heights_is_seen_as_from_the_aircraft(world: np.ndarray) -> None:
+    places = np.array([(x, y, 0.9 * ((x + 2 * y) % 3)) for x in range(4) for y in range(3)], float)
+    ups = np.array([(0.0, (-1.0) ** (k // 3), 0.0) for k in range(12)])
+    plane = top_view(*nadir_photos(places, ups, world), ground(world))
+    assert np.cross(*plane) @ world @ np.array([0.0, 0.0, 1.0]) > 0.95
+
+
+def test_a_walk_along_a_facade_is_seen_from_above(world: np.ndarray) -> None:
+    rng = np.random.default_rng(2)
+    places = np.column_stack([np.arange(9.0), rng.normal(0, 0.1, 9), rng.normal(1.6, 0.05, 9)])
+    wall = np.column_stack([rng.uniform(-2, 10, 400), rng.normal(5, 0.1, 400), rng.uniform(0, 6, 400)])
+    up, ahead = world @ np.array([0.0, 0.0, 1.0]), world @ np.array([0.0, 1.0, 0.1])
+    rotations = np.array([looking(c, c + ahead, up) for c in places @ world.T])
+    plane = top_view(rotations, places @ world.T, wall @ world.T)
+    assert np.cross(*plane) @ up > 0.95 and plane[1] @ ahead > 0.9
+
+
 NAMES = [f"IMG_{k}.jpg" for k in range(8)]
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
@@ -31,6 +32,7 @@ AGREE = 0.9  # length of the mean viewing direction from which on all cameras lo
 UPRIGHT = 0.7
 TALL = 0.3  # of the cameras' spread sideways: spread along up of a path that a view from above would hide
 LEVEL = 0.3  # length of the mean up direction below which up is unknown; shorter headings are not drawn
+WIDEST = 1.5  # size of the map in sizes of the placed cameras' box: what is farther away is cut off
 COMMON = 0.4  # length of the mean heading from which on it is up on the map
 ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
 ROOM = 0.4  # of this distance: free room around such a photo
@@ -42,7 +44,7 @@ Kind = Literal["train", "test", "part", "left out"]
 class MapPhoto:
     """A photo on the map."""
 
-    name: str
+    name: str  # path in the capture
     xy: tuple[float, float]  # x right, y up
     kind: Kind = "train"
     heading: tuple[float, float] | None = None  # viewing direction, at most unit length; None: unknown
@@ -73,6 +75,7 @@ class CaptureMap:
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # [P, 2] backdrop
     colours: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # [P, 3] of the points
     posed: bool = True  # positions are those of the cameras
+    labels: Mapping[str, str] = field(default_factory=dict)  # name of a photo -> shorter name for the drawing
 
 
 def map_of_model(
@@ -89,11 +92,11 @@ def map_of_model(
     plane = top_view(poses[:, :3, :3], centres, model.points.xyz)
     flat = centres @ plane.T
     size = longer_side(flat)
-    labels = {name: photo_label(source) for name, source in sources.items()}
+    shown = {name: printable(source) for name, source in sources.items()}
     provisional = set(mapping.get("provisional", ()))
     photos = [
         MapPhoto(
-            labels[name],
+            shown[name],
             as_pair(flat[k]),
             "test" if name in tests else "train",
             as_pair(plane @ poses[k, 2, :3]),
@@ -109,8 +112,8 @@ def map_of_model(
     order = {name: k for k, name in enumerate(sources)}
     up = -poses[:, 1, :3].mean(axis=0)
     hidden = np.linalg.norm(up) > UPRIGHT and np.cross(*plane) @ up < np.linalg.norm(up) / 2
-    seen = "seen in the viewing direction" if hidden else "seen from above"
-    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, {seen}", photos, [], [], [])
+    direction = "seen in the viewing direction" if hidden else "seen from above"
+    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, {direction}", photos, [], [], [])
     result = _with_links(result, links)
     for part in other_parts:
         members = sorted(order[name] for name in part if name in order)
@@ -119,14 +122,16 @@ def map_of_model(
         every = list(sources)
         loose = _links(mapping.get("unplaced_links", ()), order)
         inside, outside = best_join([order[name] for name in names], members, loose)
-        pair = (labels[every[inside]], labels[every[outside]])
-        named = shortlist([labels[every[k]] for k in members], 3)
+        pair = (shown[every[inside]], shown[every[outside]])
+        named = shortlist([shown[every[k]] for k in members], 3)
         result.listed.append(f"another part, {len(members)} photos: {named}")
         result.advice.insert(0, f"take a photo that shows both {pair[0]} and {pair[1]}, to join the parts")
-    result = _with_left_out(result, left_out, mapping, labels, at, plane, size)
+    result = _with_left_out(result, left_out, mapping, shown, at, plane, size)
     points = model.points.xyz[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
     colours = model.points.rgb[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
-    return replace(result, points=points @ plane.T, colours=colours)
+    return replace(
+        result, points=points @ plane.T, colours=colours, labels=short_labels(list(shown.values()))
+    )
 
 
 def map_of_photos(
@@ -140,7 +145,7 @@ def map_of_photos(
     xy = lay_out(len(sources), links)
     photos = [
         MapPhoto(
-            photo_label(source),
+            printable(source),
             as_pair(xy[k]),
             "train" if k in main else "part" if k in in_part else "left out",
         )
@@ -167,6 +172,7 @@ def map_of_photos(
             for part in growth.parts[1:]
         ]
         + ([f"of no part: {shortlist([photos[k].name for k in growth.others])}"] if growth.others else []),
+        labels=short_labels([photo.name for photo in photos]),
     )
 
 
@@ -190,10 +196,35 @@ def between(first: str, second: str) -> str:
     return f"take 2 or 3 photos between {first} and {second}"
 
 
-def photo_label(source: str) -> str:
-    """Return the name of a photo for the map: without extension, its beginning left out if it is long."""
-    text = "".join(c if c.isprintable() else "?" for c in str(PurePosixPath(source).with_suffix("")))
-    return text if len(text) <= LONGEST_NAME else f"…{text[1 - LONGEST_NAME :]}"
+def printable(source: str) -> str:
+    """Return the name of a photo without control characters."""
+    return "".join(c if c.isprintable() else "?" for c in source)
+
+
+def short_labels(names: Collection[str]) -> dict[str, str]:  # name -> label
+    """Return short labels for a drawing, each of one photo.
+
+    A label has no extension, unless two photos differ by nothing else. A long one is the shortest end of the
+    name that no other name has; the end starts at a folder where that makes it little longer.
+    """
+    whole = {name: str(PurePosixPath(name).with_suffix("")) for name in names}
+    uses = Counter(whole.values())
+    whole = {name: stem if uses[stem] == 1 else name for name, stem in whole.items()}
+    labels = {name: text for name, text in whole.items() if len(text) <= LONGEST_NAME}
+    length, longest = LONGEST_NAME - 1, max(map(len, whole.values()), default=0)
+    while len(labels) < len(whole):
+        ends = Counter(text[-length:] for text in whole.values())
+        for name in whole.keys() - labels.keys():
+            text = whole[name]
+            if ends[text[-length:]] > 1 and length < longest:
+                continue
+            start = max(len(text) - length, 0)
+            folder = text.rfind("/", 0, start) + 1
+            if length >= LONGEST_NAME and start - folder < LONGEST_NAME:
+                start = folder
+            labels[name] = f"…{text[start:]}" if start else text
+        length += 1
+    return labels
 
 
 def top_view(
@@ -204,8 +235,8 @@ def top_view(
     """Return the map's axes, right and up, in the world.
 
     The map is perpendicular to the cameras' mean up direction. Nadir photos are seen as from behind the
-    cameras (`_nadir_axis`). Up on the map is where most photos look, else up in the photos; if both are unknown, the
-    longest axis of the path is horizontal and the first photo on the left.
+    cameras (`_nadir_axis`). Up on the map is where most photos look, else up in the photos; if both are
+    unknown, the longest axis of the path is horizontal and the first photo on the left.
     """
     spread = centres - centres.mean(axis=0)
     axes = np.linalg.svd(spread, full_matrices=False)[2] if len(centres) > 2 else np.eye(3)
@@ -314,7 +345,7 @@ def _with_left_out(
     drawn: CaptureMap,
     left_out: Mapping[str, str],  # work name -> reason
     mapping: Mapping[str, Any],
-    labels: Mapping[str, str],
+    shown: Mapping[str, str],  # work name -> name on the map
     at: Mapping[str, int],  # work name of a placed photo -> its index
     plane: np.ndarray,  # [2, 3]
     size: float,
@@ -330,20 +361,24 @@ def _with_left_out(
                 best[lost] = int(matches), partner
     hypotheses = mapping.get("hypotheses", {})
     middle = np.median([photo.xy for photo in drawn.photos], axis=0)
+    low, high = frame_limits(np.array([photo.xy for photo in drawn.photos]))
+    likely = {name: plane @ np.array(xyz, float) for name, xyz in hypotheses.items()}
+    # A hypothesis far from all placed photos is wrong more often than not.
+    likely = {name: xy for name, xy in likely.items() if (low <= xy).all() and (xy <= high).all()}
     for name, reason in left_out.items():
         matches, partner = best.get(name, (0, ""))
-        if name in hypotheses:
-            xy = plane @ np.array(hypotheses[name], float)
+        if name in likely:
+            xy = likely[name]
         elif partner:
             xy = _beside(np.array(drawn.photos[at[partner]].xy), middle, ASIDE * size, photos)
-        reasons.setdefault(reason, []).append(labels[name])
-        if name not in hypotheses and not partner:
+        reasons.setdefault(reason, []).append(shown[name])
+        if name not in likely and not partner:
             continue
-        photos.append(MapPhoto(labels[name], as_pair(xy), "left out", unsure=name not in hypotheses))
+        photos.append(MapPhoto(shown[name], as_pair(xy), "left out", unsure=name not in likely))
         if partner:
             links.append(MapLink((at[partner], len(photos) - 1), matches, "left out"))
             stars.append(_middle(photos[at[partner]], photos[-1]))
-            wanted.setdefault(labels[partner], []).append(labels[name])
+            wanted.setdefault(shown[partner], []).append(shown[name])
     return replace(
         drawn,
         photos=photos,
@@ -352,6 +387,14 @@ def _with_left_out(
         advice=[*drawn.advice, *(between(name, shortlist(lost, 3)) for name, lost in wanted.items())],
         listed=[*drawn.listed, *(f"{shortlist(names, 3)}: {why}" for why, names in reasons.items())],
     )
+
+
+def frame_limits(
+    xy: np.ndarray,  # [N, 2] positions of the placed cameras
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower left and the upper right corner of what the map may show."""
+    reach = (WIDEST - 1) / 2 * longer_side(xy)
+    return xy.min(axis=0) - reach, xy.max(axis=0) + reach
 
 
 def _beside(

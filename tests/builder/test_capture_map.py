@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.builder.capture_map import (
@@ -15,11 +16,12 @@ from ambiguous_wild.builder.capture_map import (
     MapPhoto,
     map_of_model,
     map_of_photos,
-    photo_label,
+    printable,
+    short_labels,
     top_view,
 )
 from ambiguous_wild.builder.growth import GrowthForecast
-from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, write_map
+from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, with_labels, write_map
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import read_png_rgb
 
@@ -167,7 +169,7 @@ def test_test_photos_and_provisional_ones_are_marked() -> None:
     assert [p.kind for p in drawn.photos].count("test") == 1 and drawn.photos[1].kind == "test"
     assert [k for k, p in enumerate(drawn.photos) if p.provisional] == [5]
     assert drawn.stars == [] and drawn.advice == [] and not any(p.weak for p in drawn.photos)
-    assert drawn.photos[3].name == "walk/IMG_3"
+    assert drawn.photos[3].name == "walk/IMG_3.jpg"
 
 
 def test_a_bridge_has_a_star_midway_and_a_sentence() -> None:
@@ -175,7 +177,7 @@ def test_a_bridge_has_a_star_midway_and_a_sentence() -> None:
     drawn = drawn_with(NAMES, links=[*all_links(first), *all_links(second), (NAMES[4], NAMES[3], 18)])
     assert [link.ends for link in drawn.links if link.kind == "weak"] == [(3, 4)]
     assert drawn.stars == [tuple(np.mean([drawn.photos[3].xy, drawn.photos[4].xy], axis=0))]
-    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_3 and walk/IMG_4"]
+    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_3.jpg and walk/IMG_4.jpg"]
 
 
 def test_without_links_nothing_is_weak() -> None:
@@ -194,23 +196,25 @@ def test_photos_left_out_are_drawn_where_they_would_be() -> None:
     )
     by_name = {p.name: p for p in drawn.photos}
     plane = top_view(*(part[:5] for part in ring(8, np.eye(3))))
-    assert by_name["walk/IMG_5"].xy == pytest.approx(tuple(plane @ centre))
-    assert by_name["walk/IMG_5"].kind == "left out" and not by_name["walk/IMG_5"].unsure
-    guess = by_name["walk/IMG_6"]
+    assert by_name["walk/IMG_5.jpg"].xy == pytest.approx(tuple(plane @ centre))
+    assert by_name["walk/IMG_5.jpg"].kind == "left out" and not by_name["walk/IMG_5.jpg"].unsure
+    guess = by_name["walk/IMG_6.jpg"]
     apart = np.linalg.norm(np.subtract(guess.xy, [p.xy for p in drawn.photos[:5]]), axis=1)
     assert guess.unsure and np.argmin(apart) == 4
     assert [link.ends for link in drawn.links if link.kind == "left out"] == [(4, 6)]
-    assert "walk/IMG_7" not in by_name
-    assert drawn.listed == ["walk/IMG_5, walk/IMG_6, walk/IMG_7: no partner"]
-    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_4 and walk/IMG_6"]
+    assert "walk/IMG_7.jpg" not in by_name
+    assert drawn.listed == ["walk/IMG_5.jpg, walk/IMG_6.jpg, walk/IMG_7.jpg: no partner"]
+    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_4.jpg and walk/IMG_6.jpg"]
 
 
 def test_other_parts_are_listed_and_not_drawn() -> None:
     placed = NAMES[:5]
     drawn = drawn_with(placed, links=all_links(placed), parts=[placed, NAMES[5:]])
     assert len(drawn.photos) == 5 and drawn.title.startswith("5 of 8 photos placed")
-    assert drawn.listed == ["another part, 3 photos: walk/IMG_5, walk/IMG_6, walk/IMG_7"]
-    assert drawn.advice == ["take a photo that shows both walk/IMG_4 and walk/IMG_5, to join the parts"]
+    assert drawn.listed == ["another part, 3 photos: walk/IMG_5.jpg, walk/IMG_6.jpg, walk/IMG_7.jpg"]
+    assert drawn.advice == [
+        "take a photo that shows both walk/IMG_4.jpg and walk/IMG_5.jpg, to join the parts"
+    ]
 
 
 def test_photos_without_poses_show_the_prediction() -> None:
@@ -224,7 +228,10 @@ def test_photos_without_poses_show_the_prediction() -> None:
         [f"{k}.jpg" for k in range(8)], links, GrowthForecast([[0, 1, 2, 3], [4, 5, 6]], [7])
     )
     assert [p.kind for p in drawn.photos] == ["train"] * 4 + ["part"] * 3 + ["left out"]
-    assert drawn.advice == ["take 2 or 3 photos between 3 and 4", "take 2 or 3 photos between 6 and 7"]
+    assert drawn.advice == [
+        "take 2 or 3 photos between 3.jpg and 4.jpg",
+        "take 2 or 3 photos between 6.jpg and 7.jpg",
+    ]
     assert [(link.ends, link.kind) for link in drawn.links if link.kind != "strong"] == [
         ((3, 4), "weak"),
         ((6, 7), "left out"),
@@ -253,9 +260,62 @@ def test_far_points_do_not_shrink_the_cameras() -> None:
     assert frame(far)[1] < 2 * frame(drawn)[1]
 
 
-def test_long_names_are_shortened_and_control_characters_replaced() -> None:
-    assert photo_label("front/000.jpg") == "front/000" and photo_label("a\x1bb.jpg") == "a?b"
-    assert photo_label("x" * 300 + "1234567890.jpg") == "…xxx1234567890"
+def test_a_hypothesis_far_away_neither_shrinks_the_map_nor_leaves_it() -> None:
+    placed = NAMES[:5]
+    links = {"links": all_links(placed), "unplaced_links": [(NAMES[4], NAMES[6], 30)]}
+    far = {NAMES[6]: [5000.0, 0.0, 0.0], NAMES[7]: [0.0, 5000.0, 0.0]}
+    drawn = drawn_with(placed, hypotheses=far, **links)
+    assert frame(drawn)[1] < 1.5 * frame(drawn_with(placed, links=links["links"]))[1]
+    (guess,) = (photo for photo in drawn.photos if photo.kind == "left out")
+    assert guess.name == "walk/IMG_6.jpg" and guess.unsure  # without a partner, IMG_7 is only listed
+    wrong = replace(drawn.photos[0], xy=(5000.0, 0.0), kind="left out")
+    assert frame(replace(drawn, photos=[*drawn.photos, wrong]))[1] < 1.5 * frame(drawn)[1]
+
+
+def test_labels_are_short_and_each_of_one_photo() -> None:
+    def labels(*names: str) -> list[str]:
+        made = short_labels(names)
+        return [made[name] for name in names]
+
+    assert labels("front/000.jpg", "b.jpg", "b.png") == ["front/000", "b.jpg", "b.png"]
+    assert labels("x" * 300 + "1234567890.jpg", "y.jpg") == ["…xxx1234567890", "y"]
+    same = ["left/2024-05-03_120002.jpg", "right/2024-05-03_120002.jpg"]
+    assert labels(*same) == ["left/2024-05-03_120002", "right/2024-05-03_120002"]
+    deep = labels(*(f"a/very/long/path/{name}" for name in same))
+    assert deep == ["…left/2024-05-03_120002", "…right/2024-05-03_120002"]
+    ends = labels("2024-05-03_120002.jpg", "left/2024-05-03_120002.jpg")
+    assert len(set(ends)) == 2
+
+
+def test_advice_holds_whole_names_and_each_gap() -> None:
+    names = [f"{side}/2024-05-03_12000{k}.jpg" for side in ("left", "right") for k in range(4)]
+    growth = GrowthForecast([[0, 1, 2]], [3, 4, 5, 6, 7])
+    drawn = map_of_photos(names, [(0, 1, 40), (0, 2, 40), (1, 2, 40)], growth)
+    assert len(drawn.advice) == 5 and all(".jpg and " in text for text in drawn.advice)
+    assert len({with_labels(drawn, text) for text in drawn.advice}) == 5
+    assert with_labels(drawn, drawn.advice[0]).endswith("left/2024-05-03_120003")
+
+
+def test_control_characters_are_replaced() -> None:
+    assert printable("a\x1bb.jpg") == "a?b.jpg"
+
+
+@pytest.mark.parametrize("stars", [[], [(0.0, 0.0)]])
+def test_the_heading_names_a_star_only_where_one_is_drawn(
+    stars: list[tuple[float, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts: list[str] = []
+    draw = Axes.text
+
+    def text(axes: Axes, x: float, y: float, shown: str, **style: Any) -> Any:
+        texts.append(shown)
+        return draw(axes, x, y, shown, **style)
+
+    monkeypatch.setattr(Axes, "text", text)
+    drawn = CaptureMap("", [MapPhoto("a", (1.0, 1.0))], [], stars, ["take a photo"])
+    write_map(drawn, tmp_path / "map.png")
+    assert ("Take more photos (star)" in texts) == bool(stars)
+    assert ("Take more photos" in texts) == (not stars)
 
 
 def test_equal_maps_have_equal_bytes_whatever_the_names(tmp_path: Path) -> None:

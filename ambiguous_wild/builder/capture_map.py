@@ -138,6 +138,7 @@ def map_of_photos(
     sources: Sequence[str],  # in the order of capture
     links: Sequence[Link],
     growth: GrowthForecast,
+    gaps: Sequence[tuple[int, int]],  # of `joins`
 ) -> CaptureMap:
     """Return the map of photos without poses: near each other if they overlap much."""
     main = set(growth.parts[0]) if growth.parts else set()
@@ -155,7 +156,6 @@ def map_of_photos(
     share = f"all {len(main)}" if whole else f"about {len(main)} of {len(sources)}"
     title = f"{share} photos will be placed; near = much overlap, not positions"
     result = _with_links(CaptureMap(title, photos, [], [], [], posed=False), links)
-    gaps = joins(growth, links)
     matches = {link[:2]: link[2] for link in links}
     bridged = [
         MapLink(pair, matches.get(_sorted(pair), 0), "weak" if _sorted(pair) in matches else "left out")
@@ -181,13 +181,13 @@ def joins(growth: GrowthForecast, links: Sequence[Link]) -> list[tuple[int, int]
     if not growth.parts:
         return []
     inside, pairs = set(growth.parts[0]), []
-    left = [*growth.parts[1:], *([k] for k in growth.others)]
-    while left:
-        pair = best_join(inside, [photo for part in left for photo in part], links)
+    part_of = {photo: part for part in (*growth.parts[1:], *([k] for k in growth.others)) for photo in part}
+    while part_of:
+        pair = best_join(inside, part_of.keys(), links)
         pairs.append(pair)
-        (joined,) = (part for part in left if pair[1] in part)
-        inside |= set(joined)
-        left.remove(joined)
+        for photo in part_of[pair[1]].copy():
+            inside.add(photo)
+            del part_of[photo]
     return pairs
 
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from ambiguous_wild.builder.capture_map import (
     CaptureMap,
     MapPhoto,
+    joins,
     map_of_model,
     map_of_photos,
     printable,
@@ -224,9 +225,8 @@ def test_photos_without_poses_show_the_prediction() -> None:
         (5, 6, 30),
         (3, 4, 14),
     ]
-    drawn = map_of_photos(
-        [f"{k}.jpg" for k in range(8)], links, GrowthForecast([[0, 1, 2, 3], [4, 5, 6]], [7])
-    )
+    growth = GrowthForecast([[0, 1, 2, 3], [4, 5, 6]], [7])
+    drawn = map_of_photos([f"{k}.jpg" for k in range(8)], links, growth, joins(growth, links))
     assert [p.kind for p in drawn.photos] == ["train"] * 4 + ["part"] * 3 + ["left out"]
     assert drawn.advice == [
         "take 2 or 3 photos between 3.jpg and 4.jpg",
@@ -290,7 +290,8 @@ def test_labels_are_short_and_each_of_one_photo() -> None:
 def test_advice_holds_whole_names_and_each_gap() -> None:
     names = [f"{side}/2024-05-03_12000{k}.jpg" for side in ("left", "right") for k in range(4)]
     growth = GrowthForecast([[0, 1, 2]], [3, 4, 5, 6, 7])
-    drawn = map_of_photos(names, [(0, 1, 40), (0, 2, 40), (1, 2, 40)], growth)
+    links = [(0, 1, 40), (0, 2, 40), (1, 2, 40)]
+    drawn = map_of_photos(names, links, growth, joins(growth, links))
     assert len(drawn.advice) == 5 and all(".jpg and " in text for text in drawn.advice)
     assert len({with_labels(drawn, text) for text in drawn.advice}) == 5
     assert with_labels(drawn, drawn.advice[0]).endswith("left/2024-05-03_120003")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
@@ -204,12 +205,18 @@ def printable(source: str) -> str:
 def short_labels(names: Collection[str]) -> dict[str, str]:  # name -> label
     """Return short labels for a drawing, each of one photo.
 
-    A label has no extension, unless two photos differ by nothing else. A long one is the shortest end of the
-    name that no other name has; the end starts at a folder where that makes it little longer.
+    A label has no extension, unless two photos differ by nothing else, and no folder that all photos share.
+    A long one is the shortest end of the name that no other name has; the end starts at a folder where that
+    makes it little longer.
     """
-    whole = {name: str(PurePosixPath(name).with_suffix("")) for name in names}
-    uses = Counter(whole.values())
-    whole = {name: stem if uses[stem] == 1 else name for name, stem in whole.items()}
+    paths = {name: PurePosixPath(name) for name in names}
+    folders = zip(*(path.parent.parts for path in paths.values()))
+    shared = len(list(takewhile(lambda level: len(set(level)) == 1, folders)))
+    uses = Counter(path.with_suffix("") for path in paths.values())
+    whole = {}
+    for name, path in paths.items():
+        stem = path.with_suffix("")
+        whole[name] = "/".join((stem if uses[stem] == 1 else path).parts[shared:])
     labels = {name: text for name, text in whole.items() if len(text) <= LONGEST_NAME}
     length, longest = LONGEST_NAME - 1, max(map(len, whole.values()), default=0)
     while len(labels) < len(whole):

@@ -282,7 +282,10 @@ def test_labels_are_short_and_each_of_one_photo() -> None:
     same = ["left/2024-05-03_120002.jpg", "right/2024-05-03_120002.jpg"]
     assert labels(*same) == ["left/2024-05-03_120002", "right/2024-05-03_120002"]
     deep = labels(*(f"a/very/long/path/{name}" for name in same))
-    assert deep == ["…left/2024-05-03_120002", "…right/2024-05-03_120002"]
+    assert deep == labels(*same)
+    deep = labels(*(f"{day}/very/long/path/{name}" for day in "ab" for name in same[:1]), "c/" + same[1])
+    assert len(set(deep)) == 3 and all(label.endswith("/2024-05-03_120002") for label in deep)
+    assert labels("images/IMG_0001.jpg", "images/IMG_0002.jpg") == ["IMG_0001", "IMG_0002"]
     ends = labels("2024-05-03_120002.jpg", "left/2024-05-03_120002.jpg")
     assert len(set(ends)) == 2
 

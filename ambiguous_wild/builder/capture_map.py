@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
@@ -20,11 +22,18 @@ from ambiguous_wild.io.colmap_records import Model
 MOST_POINTS = 5000  # of the backdrop
 STRONGEST = 4  # links drawn of each photo, besides the weak ones
 LONGEST_NAME = 14  # characters
-DOWN = 0.8  # share of the mean viewing direction along the normal of the cameras' plane: nadir photos
+DOWN = 0.8  # share of the mean viewing direction along the normal of a plane from which on cameras face it
 # Cameras lie in a plane if their second axis is longer than this share of the first, and their third shorter
 # than this share of the second.
 WIDE, THIN = 0.15, 0.4
+CORE = 80  # percent of the points, the nearest to their median, by which their thinnest axis is measured
+AGREE = 0.9  # length of the mean viewing direction from which on all cameras look the same way
+# Length of the mean up direction from which on up is determined. It is 0.34 to 0.67 for nadir strips flown
+# back and forth (seneca), 0.96 or more for photos taken by hand (monstree, sceaux, statue, reichstag).
+UPRIGHT = 0.7
+TALL = 0.3  # of the cameras' spread sideways: spread along up of a path that a view from above would hide
 LEVEL = 0.3  # length of the mean up direction below which up is unknown; shorter headings are not drawn
+WIDEST = 1.5  # size of the map in sizes of the placed cameras' box: what is farther away is cut off
 COMMON = 0.4  # length of the mean heading from which on it is up on the map
 ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
 ROOM = 0.4  # of this distance: free room around such a photo
@@ -36,7 +45,7 @@ Kind = Literal["train", "test", "part", "left out"]
 class MapPhoto:
     """A photo on the map."""
 
-    name: str
+    name: str  # path in the capture
     xy: tuple[float, float]  # x right, y up
     kind: Kind = "train"
     heading: tuple[float, float] | None = None  # viewing direction, at most unit length; None: unknown
@@ -67,6 +76,7 @@ class CaptureMap:
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # [P, 2] backdrop
     colours: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # [P, 3] of the points
     posed: bool = True  # positions are those of the cameras
+    labels: Mapping[str, str] = field(default_factory=dict)  # name of a photo -> shorter name for the drawing
 
 
 def map_of_model(
@@ -80,14 +90,14 @@ def map_of_model(
     names = [name for name in sources if name in placed]
     poses = np.array([placed[name] for name in names]).reshape(-1, 4, 4)
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    plane = top_view(poses[:, :3, :3], centres)
+    plane = top_view(poses[:, :3, :3], centres, model.points.xyz)
     flat = centres @ plane.T
     size = longer_side(flat)
-    labels = {name: photo_label(source) for name, source in sources.items()}
+    shown = {name: printable(source) for name, source in sources.items()}
     provisional = set(mapping.get("provisional", ()))
     photos = [
         MapPhoto(
-            labels[name],
+            shown[name],
             as_pair(flat[k]),
             "test" if name in tests else "train",
             as_pair(plane @ poses[k, 2, :3]),
@@ -101,7 +111,10 @@ def map_of_model(
     elsewhere = {name for part in other_parts for name in part}
     left_out = {name: why for name, why in mapping["left_out"].items() if name in sources.keys() - elsewhere}
     order = {name: k for k, name in enumerate(sources)}
-    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, seen from above", photos, [], [], [])
+    up = -poses[:, 1, :3].mean(axis=0)
+    hidden = np.linalg.norm(up) > UPRIGHT and np.cross(*plane) @ up < np.linalg.norm(up) / 2
+    direction = "seen in the viewing direction" if hidden else "seen from above"
+    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, {direction}", photos, [], [], [])
     result = _with_links(result, links)
     for part in other_parts:
         members = sorted(order[name] for name in part if name in order)
@@ -110,20 +123,23 @@ def map_of_model(
         every = list(sources)
         loose = _links(mapping.get("unplaced_links", ()), order)
         inside, outside = best_join([order[name] for name in names], members, loose)
-        pair = (labels[every[inside]], labels[every[outside]])
-        named = shortlist([labels[every[k]] for k in members], 3)
+        pair = (shown[every[inside]], shown[every[outside]])
+        named = shortlist([shown[every[k]] for k in members], 3)
         result.listed.append(f"another part, {len(members)} photos: {named}")
         result.advice.insert(0, f"take a photo that shows both {pair[0]} and {pair[1]}, to join the parts")
-    result = _with_left_out(result, left_out, mapping, labels, at, plane, size)
+    result = _with_left_out(result, left_out, mapping, shown, at, plane, size)
     points = model.points.xyz[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
     colours = model.points.rgb[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
-    return replace(result, points=points @ plane.T, colours=colours)
+    return replace(
+        result, points=points @ plane.T, colours=colours, labels=short_labels(list(shown.values()))
+    )
 
 
 def map_of_photos(
     sources: Sequence[str],  # in the order of capture
     links: Sequence[Link],
     growth: GrowthForecast,
+    gaps: Sequence[tuple[int, int]],  # of `joins`
 ) -> CaptureMap:
     """Return the map of photos without poses: near each other if they overlap much."""
     main = set(growth.parts[0]) if growth.parts else set()
@@ -131,7 +147,7 @@ def map_of_photos(
     xy = lay_out(len(sources), links)
     photos = [
         MapPhoto(
-            photo_label(source),
+            printable(source),
             as_pair(xy[k]),
             "train" if k in main else "part" if k in in_part else "left out",
         )
@@ -141,7 +157,6 @@ def map_of_photos(
     share = f"all {len(main)}" if whole else f"about {len(main)} of {len(sources)}"
     title = f"{share} photos will be placed; near = much overlap, not positions"
     result = _with_links(CaptureMap(title, photos, [], [], [], posed=False), links)
-    gaps = joins(growth, links)
     matches = {link[:2]: link[2] for link in links}
     bridged = [
         MapLink(pair, matches.get(_sorted(pair), 0), "weak" if _sorted(pair) in matches else "left out")
@@ -158,6 +173,7 @@ def map_of_photos(
             for part in growth.parts[1:]
         ]
         + ([f"of no part: {shortlist([photos[k].name for k in growth.others])}"] if growth.others else []),
+        labels=short_labels([photo.name for photo in photos]),
     )
 
 
@@ -166,13 +182,13 @@ def joins(growth: GrowthForecast, links: Sequence[Link]) -> list[tuple[int, int]
     if not growth.parts:
         return []
     inside, pairs = set(growth.parts[0]), []
-    left = [*growth.parts[1:], *([k] for k in growth.others)]
-    while left:
-        pair = best_join(inside, [photo for part in left for photo in part], links)
+    part_of = {photo: part for part in (*growth.parts[1:], *([k] for k in growth.others)) for photo in part}
+    while part_of:
+        pair = best_join(inside, part_of.keys(), links)
         pairs.append(pair)
-        (joined,) = (part for part in left if pair[1] in part)
-        inside |= set(joined)
-        left.remove(joined)
+        for photo in part_of[pair[1]].copy():
+            inside.add(photo)
+            del part_of[photo]
     return pairs
 
 
@@ -181,34 +197,69 @@ def between(first: str, second: str) -> str:
     return f"take 2 or 3 photos between {first} and {second}"
 
 
-def photo_label(source: str) -> str:
-    """Return the name of a photo for the map: without extension, its beginning left out if it is long."""
-    text = "".join(c if c.isprintable() else "?" for c in str(PurePosixPath(source).with_suffix("")))
-    return text if len(text) <= LONGEST_NAME else f"…{text[1 - LONGEST_NAME :]}"
+def printable(source: str) -> str:
+    """Return the name of a photo without control characters."""
+    return "".join(c if c.isprintable() else "?" for c in source)
+
+
+def short_labels(names: Collection[str]) -> dict[str, str]:  # name -> label
+    """Return short labels for a drawing, each of one photo.
+
+    A label has no extension, unless two photos differ by nothing else, and no folder that all photos share.
+    A long one is the shortest end of the name that no other name has; the end starts at a folder where that
+    makes it little longer.
+    """
+    paths = {name: PurePosixPath(name) for name in names}
+    folders = zip(*(path.parent.parts for path in paths.values()))
+    shared = len(list(takewhile(lambda level: len(set(level)) == 1, folders)))
+    uses = Counter(path.with_suffix("") for path in paths.values())
+    whole = {}
+    for name, path in paths.items():
+        stem = path.with_suffix("")
+        whole[name] = "/".join((stem if uses[stem] == 1 else path).parts[shared:])
+    labels = {name: text for name, text in whole.items() if len(text) <= LONGEST_NAME}
+    length, longest = LONGEST_NAME - 1, max(map(len, whole.values()), default=0)
+    while len(labels) < len(whole):
+        ends = Counter(text[-length:] for text in whole.values())
+        for name in whole.keys() - labels.keys():
+            text = whole[name]
+            if ends[text[-length:]] > 1 and length < longest:
+                continue
+            start = max(len(text) - length, 0)
+            folder = text.rfind("/", 0, start) + 1
+            if length >= LONGEST_NAME and start - folder < LONGEST_NAME:
+                start = folder
+            labels[name] = f"…{text[start:]}" if start else text
+        length += 1
+    return labels
 
 
 def top_view(
     rotations: np.ndarray,  # [N, 3, 3] camera from world
     centres: np.ndarray,  # [N, 3] world
+    points: np.ndarray | None = None,  # [P, 3] world, of the model
 ) -> np.ndarray:  # [2, 3]
     """Return the map's axes, right and up, in the world.
 
-    The map is perpendicular to the cameras' mean up direction. Nadir photos have no common one: they are seen
-    as from behind the cameras, on the plane in which these lie. Up on the map is where most photos look; if
-    they look all round, the longest axis of the path is horizontal and the first photo on the left.
+    The map is perpendicular to the cameras' mean up direction. Nadir photos are seen as from behind the
+    cameras (`_nadir_axis`). Up on the map is where most photos look, else up in the photos; if both are
+    unknown, the longest axis of the path is horizontal and the first photo on the left.
     """
     spread = centres - centres.mean(axis=0)
     axes = np.linalg.svd(spread, full_matrices=False)[2] if len(centres) > 2 else np.eye(3)
     sizes = np.sqrt(((spread @ axes.T) ** 2).mean(axis=0))
     view, up = rotations[:, 2].mean(axis=0), -rotations[:, 1].mean(axis=0)
-    plane = sizes[1] > WIDE * sizes[0] and sizes[2] < THIN * sizes[1]
-    if plane and abs(view @ axes[2]) > DOWN:
-        normal = -axes[2] * np.sign(view @ axes[2])
+    flat = bool(sizes[1] > WIDE * sizes[0] and sizes[2] < THIN * sizes[1])
+    nadir = _nadir_axis(spread, view, up, axes[2] if flat else None, points)
+    if nadir is not None:
+        normal = -nadir * np.sign(view @ nadir)
     elif np.linalg.norm(up) > LEVEL:
         normal = up / np.linalg.norm(up)
     else:
         normal = axes[2] * (1 if up @ axes[2] >= 0 else -1)
     ahead = view - (view @ normal) * normal
+    if np.linalg.norm(ahead) <= COMMON and np.linalg.norm(up) > UPRIGHT:
+        ahead = up - (up @ normal) * normal
     if np.linalg.norm(ahead) > COMMON:
         ahead /= np.linalg.norm(ahead)
         return np.stack([np.cross(ahead, normal), ahead])
@@ -216,6 +267,49 @@ def top_view(
     right = longest - (longest @ normal) * normal
     right /= max(float(np.linalg.norm(right)), 1e-12)
     return np.stack([right, np.cross(normal, right)]) * (-1 if spread[0] @ right > 0 else 1)
+
+
+def _nadir_axis(
+    spread: np.ndarray,  # [N, 3] centres less their mean
+    view: np.ndarray,  # [3] mean viewing direction
+    up: np.ndarray,  # [3] mean up direction
+    cameras_axis: np.ndarray | None,  # [3] normal of the plane in which the cameras lie
+    points: np.ndarray | None,  # [P, 3]
+) -> np.ndarray | None:  # [3] unit length
+    """Return the axis along which nadir photos look; None for photos that are seen better from above.
+
+    Photos that all look the same way without a common up direction are nadir photos. With one, a strip flown
+    one way and a walk along a facade differ in their path: a strip goes along up in the photos, and a view
+    along up would hide it. A strip flown sideways cannot be told from a walk, and is drawn as one.
+    """
+    agreeing = bool(np.linalg.norm(view) > AGREE)
+    axis = cameras_axis if cameras_axis is not None and abs(view @ cameras_axis) > DOWN else None
+    if axis is None and agreeing and points is not None:
+        normal = _thin_axis(points)
+        if normal is not None and abs(view @ normal) > DOWN * np.linalg.norm(view):
+            axis = normal
+    if np.linalg.norm(up) <= UPRIGHT:
+        return view / np.linalg.norm(view) if axis is None and agreeing else axis
+    if axis is None:
+        return None
+    upwards = up - (up @ axis) * axis
+    upwards /= max(float(np.linalg.norm(upwards)), 1e-12)
+    directions = np.array([upwards, np.cross(axis, upwards), axis])
+    tall, wide, deep = np.sqrt(((spread @ directions.T) ** 2).mean(axis=0))
+    return axis if tall > TALL * wide and deep < THIN * tall else None
+
+
+def _thin_axis(
+    points: np.ndarray,  # [P, 3]
+) -> np.ndarray | None:  # [3] unit length
+    """Return the normal of the plane in which most points lie; None if they lie in no plane."""
+    if len(points) < 4:
+        return None
+    apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    core = points[apart <= np.percentile(apart, CORE)]
+    values, axes = np.linalg.eigh(np.cov(core.T))  # ascending
+    sizes = np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(axes[:, 0]) if sizes[0] < THIN * sizes[1] and sizes[1] > WIDE * sizes[2] else None
 
 
 def _links(rows: Sequence[Sequence[Any]], at: Mapping[str, int]) -> list[Link]:
@@ -258,7 +352,7 @@ def _with_left_out(
     drawn: CaptureMap,
     left_out: Mapping[str, str],  # work name -> reason
     mapping: Mapping[str, Any],
-    labels: Mapping[str, str],
+    shown: Mapping[str, str],  # work name -> name on the map
     at: Mapping[str, int],  # work name of a placed photo -> its index
     plane: np.ndarray,  # [2, 3]
     size: float,
@@ -274,20 +368,24 @@ def _with_left_out(
                 best[lost] = int(matches), partner
     hypotheses = mapping.get("hypotheses", {})
     middle = np.median([photo.xy for photo in drawn.photos], axis=0)
+    low, high = frame_limits(np.array([photo.xy for photo in drawn.photos]))
+    likely = {name: plane @ np.array(xyz, float) for name, xyz in hypotheses.items()}
+    # A hypothesis far from all placed photos is wrong more often than not.
+    likely = {name: xy for name, xy in likely.items() if (low <= xy).all() and (xy <= high).all()}
     for name, reason in left_out.items():
         matches, partner = best.get(name, (0, ""))
-        if name in hypotheses:
-            xy = plane @ np.array(hypotheses[name], float)
+        if name in likely:
+            xy = likely[name]
         elif partner:
             xy = _beside(np.array(drawn.photos[at[partner]].xy), middle, ASIDE * size, photos)
-        reasons.setdefault(reason, []).append(labels[name])
-        if name not in hypotheses and not partner:
+        reasons.setdefault(reason, []).append(shown[name])
+        if name not in likely and not partner:
             continue
-        photos.append(MapPhoto(labels[name], as_pair(xy), "left out", unsure=name not in hypotheses))
+        photos.append(MapPhoto(shown[name], as_pair(xy), "left out", unsure=name not in likely))
         if partner:
             links.append(MapLink((at[partner], len(photos) - 1), matches, "left out"))
             stars.append(_middle(photos[at[partner]], photos[-1]))
-            wanted.setdefault(labels[partner], []).append(labels[name])
+            wanted.setdefault(shown[partner], []).append(shown[name])
     return replace(
         drawn,
         photos=photos,
@@ -296,6 +394,14 @@ def _with_left_out(
         advice=[*drawn.advice, *(between(name, shortlist(lost, 3)) for name, lost in wanted.items())],
         listed=[*drawn.listed, *(f"{shortlist(names, 3)}: {why}" for why, names in reasons.items())],
     )
+
+
+def frame_limits(
+    xy: np.ndarray,  # [N, 2] positions of the placed cameras
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower left and the upper right corner of what the map may show."""
+    reach = (WIDEST - 1) / 2 * longer_side(xy)
+    return xy.min(axis=0) - reach, xy.max(axis=0) + reach
 
 
 def _beside(

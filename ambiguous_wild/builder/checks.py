@@ -23,7 +23,6 @@ from ambiguous_wild.builder.growth import GrowthForecast, predict_growth
 from ambiguous_wild.builder.overlap_graph import Link
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
-    candidate_pairs,
     compare_photos,
     photo_features,
 )
@@ -68,6 +67,7 @@ def run_checks(
     thumbnails: np.ndarray,  # [N, 1024], see `screen.thumbnail`
     compared: PhotoComparison,
     growth: GrowthForecast,
+    gaps: Sequence[tuple[int, int]],  # of `joins`
 ) -> list[Check]:
     """Run all checks, in the order of the table."""
     return [
@@ -78,7 +78,7 @@ def run_checks(
         focal_length(facts),
         blur(facts, compared),
         near_duplicates(facts, thumbnails),
-        overlap(facts, compared, growth),
+        overlap(facts, compared, growth, gaps),
         motion(compared),
         fixed_to_camera(compared),
     ]
@@ -216,7 +216,12 @@ def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Ch
     )
 
 
-def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison, growth: GrowthForecast) -> Check:
+def overlap(
+    facts: Sequence[CheckedPhoto],
+    compared: PhotoComparison,
+    growth: GrowthForecast,
+    gaps: Sequence[tuple[int, int]],  # of `joins`
+) -> Check:
     """Predict how many photos will be placed, and name those that share too little with the others."""
     names, count = [f["source"] for f in facts], len(facts)
     if not growth.parts:
@@ -234,8 +239,8 @@ def overlap(facts: Sequence[CheckedPhoto], compared: PhotoComparison, growth: Gr
     if growth.others:
         finding += "; the others share too few features with two photos at once: "
         finding += shortlist([names[k] for k in growth.others], 3)
-    gaps = [f"{names[a]} and {names[b]}" for a, b in joins(growth, compared.links)]
-    advice = f"take 2 or 3 photos between {shortlist(gaps, 3)}"
+    pairs = [f"{names[a]} and {names[b]}" for a, b in gaps]
+    advice = f"take 2 or 3 photos between {shortlist(pairs, 3)}"
     outside = tuple(names[k] for k in range(count) if k not in main)
     return Check("overlap", "warning", "pixels", finding, advice, outside)
 
@@ -297,6 +302,7 @@ class CaptureReport:
     sources: list[str]  # of the readable photos, in the order of capture
     links: list[Link]  # photos that overlap
     growth: GrowthForecast
+    gaps: list[tuple[int, int]]  # photos between which more are needed
 
     @property
     def warnings(self) -> list[Check]:
@@ -305,7 +311,7 @@ class CaptureReport:
 
     def overlap_map(self) -> CaptureMap:
         """Lay out the photos by their overlap."""
-        return map_of_photos(self.sources, self.links, self.growth)
+        return map_of_photos(self.sources, self.links, self.growth, self.gaps)
 
 
 def check_capture(
@@ -331,15 +337,14 @@ def check_capture(
         {**record, "noise": level} for record, (level, _) in zip(read.photos, read.more)
     ]
     features = [found for _, found in read.more]
-    bar.start("comparing photos", len(candidate_pairs(features)))
-    compared = compare_photos(features, bar.step, jobs)
-    bar.finish()
+    compared = compare_photos(features, bar, jobs)
     growth = predict_growth(len(facts), compared.matches)
-    checks = run_checks(facts, read.thumbnails, compared, growth)
+    gaps = joins(growth, compared.links)
+    checks = run_checks(facts, read.thumbnails, compared, growth, gaps)
     if read.skipped:
         checks.insert(0, _files_check(read.skipped, len(capture.sources)))
     names = [f["source"] for f in facts]
-    return CaptureReport(capture.root, len(facts), read.skipped, checks, names, compared.links, growth)
+    return CaptureReport(capture.root, len(facts), read.skipped, checks, names, compared.links, growth, gaps)
 
 
 def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -10,25 +11,27 @@ from typing import Any, cast
 
 import numpy as np
 
+from ambiguous_wild import __version__
 from ambiguous_wild.builder.capture_map import (
     LEVEL,
     CaptureMap,
     Kind,
     MapPhoto,
     as_pair,
-    longer_side,
+    frame_limits,
     map_of_model,
 )
 from ambiguous_wild.builder.records import MappingResult, MapResult
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.colmap_records import Model
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.files import atomic_path, check_output
 from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
 
 FILE = "map.png"  # in the scene's folder
+SOFTWARE = "ambiguous_wild"  # text chunk `Software` of the file, followed by the version
 SIZE_PX, PANEL_PX, TITLE_PX = (1300, 860), 380, 40  # of the picture, its side panel and its title
 DPI = 100
 MOST_ADVICE, MOST_LISTED = 7, 8  # sentences at the side
-WIDEST = 1.5  # size of the map in sizes of the cameras' box: far points are cut off
 CORE = (10, 90)  # percentiles of the backdrop's positions that are shown if they fit
 MARGIN = 0.08  # of the map's size
 FONT_PX, NAME_PX = 12.0, 11.0
@@ -63,14 +66,13 @@ def draw_built(
 def frame(drawn: CaptureMap) -> tuple[tuple[float, float], float]:
     """Return the middle of the map, and the map's units per px."""
     xy = np.array([photo.xy for photo in drawn.photos])
-    low, high = xy.min(axis=0), xy.max(axis=0)
+    placed = np.array([not drawn.posed or photo.kind in ("train", "test") for photo in drawn.photos])
+    least, most = frame_limits(xy[placed] if placed.any() else xy)
+    shown = np.clip(xy, least, most)
+    low, high = shown.min(axis=0), shown.max(axis=0)
     if len(drawn.points):
-        core = np.percentile(drawn.points, CORE, axis=0)
-        reach = (WIDEST - 1) / 2 * longer_side(xy)
-        low, high = (
-            np.minimum(low, np.maximum(core[0], low - reach)),
-            np.maximum(high, np.minimum(core[1], high + reach)),
-        )
+        core = np.clip(np.percentile(drawn.points, CORE, axis=0), least, most)
+        low, high = np.minimum(low, core[0]), np.maximum(high, core[1])
     room = np.array([SIZE_PX[0] - PANEL_PX, SIZE_PX[1] - TITLE_PX]) * (1 - 2 * MARGIN)
     unit = float(((high - low) / room).max()) or 1.0 / room.max()
     return as_pair((low + high) / 2), unit
@@ -126,7 +128,47 @@ def write_map(drawn: CaptureMap, path: Path) -> None:
             parse_math=False,
         )  # fmt: skip
         with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png", metadata={"Software": None})
+            figure.savefig(temporary, format="png", metadata={"Software": f"{SOFTWARE} {__version__}"})
+
+
+def check_target(path: Path, raw: Sequence[Path]) -> None:
+    """Check, before long work, that a map can be written to `path` without a loss.
+
+    Raises:
+        AwError: `path` lies in a folder of the capture, is no .png, or holds anything but a map.
+    """
+    target = path.resolve()
+    for folder in raw:
+        if target.is_relative_to(folder.resolve()):
+            raise AwError(
+                f"{path} lies in the capture {folder}, where it would be taken for a photo: "
+                "choose an -o outside it"
+            )
+    if target.suffix.lower() != ".png":
+        raise AwError(f"{path} is no .png: the map is a PNG; choose an -o such as map.png")
+    if target.exists() and not target.is_file():
+        raise AwError(f"{path} is no regular file; choose another -o")
+    if target.exists() and not is_map(target):
+        raise AwError(f"{path} exists and is no map that aw drew: move it away, or choose another -o")
+    check_output(path)
+
+
+def is_map(path: Path) -> bool:
+    """Tell whether a file is a map of `write_map`, by its text chunk (PNG specification, 11.3.3.3)."""
+    try:
+        with open(path, "rb") as file:
+            if file.read(8) != b"\x89PNG\r\n\x1a\n":
+                return False
+            while len(head := file.read(8)) == 8 and head[4:] not in (b"IDAT", b"IEND"):
+                length = int.from_bytes(head[:4], "big")
+                if head[4:] == b"tEXt" and length < 1000:
+                    if file.read(length).startswith(f"Software\0{SOFTWARE} ".encode()):
+                        return True
+                    length = 0
+                file.seek(length + 4, 1)  # the checksum is 4 bytes
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}; choose another -o") from error
+    return False
 
 
 def _points(px: float) -> float:
@@ -233,7 +275,7 @@ def _draw_names(
     from matplotlib.patheffects import withStroke
 
     photos, advice = drawn.photos, drawn.advice[:MOST_ADVICE]
-    named = {photo.name for photo in photos if any(photo.name in text for text in advice)}
+    named = {name for text in advice for name in _names_in(drawn, text)}
 
     def urgency(k: int) -> tuple[bool, bool, bool, int]:
         photo = photos[k]
@@ -243,7 +285,7 @@ def _draw_names(
     # Names may cover wedges, but not the half next to a camera.
     ahead = np.array([photo.heading or (0.0, 0.0) for photo in photos])
     dots = np.concatenate([xy, stars, xy + 0.4 * wedge_length(xy) * ahead])
-    names = [photo.name for photo in photos]
+    names = [drawn.labels.get(photo.name, photo.name) for photo in photos]
     for k, corner in place_names(dots, names, order, size).items():
         axes.text(
             *corner, names[k], fontsize=_points(NAME_PX), va="bottom", zorder=6, parse_math=False,
@@ -261,7 +303,7 @@ def _draw_panel(axes: Any, drawn: CaptureMap) -> None:
         axes.text(46, top, text, fontsize=_points(FONT_PX), va="top")
         top -= 1.25 * line
     for heading, sentences, most in (
-        ("Take more photos (star)", drawn.advice, MOST_ADVICE),
+        ("Take more photos (star)" if drawn.stars else "Take more photos", drawn.advice, MOST_ADVICE),
         ("Not placed", drawn.listed, MOST_LISTED),
     ):
         if not sentences:
@@ -270,13 +312,30 @@ def _draw_panel(axes: Any, drawn: CaptureMap) -> None:
         axes.text(12, top, heading, fontsize=_points(FONT_PX + 1), va="top", weight="bold")
         top -= 1.3 * line
         more = [f"and {len(sentences) - most} more"] if len(sentences) > most else []
-        for text in [*sentences[:most], *more]:
+        for text in [*(with_labels(drawn, text) for text in sentences[:most]), *more]:
             rows = textwrap.wrap(text, int((PANEL_PX - 30) / (CHARACTER * FONT_PX))) or [""]
             axes.text(
                 12, top, "\n".join(rows), fontsize=_points(FONT_PX), va="top", linespacing=1.2,
                 parse_math=False,
             )  # fmt: skip
             top -= len(rows) * line + 5
+
+
+def with_labels(drawn: CaptureMap, text: str) -> str:
+    """Return a sentence with the names of photos as they stand on the map."""
+    if not drawn.labels:
+        return text
+    return _any_name(drawn).sub(lambda match: drawn.labels[match[0]], text)
+
+
+def _names_in(drawn: CaptureMap, text: str) -> list[str]:
+    return _any_name(drawn).findall(text) if drawn.labels else []
+
+
+def _any_name(drawn: CaptureMap) -> re.Pattern[str]:
+    """Return a pattern of the names of photos, the longest first: a name may be a part of another."""
+    names = sorted(drawn.labels, key=lambda name: (-len(name), name))
+    return re.compile(rf"(?<!\w)(?:{'|'.join(map(re.escape, names))})(?!\w)")
 
 
 def _legend(drawn: CaptureMap) -> Iterator[tuple[str, str]]:

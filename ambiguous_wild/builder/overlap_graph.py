@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 Link = tuple[int, int, int]  # two photos, the lower number first, and their matches
 FEW_PARTNERS = 3  # a photo with fewer is held weakly
 STRESS_ROUNDS = 100  # of the layout
+ROUND = 0.95  # second axis of a layout, of the first, from which on it has no long axis
+CLEAR = 0.1  # of the largest distance from the middle: photos nearer to it do not decide the orientation
 SHORTEST, LONGEST = 0.6, 1.8  # length of a link on the layout; 1 = a link with the median number of matches
 
 
@@ -62,6 +65,7 @@ def weakly_held(
 
 def best_join(inside: Collection[int], outside: Collection[int], links: Iterable[Link]) -> tuple[int, int]:
     """Return the photo inside and the one outside with most matches; without matches the nearest in order."""
+    inside, outside = set(inside), set(outside)
     strongest = (0, -1, -1)
     for a, b, matches in links:
         if a in outside and b in inside:
@@ -70,7 +74,10 @@ def best_join(inside: Collection[int], outside: Collection[int], links: Iterable
             strongest = (matches, a, b)
     if strongest[0]:
         return strongest[1:]
-    return min(((a, b) for a in inside for b in outside), key=lambda pair: (abs(pair[0] - pair[1]), pair))
+    ordered = sorted(inside)
+    at = {b: bisect_left(ordered, b) for b in outside}
+    nearest = ((a, b) for b, k in at.items() for a in ordered[max(k - 1, 0) : k + 1])
+    return min(nearest, key=lambda pair: (abs(pair[0] - pair[1]), pair))
 
 
 def groups(
@@ -139,11 +146,27 @@ def _lay_out_part(part: Sequence[int], links: Sequence[Link]) -> np.ndarray:
         pull = -weights * apart / np.maximum(drawn, 1e-9)
         np.fill_diagonal(pull, 0.0)
         np.fill_diagonal(pull, -pull.sum(axis=1))
-        xy = inverse @ pull @ xy
-    xy -= xy.mean(axis=0)
-    axes = np.linalg.svd(xy, full_matrices=False)[2]
+        xy = inverse @ (pull @ xy)
+    return _oriented(xy - xy.mean(axis=0))
+
+
+def _oriented(
+    xy: np.ndarray,  # [N, 2] around 0
+) -> np.ndarray:
+    """Rotate and mirror a layout independently of rounding: photos decide what an SVD leaves open.
+
+    The long axis is horizontal, the first photo left; without a long axis, as in a ring, the first photo is
+    leftmost. The photo after a quarter of the capture is above.
+    """
+    _, sizes, axes = np.linalg.svd(xy, full_matrices=False)
+    far = np.linalg.norm(xy, axis=1)
+    if sizes[1] > ROUND * sizes[0]:
+        first = int(np.argmax(far > CLEAR * far.max()))
+        left = xy[first] / max(far[first], 1e-12)
+        axes = -np.array([left, [-left[1], left[0]]])
     xy = xy @ axes.T
-    # The signs of an SVD are arbitrary.
-    xy[:, 0] *= -1 if xy[0, 0] > 0 else 1
-    xy[:, 1] *= -1 if xy[int(np.argmax(np.abs(xy[:, 1]))), 1] < 0 else 1
+    for column, start, sign in ((0, 0, -1), (1, len(xy) // 4, 1)):
+        from_start = np.roll(xy[:, column], -start)
+        clear = from_start[int(np.argmax(np.abs(from_start) > CLEAR * np.abs(from_start).max()))]
+        xy[:, column] *= -1 if clear * sign < 0 else 1
     return xy

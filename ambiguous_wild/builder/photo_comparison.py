@@ -8,7 +8,7 @@ one offset a photo.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
+from ambiguous_wild.builder.progress import Bar
 
 SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
@@ -113,28 +114,26 @@ def _coarse_colours(small: np.ndarray) -> np.ndarray:
 
 def compare_photos(
     features: Sequence[PhotoFeatures],  # in the order of capture, where known
-    step: Callable[[], None] = lambda: None,
+    bar: Bar | None = None,
     jobs: int = 1,  # threads; the result does not depend on it
 ) -> PhotoComparison:
     """Match each photo with the next and the most similar ones; solve for one offset a photo."""
+    bar = bar or Bar(False)
     ordered = candidate_pairs(features)
-    with ThreadPoolExecutor(jobs) as pool:
-        raw = dict(zip(ordered, pool.map(lambda pair: _raw_matches(features, pair), ordered)))
+    raw = _all_raw_matches(features, ordered, "comparing photos", bar, jobs)
     sizes = [f.size for f in features]
     fixed = find_fixed([f.xy for f in features], sizes, [0] * len(features), raw)
     if fixed:
-        features = _without(features, fixed)
-        raw = {pair: _raw_matches(features, pair) for pair in ordered}
+        rest = _without(features, fixed)
+        fewer = {k for k, (f, g) in enumerate(zip(features, rest)) if len(g.xy) < len(f.xy)}
+        again = [pair for pair in ordered if fewer & set(pair)]
+        features = rest
+        raw |= _all_raw_matches(features, again, "comparing photos without what is fixed", bar, jobs)
     count = len(features)
     graph = np.zeros((count, count), bool)
     matches: Matches = {}
     rows: list[tuple[int, int, np.ndarray, float]] = []
     forward: list[bool] = []
-
-    def matched(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
-        matching = _match(features, pair, raw[pair])
-        step()
-        return matching
 
     def enter(i: int, j: int, inliers: tuple[np.ndarray, np.ndarray] | None) -> None:
         if inliers is None:
@@ -149,18 +148,19 @@ def compare_photos(
         if good.sum() >= MIN_INLIERS // 2:
             rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
 
-    tried = set(ordered)
-    # OpenCV keeps random numbers per thread, and each match seeds them: the result is deterministic.
-    with ThreadPoolExecutor(jobs) as pool:
-        for (i, j), inliers in zip(ordered, pool.map(matched, ordered)):
-            enter(i, j, inliers)
+    def enter_all(pairs: Sequence[tuple[int, int]], raw: Mapping[tuple[int, int], np.ndarray]) -> None:
+        # OpenCV keeps random numbers per thread, and each match seeds them: the result is deterministic.
+        with ThreadPoolExecutor(jobs) as pool:
+            for pair, inliers in zip(pairs, pool.map(lambda p: _match(features, p, raw[p]), pairs)):
+                enter(*pair, inliers)
+
+    enter_all(ordered, raw)
     # A photo that overlaps with few others is tried against more candidates before it counts as isolated.
     groups = _groups(graph)
-    for i in np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist():
-        for j in most_similar(features, i, EXTRA_CANDIDATES):
-            if (pair := (min(i, j), max(i, j))) not in tried:
-                tried.add(pair)
-                enter(*pair, _match(features, pair, _raw_matches(features, pair)))
+    lonely = np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist()
+    more = [(min(i, j), max(i, j)) for i in lonely for j in most_similar(features, i, EXTRA_CANDIDATES)]
+    more = [pair for pair in dict.fromkeys(more) if pair not in raw]
+    enter_all(more, _all_raw_matches(features, more, "comparing photos that overlap with few", bar, jobs))
     share = float(np.mean(forward)) if forward else math.nan
     return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, fixed, confirmed(matches))
 
@@ -243,6 +243,25 @@ def _raw_matches(
     if min(len(a.xy), len(b.xy)) < LEAST_MATCHES:
         return np.zeros((0, 2), int)
     return np.column_stack(_ratio_matches(a.descriptors, b.descriptors))
+
+
+def _all_raw_matches(
+    features: Sequence[PhotoFeatures], pairs: Sequence[tuple[int, int]], what: str, bar: Bar, jobs: int
+) -> dict[tuple[int, int], np.ndarray]:
+    """Match many pairs, with a bar: this takes nearly all the time of a comparison."""
+
+    def match(pair: tuple[int, int]) -> np.ndarray:
+        rows = _raw_matches(features, pair)
+        bar.step()
+        return rows
+
+    if not pairs:
+        return {}
+    bar.start(what, len(pairs))
+    with ThreadPoolExecutor(jobs) as pool:
+        matches = dict(zip(pairs, pool.map(match, pairs)))
+    bar.finish()
+    return matches
 
 
 def _match(

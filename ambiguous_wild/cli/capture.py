@@ -107,12 +107,11 @@ def screen_command(
     near-duplicates, overlap, motion. Nothing is written but the picture of -o."""
 
     from ambiguous_wild.builder.checks import check_capture, refuse_failed
-    from ambiguous_wild.builder.map_drawing import write_map
+    from ambiguous_wild.builder.map_drawing import check_target, write_map
     from ambiguous_wild.builder.progress import Bar
-    from ambiguous_wild.io.files import check_output
 
     if output is not None:
-        check_output(output)
+        check_target(output, raw)
     report = check_capture(raw, jobs=threads or os.cpu_count() or 1, bar=Bar(not as_json))
     if output is not None:
         write_map(report.overlap_map(), output)

@@ -8,18 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.builder.capture_map import (
     CaptureMap,
     MapPhoto,
+    joins,
     map_of_model,
     map_of_photos,
-    photo_label,
+    printable,
+    short_labels,
     top_view,
 )
 from ambiguous_wild.builder.growth import GrowthForecast
-from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, write_map
+from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, with_labels, write_map
 from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import read_png_rgb
 
@@ -82,6 +85,55 @@ def test_nadir_photos_are_seen_as_from_the_aircraft(world: np.ndarray) -> None:
     assert np.cross(plane[0], plane[1]) @ down == pytest.approx(-1, abs=1e-2)
 
 
+def ground(world: np.ndarray) -> np.ndarray:
+    """Points [P, 3] near a plane 4 below the cameras of the nadir tests."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-4, 9, (300, 2)), rng.normal(-4, 0.2, 300)])
+    return np.concatenate([points, rng.normal(size=(20, 3)) * 30]) @ world.T
+
+
+def nadir_photos(places: np.ndarray, ups: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and centres of cameras at places [N, 3] that look down, their up towards ups [N, 3]."""
+    centres, down = places @ world.T, world @ np.array([0.03, 0.02, -1.0])
+    return np.array([looking(c, c + down, world @ u) for c, u in zip(centres, ups)]), centres
+
+
+STRIP = np.array([(0.1 * (k % 2), k, 0.2 * (k % 3)) for k in range(6)], float)
+
+
+@pytest.mark.parametrize("back", [1.0, -1.0])
+def test_a_nadir_strip_is_seen_as_from_the_aircraft(world: np.ndarray, back: float) -> None:
+    places = STRIP if back > 0 else np.concatenate([STRIP, STRIP[::-1] + np.array([0.5, 0.0, 0.0])])
+    ups = np.array([(0.0, 1.0 if k < 6 else back, 0.0) for k in range(len(places))])
+    rotations, centres = nadir_photos(places, ups, world)
+    plane = top_view(rotations, centres, ground(world))
+    assert np.cross(*plane) @ world @ np.array([0.0, 0.0, 1.0]) > 0.95
+    assert np.ptp(centres @ plane.T, axis=0).max() == pytest.approx(5, rel=0.05)
+
+
+def test_a_nadir_strip_flown_back_and_forth_needs_no_points(world: np.ndarray) -> None:
+    ups = np.array([(0.0, (-1.0) ** k, 0.0) for k in range(6)])
+    plane = top_view(*nadir_photos(STRIP, ups, world))
+    assert np.cross(*plane) @ world @ np.array([0.0, 0.0, 1.0]) > 0.95
+
+
+def test_a_nadir_grid_at_mixed_heights_is_seen_as_from_the_aircraft(world: np.ndarray) -> None:
+    places = np.array([(x, y, 0.9 * ((x + 2 * y) % 3)) for x in range(4) for y in range(3)], float)
+    ups = np.array([(0.0, (-1.0) ** (k // 3), 0.0) for k in range(12)])
+    plane = top_view(*nadir_photos(places, ups, world), ground(world))
+    assert np.cross(*plane) @ world @ np.array([0.0, 0.0, 1.0]) > 0.95
+
+
+def test_a_walk_along_a_facade_is_seen_from_above(world: np.ndarray) -> None:
+    rng = np.random.default_rng(2)
+    places = np.column_stack([np.arange(9.0), rng.normal(0, 0.1, 9), rng.normal(1.6, 0.05, 9)])
+    wall = np.column_stack([rng.uniform(-2, 10, 400), rng.normal(5, 0.1, 400), rng.uniform(0, 6, 400)])
+    up, ahead = world @ np.array([0.0, 0.0, 1.0]), world @ np.array([0.0, 1.0, 0.1])
+    rotations = np.array([looking(c, c + ahead, up) for c in places @ world.T])
+    plane = top_view(rotations, places @ world.T, wall @ world.T)
+    assert np.cross(*plane) @ up > 0.95 and plane[1] @ ahead > 0.9
+
+
 NAMES = [f"IMG_{k}.jpg" for k in range(8)]
 
 
@@ -118,7 +170,7 @@ def test_test_photos_and_provisional_ones_are_marked() -> None:
     assert [p.kind for p in drawn.photos].count("test") == 1 and drawn.photos[1].kind == "test"
     assert [k for k, p in enumerate(drawn.photos) if p.provisional] == [5]
     assert drawn.stars == [] and drawn.advice == [] and not any(p.weak for p in drawn.photos)
-    assert drawn.photos[3].name == "walk/IMG_3"
+    assert drawn.photos[3].name == "walk/IMG_3.jpg"
 
 
 def test_a_bridge_has_a_star_midway_and_a_sentence() -> None:
@@ -126,7 +178,7 @@ def test_a_bridge_has_a_star_midway_and_a_sentence() -> None:
     drawn = drawn_with(NAMES, links=[*all_links(first), *all_links(second), (NAMES[4], NAMES[3], 18)])
     assert [link.ends for link in drawn.links if link.kind == "weak"] == [(3, 4)]
     assert drawn.stars == [tuple(np.mean([drawn.photos[3].xy, drawn.photos[4].xy], axis=0))]
-    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_3 and walk/IMG_4"]
+    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_3.jpg and walk/IMG_4.jpg"]
 
 
 def test_without_links_nothing_is_weak() -> None:
@@ -145,23 +197,25 @@ def test_photos_left_out_are_drawn_where_they_would_be() -> None:
     )
     by_name = {p.name: p for p in drawn.photos}
     plane = top_view(*(part[:5] for part in ring(8, np.eye(3))))
-    assert by_name["walk/IMG_5"].xy == pytest.approx(tuple(plane @ centre))
-    assert by_name["walk/IMG_5"].kind == "left out" and not by_name["walk/IMG_5"].unsure
-    guess = by_name["walk/IMG_6"]
+    assert by_name["walk/IMG_5.jpg"].xy == pytest.approx(tuple(plane @ centre))
+    assert by_name["walk/IMG_5.jpg"].kind == "left out" and not by_name["walk/IMG_5.jpg"].unsure
+    guess = by_name["walk/IMG_6.jpg"]
     apart = np.linalg.norm(np.subtract(guess.xy, [p.xy for p in drawn.photos[:5]]), axis=1)
     assert guess.unsure and np.argmin(apart) == 4
     assert [link.ends for link in drawn.links if link.kind == "left out"] == [(4, 6)]
-    assert "walk/IMG_7" not in by_name
-    assert drawn.listed == ["walk/IMG_5, walk/IMG_6, walk/IMG_7: no partner"]
-    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_4 and walk/IMG_6"]
+    assert "walk/IMG_7.jpg" not in by_name
+    assert drawn.listed == ["walk/IMG_5.jpg, walk/IMG_6.jpg, walk/IMG_7.jpg: no partner"]
+    assert drawn.advice == ["take 2 or 3 photos between walk/IMG_4.jpg and walk/IMG_6.jpg"]
 
 
 def test_other_parts_are_listed_and_not_drawn() -> None:
     placed = NAMES[:5]
     drawn = drawn_with(placed, links=all_links(placed), parts=[placed, NAMES[5:]])
     assert len(drawn.photos) == 5 and drawn.title.startswith("5 of 8 photos placed")
-    assert drawn.listed == ["another part, 3 photos: walk/IMG_5, walk/IMG_6, walk/IMG_7"]
-    assert drawn.advice == ["take a photo that shows both walk/IMG_4 and walk/IMG_5, to join the parts"]
+    assert drawn.listed == ["another part, 3 photos: walk/IMG_5.jpg, walk/IMG_6.jpg, walk/IMG_7.jpg"]
+    assert drawn.advice == [
+        "take a photo that shows both walk/IMG_4.jpg and walk/IMG_5.jpg, to join the parts"
+    ]
 
 
 def test_photos_without_poses_show_the_prediction() -> None:
@@ -171,11 +225,13 @@ def test_photos_without_poses_show_the_prediction() -> None:
         (5, 6, 30),
         (3, 4, 14),
     ]
-    drawn = map_of_photos(
-        [f"{k}.jpg" for k in range(8)], links, GrowthForecast([[0, 1, 2, 3], [4, 5, 6]], [7])
-    )
+    growth = GrowthForecast([[0, 1, 2, 3], [4, 5, 6]], [7])
+    drawn = map_of_photos([f"{k}.jpg" for k in range(8)], links, growth, joins(growth, links))
     assert [p.kind for p in drawn.photos] == ["train"] * 4 + ["part"] * 3 + ["left out"]
-    assert drawn.advice == ["take 2 or 3 photos between 3 and 4", "take 2 or 3 photos between 6 and 7"]
+    assert drawn.advice == [
+        "take 2 or 3 photos between 3.jpg and 4.jpg",
+        "take 2 or 3 photos between 6.jpg and 7.jpg",
+    ]
     assert [(link.ends, link.kind) for link in drawn.links if link.kind != "strong"] == [
         ((3, 4), "weak"),
         ((6, 7), "left out"),
@@ -204,9 +260,66 @@ def test_far_points_do_not_shrink_the_cameras() -> None:
     assert frame(far)[1] < 2 * frame(drawn)[1]
 
 
-def test_long_names_are_shortened_and_control_characters_replaced() -> None:
-    assert photo_label("front/000.jpg") == "front/000" and photo_label("a\x1bb.jpg") == "a?b"
-    assert photo_label("x" * 300 + "1234567890.jpg") == "…xxx1234567890"
+def test_a_hypothesis_far_away_neither_shrinks_the_map_nor_leaves_it() -> None:
+    placed = NAMES[:5]
+    links = {"links": all_links(placed), "unplaced_links": [(NAMES[4], NAMES[6], 30)]}
+    far = {NAMES[6]: [5000.0, 0.0, 0.0], NAMES[7]: [0.0, 5000.0, 0.0]}
+    drawn = drawn_with(placed, hypotheses=far, **links)
+    assert frame(drawn)[1] < 1.5 * frame(drawn_with(placed, links=links["links"]))[1]
+    (guess,) = (photo for photo in drawn.photos if photo.kind == "left out")
+    assert guess.name == "walk/IMG_6.jpg" and guess.unsure  # without a partner, IMG_7 is only listed
+    wrong = replace(drawn.photos[0], xy=(5000.0, 0.0), kind="left out")
+    assert frame(replace(drawn, photos=[*drawn.photos, wrong]))[1] < 1.5 * frame(drawn)[1]
+
+
+def test_labels_are_short_and_each_of_one_photo() -> None:
+    def labels(*names: str) -> list[str]:
+        made = short_labels(names)
+        return [made[name] for name in names]
+
+    assert labels("front/000.jpg", "b.jpg", "b.png") == ["front/000", "b.jpg", "b.png"]
+    assert labels("x" * 300 + "1234567890.jpg", "y.jpg") == ["…xxx1234567890", "y"]
+    same = ["left/2024-05-03_120002.jpg", "right/2024-05-03_120002.jpg"]
+    assert labels(*same) == ["left/2024-05-03_120002", "right/2024-05-03_120002"]
+    deep = labels(*(f"a/very/long/path/{name}" for name in same))
+    assert deep == labels(*same)
+    deep = labels(*(f"{day}/very/long/path/{name}" for day in "ab" for name in same[:1]), "c/" + same[1])
+    assert len(set(deep)) == 3 and all(label.endswith("/2024-05-03_120002") for label in deep)
+    assert labels("images/IMG_0001.jpg", "images/IMG_0002.jpg") == ["IMG_0001", "IMG_0002"]
+    ends = labels("2024-05-03_120002.jpg", "left/2024-05-03_120002.jpg")
+    assert len(set(ends)) == 2
+
+
+def test_advice_holds_whole_names_and_each_gap() -> None:
+    names = [f"{side}/2024-05-03_12000{k}.jpg" for side in ("left", "right") for k in range(4)]
+    growth = GrowthForecast([[0, 1, 2]], [3, 4, 5, 6, 7])
+    links = [(0, 1, 40), (0, 2, 40), (1, 2, 40)]
+    drawn = map_of_photos(names, links, growth, joins(growth, links))
+    assert len(drawn.advice) == 5 and all(".jpg and " in text for text in drawn.advice)
+    assert len({with_labels(drawn, text) for text in drawn.advice}) == 5
+    assert with_labels(drawn, drawn.advice[0]).endswith("left/2024-05-03_120003")
+
+
+def test_control_characters_are_replaced() -> None:
+    assert printable("a\x1bb.jpg") == "a?b.jpg"
+
+
+@pytest.mark.parametrize("stars", [[], [(0.0, 0.0)]])
+def test_the_heading_names_a_star_only_where_one_is_drawn(
+    stars: list[tuple[float, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts: list[str] = []
+    draw = Axes.text
+
+    def text(axes: Axes, x: float, y: float, shown: str, **style: Any) -> Any:
+        texts.append(shown)
+        return draw(axes, x, y, shown, **style)
+
+    monkeypatch.setattr(Axes, "text", text)
+    drawn = CaptureMap("", [MapPhoto("a", (1.0, 1.0))], [], stars, ["take a photo"])
+    write_map(drawn, tmp_path / "map.png")
+    assert ("Take more photos (star)" in texts) == bool(stars)
+    assert ("Take more photos" in texts) == (not stars)
 
 
 def test_equal_maps_have_equal_bytes_whatever_the_names(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from ambiguous_wild.builder.checks import fixed_to_camera
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
 from ambiguous_wild.builder.photo_comparison import compare_photos, photo_features
 from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from tests.builder.capture_maker import COUNT, SETTINGS, write_capture, write_split_capture
@@ -216,6 +217,21 @@ def test_a_scene_is_built_past_a_bonnet(tmp_path: Path):
             assert max(p.xy[1] for p in image.points2D if p.has_point3D()) < 0.79 * 240
 
 
+class CountingBar(Bar):
+    """Keeps name, total and steps of each stage."""
+
+    def __init__(self) -> None:
+        super().__init__(False)
+        self.stages: list[tuple[str, int | None, int]] = []
+
+    def start(self, what: str, total: int | None) -> None:
+        self.stages.append((what, total, 0))
+
+    def step(self, count: int = 1) -> None:
+        what, total, steps = self.stages[-1]
+        self.stages[-1] = (what, total, steps + count)
+
+
 def test_the_capture_check_names_it_and_compares_the_rest(tmp_path: Path):
     bonnet = cv2.resize(
         np.random.default_rng(0).integers(0, 256, (8, 40, 3), np.uint8),
@@ -226,7 +242,10 @@ def test_the_capture_check_names_it_and_compares_the_rest(tmp_path: Path):
     plain = compare_photos([photo_features(read_png_rgb(path)) for path in paths])
     for path in paths:
         _over(path, bonnet)
-    compared = compare_photos([photo_features(read_png_rgb(path)) for path in paths])
+    bar = CountingBar()
+    compared = compare_photos([photo_features(read_png_rgb(path)) for path in paths], bar)
+    pairs = len(paths) * (len(paths) - 1) // 2
+    assert bar.stages == [("comparing photos", pairs, pairs), (bar.stages[1][0], pairs, pairs)]
     check = fixed_to_camera(compared)
     assert check.state == "warning" and check.finding.startswith("the lower 2") and check.advice
     assert fixed_to_camera(plain).state == "ok" and plain.fixed == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.overlap_graph import best_join, bridges, groups, lay_out, weakly_held
+from ambiguous_wild.builder.overlap_graph import _oriented, best_join, bridges, groups, lay_out, weakly_held
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -46,3 +46,22 @@ def test_parts_and_single_photos_do_not_cover_each_other() -> None:
     apart = np.linalg.norm(xy[:, None] - xy[None], axis=2) + 9 * np.eye(9)
     assert apart.min() > 0.5 and (lay_out(9, links) == xy).all()
     assert np.isfinite(lay_out(3, [])).all() and len({tuple(p) for p in lay_out(3, [])}) == 3
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_nearest_photos_in_order_are_those_of_brute_force(seed: int) -> None:
+    order = np.random.default_rng(seed).permutation(30).tolist()
+    inside, outside = order[:9], order[12:20]
+    pairs = [(a, b) for a in inside for b in outside]
+    assert best_join(inside, outside, []) == min(pairs, key=lambda p: (abs(p[0] - p[1]), p))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_orientation_of_a_ring_does_not_depend_on_rounding(seed: int) -> None:
+    angles = 2 * np.pi * np.arange(16) / 16
+    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(0, 2 * np.pi)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    moved = _oriented((ring * [1, rng.choice([-1, 1])] + rng.normal(0, 1e-9, ring.shape)) @ rotation.T)
+    assert np.abs(moved - ring * [-1, 1]).max() < 1e-6  # photo 0 left, photo 4 above

@@ -149,11 +149,15 @@ class Placement:
                     links[a, b] = int(np.count_nonzero(fits))
         return links
 
+    def _joins(self, first: int, second: int) -> bool:
+        """Tell whether a pair lies across parts that several pairs joined."""
+        return any((first in part) != (second in part) for part in self.joined)
+
     def components(self, without: Collection[int] = ()) -> list[set[int]]:
         """Return the placed photos that links connect, the largest group first.
 
         A single link between two groups of photos does not connect them: it may show a distractor, and it
-        gives no scale. It does connect one or two photos with a group.
+        gives no scale. It does connect one or two photos with a group, and parts that several pairs joined.
 
         Args:
             without: photos whose links are not used.
@@ -161,7 +165,7 @@ class Placement:
         photos = sorted(set(self.poses) - set(without))
         at = {photo: k for k, photo in enumerate(photos)}
         links = [(at[a], at[b], n) for (a, b), n in self.links().items() if a in at and b in at]
-        weak = bridges(len(photos), links)
+        weak = {pair for pair in bridges(len(photos), links) if not self._joins(*(photos[k] for k in pair))}
         rows = [(a, b) for a, b, _ in links if (a, b) not in weak]
         ends = tuple(np.array(rows, int).reshape(-1, 2).T)
         graph = coo_array((np.ones(len(rows)), ends), (len(photos), len(photos)))

@@ -180,6 +180,21 @@ def test_only_the_largest_part_that_links_connect_is_kept():
     assert [sorted(other) for other in others] == [[3, 4, 5]] and part.poses.keys() == {0, 1, 2}
 
 
+def test_a_single_link_does_not_connect_two_groups_but_a_photo_with_one():
+    part, _ = parts({(2, 3): None})
+    part.poses = {k: pose(k) for k in range(6)}
+    assert (2, 3) in part.links()
+    assert part.components() == [{0, 1, 2}, {3, 4, 5}]
+    del part.poses[5]
+    assert part.components() == [{0, 1, 2, 3, 4}]  # two photos at the end of a chain
+    part, _ = parts({(2, 3): None, (1, 4): None})
+    part.poses = {k: pose(k) for k in range(6)}
+    assert part.components() == [set(range(6))]
+    part, _ = parts({(2, 3): None})
+    part.poses, part.joined = {k: pose(k) for k in range(6)}, [frozenset(THERE)]
+    assert part.components() == [set(range(6))]
+
+
 def test_little_evidence_is_enough_only_where_nothing_speaks_against_it():
     part, _ = parts({})
     points = PointLookup(part.matched, [np.full(len(POINTS), -1)] * 6, np.zeros((0, 3)), np.zeros(0, int))

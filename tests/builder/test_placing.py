@@ -180,6 +180,9 @@ def test_a_photo_without_a_clear_place_is_named_with_the_reason():
     assert "no placed photo" in str(_reason(nowhere, nowhere, 2))
     assert "only 2 placed photos" in str(_reason(place(2, 0.4), nowhere, 3))
     assert "small part" in str(_reason(place(5, 0.07), nowhere, 2))
+    crowded = Place(np.eye(4)[:3], frozenset(range(5)), 0.25, 0.2)  # as the matches of a distractor are
+    assert "small part" in str(_reason(crowded, nowhere, 2))
+    assert _reason(place(5, 0.25), nowhere, 2) is None
 
 
 def test_only_many_photos_are_adjusted_iteratively():

@@ -152,6 +152,7 @@ def _size(model: Any) -> tuple[int, int]:
 def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> Placement:
     """Place photos from the first model; where it leaves some out, from the others; join their parts."""
     parts: list[Placement] = []
+    started: set[int] = set()  # photos of parts that were placed alone
     for model in models:
         todo = set(range(len(matched.ids))).difference(*(part.poses for part in parts))
         if not todo & matched.poses(model).keys():
@@ -162,6 +163,9 @@ def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[
             part.run()
             parts.append(part)
             for poses in part.apart:
+                if poses.keys() <= started:  # it grew into the photos that it was taken out of
+                    continue
+                started |= poses.keys()
                 waiting.append(Placement(matched.copy(), database, part.model, job["seed"]))
                 waiting[-1].poses = poses
         if len(parts[-1].poses) == len(matched.ids):

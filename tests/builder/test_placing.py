@@ -15,7 +15,8 @@ from ambiguous_wild.builder.adjustment import adjustment_options
 from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placing import Place, Placement, PointLookup, _reason
+from ambiguous_wild.builder.placing import Place, Placement, _reason
+from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError

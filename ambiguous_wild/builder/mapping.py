@@ -39,7 +39,7 @@ def run_mapping(job: MappingJob) -> None:
     if models and not plausible(models[0]):
         matched.distorted = False
         models = _models(job, output, matched)
-    placement = None
+    parts: list[Placement] = []
     if models:
         change = matched.take_cameras(max(models, key=_size))
         rivals = _models(job, output, matched, held=True) if change > FOCAL_DOUBT else []
@@ -52,11 +52,10 @@ def run_mapping(job: MappingJob) -> None:
             models = _models(job, output, matched) or models
         else:
             matched.load_motions(Path(job["motions"]))
-        placement = _placed(job, database, matched, models)
+        parts = _placed(job, database, matched, models)
         if rivals:
             other.load_motions(Path(job["motions"]))
-            placement = max(placement, _placed(job, database, other, rivals), key=_explained)
-    parts = [] if placement is None else [placement, *placement.others]
+            parts = max(parts, _placed(job, database, other, rivals), key=lambda p: _explained(p[0]))
     chosen = parts[job["part"] - 1] if len(parts) >= job["part"] else None
     firm = len(parts[0].poses.keys() - parts[0].provisional) if parts else 0
     if chosen is None or len(chosen.poses) < LEAST_PHOTOS:
@@ -149,8 +148,12 @@ def _size(model: Any) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
-def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> Placement:
-    """Place photos from the first model; where it leaves some out, from the others; join their parts."""
+def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> list[Placement]:
+    """Place photos from the first model; where it leaves some out, from the others; join their parts.
+
+    Returns:
+        The largest part, then those that no photo joins to it.
+    """
     parts: list[Placement] = []
     started: set[int] = set()  # photos of parts that were placed alone
     for model in models:
@@ -184,12 +187,12 @@ def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[
         if len(best.poses) < len(before):  # what was joined did not hold
             best.matched, best.poses, best.joined = cameras, before, []
             best.run()
-    placed = set(best.poses)
+    kept, placed = [best], set(best.poses)
     for other in others:
         if len(other.poses.keys() - placed) >= LEAST_PHOTOS:
-            best.others.append(other)
+            kept.append(other)
             placed |= other.poses.keys()
-    return best
+    return kept
 
 
 def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: bool) -> dict[int, Any]:

@@ -25,6 +25,7 @@ from ambiguous_wild.builder.motions import (
     focal_votes,
     motions_of_pairs,
 )
+from ambiguous_wild.builder.overlap_graph import groups
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 # A match fits within this distance of its epipolar line: a share of the longer side, between bounds in px.
@@ -236,12 +237,8 @@ class Matched:
 
 def largest_group(pairs: Collection[Pair]) -> int:
     """Return the largest number of photos that pairs connect."""
-    if not pairs:
-        return 0
-    ends = np.array(list(pairs)).T
-    count = int(ends.max()) + 1
-    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), (count, count))
-    return int(np.bincount(connected_components(graph, directed=False)[1]).max())
+    count = max((max(pair) for pair in pairs), default=-1) + 1
+    return max(map(len, groups(count, [(a, b, 1) for a, b in pairs])), default=0)
 
 
 def connected_photos(database: Path) -> int:

@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ambiguous_wild.builder.adjustment import adjustment_options, pipeline_options, plausible
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
-from ambiguous_wild.builder.overlap_graph import bridges
+from ambiguous_wild.builder.overlap_graph import bridges, groups
 from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.builder.retrieval import FEW
@@ -88,7 +86,6 @@ class Placement:
         self.hypotheses: dict[int, np.ndarray] = {}  # best pose of photos, those left out among them
         self.apart: list[dict[int, np.ndarray]] = []  # poses of photos that agree among themselves alone
         self.joined: list[frozenset[int]] = []  # photos of parts that were placed alone and then joined
-        self.others: list[Placement] = []  # parts of the capture that no photo joins to this one
         self._use_model(model)
 
     def run(self) -> None:
@@ -111,9 +108,9 @@ class Placement:
         firm = self.components(self.provisional)[:1]
         firm = [part for part in firm if len(part) >= LEAST_PHOTOS]
         self.provisional = set(self.poses).difference(*firm)
+        links = self.links() if self.joined else {}
         for part in self.joined:
-            across = [pair for pair in self.links() if (pair[0] in part) != (pair[1] in part)]
-            if len(across) < FIRMLY_JOINED:
+            if sum((a in part) != (b in part) for a, b in links) < FIRMLY_JOINED:
                 smaller = min(part & self.poses.keys(), self.poses.keys() - part, key=len)
                 self.provisional |= smaller
         for photo in range(len(outs)):
@@ -167,20 +164,14 @@ class Placement:
         at = {photo: k for k, photo in enumerate(photos)}
         links = [(at[a], at[b], n) for (a, b), n in self.links().items() if a in at and b in at]
         weak = {pair for pair in bridges(len(photos), links) if not self._joins(*(photos[k] for k in pair))}
-        rows = [(a, b) for a, b, _ in links if (a, b) not in weak]
-        ends = tuple(np.array(rows, int).reshape(-1, 2).T)
-        graph = coo_array((np.ones(len(rows)), ends), (len(photos), len(photos)))
-        groups = connected_components(graph, directed=False)[1]
-        large = set(np.flatnonzero(np.bincount(groups, minlength=1) >= LEAST_PHOTOS).tolist())
+        parts = [set(part) for part in groups(len(photos), [link for link in links if link[:2] not in weak])]
         for _, a, b in sorted((-n, a, b) for a, b, n in links if (a, b) in weak):
-            first, second = int(groups[a]), int(groups[b])
-            if not {first, second} <= large:
-                kept, gone = (second, first) if second in large else (first, second)
-                groups[groups == gone] = kept
-                if np.count_nonzero(groups == kept) >= LEAST_PHOTOS:
-                    large.add(kept)
-        parts = [{photos[k] for k in np.flatnonzero(groups == g)} for g in np.unique(groups)]
-        return sorted(parts, key=lambda part: (-len(part), min(part)))
+            first, second = (next(part for part in parts if k in part) for k in (a, b))
+            if min(len(first), len(second)) < LEAST_PHOTOS:
+                parts.remove(second)
+                first |= second
+        named = [{photos[k] for k in part} for part in parts]
+        return sorted(named, key=lambda part: (-len(part), min(part)))
 
     def cameras(self) -> list[CameraFact]:
         """Return the focal length of every camera, with its standard deviation if it can be estimated."""

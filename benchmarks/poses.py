@@ -39,6 +39,7 @@ WAYS = ("auto", "thorough", "colmap", "colmap-global")
 KINDS = ("cutouts", "patches")
 TURNED_DEG, MOVED_PERCENT = 1.0, 5.0  # a photo is placed rightly below both
 MOVED_M = 20.0  # the same by GPS, whose own error is several metres in a street
+LEAST_COMPOSITE = 6  # photos: `aw composite` refuses fewer
 COLMAP = """
 import os, sys, zlib, pycolmap
 photos, out, mapper, seed = sys.argv[1:]
@@ -181,8 +182,10 @@ def aw(*words: object, checkout: Path | None = None) -> str:
 
 def capture_of(
     name: str, seed: int, kind: str, every: int, args: argparse.Namespace
-) -> tuple[Path, Callable[[Poses], dict[str, Any]]]:
+) -> tuple[Path, Callable[[Poses], dict[str, Any]]] | None:
     """The raw capture and the comparison with its truth; both are made where they are missing.
+
+    None where too few photos are left to paste on.
 
     Raises:
         AwError: a command failed.
@@ -207,6 +210,8 @@ def capture_of(
     photos = args.out / "photos" / f"{name}{thin}"
     if not photos.is_dir():
         _copy_every(source, photos, every)
+    if kind != "clean" and len(_photos(photos)) < LEAST_COMPOSITE:
+        return None
     if kind == "clean":
         raw = raw if raw.is_dir() else Path(shutil.copytree(photos, raw))
     elif not raw.is_dir():
@@ -364,7 +369,10 @@ def main(words: Sequence[str] | None = None) -> None:
         for way in args.ways:
             kept = args.out / "rows" / f"{capture}-{way}.json"
             if not kept.is_file() and not args.report_only:
-                raw, judge = capture_of(name, seed, kind, every, args)
+                made = capture_of(name, seed, kind, every, args)
+                if made is None:
+                    break
+                raw, judge = made
                 row = build(raw, way, seed, args)
                 model = row.pop("model", None)
                 row |= judge(model_poses(model) if model else {})

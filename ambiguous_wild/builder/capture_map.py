@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambiguous_wild.builder.growth import GrowthForecast
-from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, lay_out, weakly_held
+from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, graph_of, lay_out, weakly_held
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import Model
 
@@ -323,7 +323,7 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
     photos = drawn.photos
     kept = [k for k, photo in enumerate(photos) if photo.kind in ("train", "test")]
     weak_photos = set(weakly_held(kept, links)) if links else set()
-    weak = bridges(len(photos), links)
+    weak = bridges(graph_of(len(photos), links))
     strongest: set[tuple[int, int]] = set()
     of: list[list[Link]] = [[] for _ in photos]
     for link in sorted(links, key=lambda link: (-link[2], link)):

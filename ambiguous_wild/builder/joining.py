@@ -183,7 +183,7 @@ def _depths(
 
 
 def _fitting(first: Placement, moved: Mapping[int, np.ndarray]) -> set[Pair]:
-    """Return the pairs across the parts of which a motion fits."""
+    """Return the pairs across the parts of which a motion fits that is crowded in neither photo."""
     matched: Matched = first.matched
     rays, poses = matched.rays(), {**moved, **first.poses}
     fitting = set()
@@ -191,6 +191,9 @@ def _fitting(first: Placement, moved: Mapping[int, np.ndarray]) -> set[Pair]:
         if not motions or (a in moved) == (b in moved) or not {a, b} <= poses.keys():
             continue
         near = matched.misfit((a, b), poses[a], poses[b], rays) <= ROUGHLY
-        if any(near[motion.matches].mean() >= FITS for motion in motions):
-            fitting.add((a, b))
+        for motion in motions:
+            rows = matched.matches[a, b][motion.matches].T
+            places = (first.place(k, None, {((a, b), 0): row}) for k, row in zip((a, b), rows))
+            if near[motion.matches].mean() >= FITS and not any(place.crowded for place in places):
+                fitting.add((a, b))
     return fitting

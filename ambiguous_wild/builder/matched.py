@@ -25,7 +25,7 @@ from ambiguous_wild.builder.motions import (
     focal_votes,
     motions_of_pairs,
 )
-from ambiguous_wild.builder.overlap_graph import groups
+from ambiguous_wild.builder.overlap_graph import graph_of, groups
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 # A match fits within this distance of its epipolar line: a share of the longer side, between bounds in px.
@@ -238,7 +238,7 @@ class Matched:
 def largest_group(pairs: Collection[Pair]) -> int:
     """Return the largest number of photos that pairs connect."""
     count = max((max(pair) for pair in pairs), default=-1) + 1
-    return max(map(len, groups(count, [(a, b, 1) for a, b in pairs])), default=0)
+    return max(map(len, groups(graph_of(count, pairs))), default=0)
 
 
 def connected_photos(database: Path) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Sequence
 
+import networkx as nx
 import numpy as np
 
 Link = tuple[int, int, int]  # two photos, the lower number first, and their matches
@@ -15,39 +16,20 @@ CLEAR = 0.1  # of the largest distance from the middle: photos nearer to it do n
 SHORTEST, LONGEST = 0.6, 1.8  # length of a link on the layout; 1 = a link with the median number of matches
 
 
-def bridges(
+def graph_of(
     count: int,  # photos
-    links: Iterable[Link],
-) -> set[tuple[int, int]]:
-    """Return the links without which a part falls into two (Tarjan, Information Processing Letters 1974)."""
-    neighbours: list[list[int]] = [[] for _ in range(count)]
-    for a, b, _ in links:
-        neighbours[a].append(b)
-        neighbours[b].append(a)
-    order, lowest = [-1] * count, [0] * count
-    result, clock = set(), 0
-    for root in range(count):
-        if order[root] >= 0:
-            continue
-        stack = [(root, -1, iter(neighbours[root]))]
-        order[root] = lowest[root] = clock
-        clock += 1
-        while stack:
-            photo, parent, rest = stack[-1]
-            other = next(rest, None)
-            if other is None:
-                stack.pop()
-                if parent >= 0:
-                    lowest[parent] = min(lowest[parent], lowest[photo])
-                    if lowest[photo] > order[parent]:
-                        result.add((min(photo, parent), max(photo, parent)))
-            elif order[other] < 0:
-                order[other] = lowest[other] = clock
-                clock += 1
-                stack.append((other, photo, iter(neighbours[other])))
-            elif other != parent:
-                lowest[photo] = min(lowest[photo], order[other])
-    return result
+    links: Iterable[Sequence[int]],
+) -> nx.Graph:
+    """Return the graph of photos and links."""
+    graph = nx.Graph()
+    graph.add_nodes_from(range(count))
+    graph.add_edges_from(link[:2] for link in links)
+    return graph
+
+
+def bridges(graph: nx.Graph) -> set[tuple[int, int]]:
+    """Return the links without which a part falls into two."""
+    return {(min(pair), max(pair)) for pair in nx.bridges(graph)}
 
 
 def weakly_held(
@@ -80,21 +62,9 @@ def best_join(inside: Collection[int], outside: Collection[int], links: Iterable
     return min(nearest, key=lambda pair: (abs(pair[0] - pair[1]), pair))
 
 
-def groups(
-    count: int,  # photos
-    links: Iterable[Link],
-) -> list[list[int]]:
+def groups(graph: nx.Graph) -> list[list[int]]:
     """Return the connected parts, the largest first."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = np.array([link[:2] for link in links], int).reshape(-1, 2)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count))
-    label = connected_components(graph, directed=False)[1]
-    parts: dict[int, list[int]] = {}
-    for photo, number in enumerate(label.tolist()):
-        parts.setdefault(number, []).append(photo)
-    return sorted(parts.values(), key=lambda part: (-len(part), part))
+    return sorted(map(sorted, nx.connected_components(graph)), key=lambda part: (-len(part), part))
 
 
 def lay_out(
@@ -107,7 +77,7 @@ def lay_out(
     side by side, photos without a link in rows below.
     """
     xy = np.zeros((count, 2))
-    parts = groups(count, links)
+    parts = groups(graph_of(count, links))
     right = 0.0
     for part in parts:
         if len(part) > 1:

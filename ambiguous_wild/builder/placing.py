@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import networkx as nx
 import numpy as np
 
 from ambiguous_wild.builder.adjustment import adjustment_options, pipeline_options, plausible
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
-from ambiguous_wild.builder.overlap_graph import bridges, groups
+from ambiguous_wild.builder.overlap_graph import bridges, graph_of, groups
 from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.builder.retrieval import FEW
@@ -66,6 +67,11 @@ class Place:
     def weight(self) -> float:
         """Partners times area, because a distractor may have partners but covers little of the photo."""
         return len(self.partners) * self.area
+
+    @property
+    def crowded(self) -> bool:
+        """Whether the matches are all in a small part of the photo: they may show a distractor."""
+        return self.area < LITTLE_AREA or self.spread < LITTLE_SPREAD
 
 
 class Placement:
@@ -155,7 +161,8 @@ class Placement:
         """Return the placed photos that links connect, the largest group first.
 
         A single link between two groups of photos does not connect them: it may show a distractor, and it
-        gives no scale. It does connect one or two photos with a group, and parts that several pairs joined.
+        gives no scale. Nor does a single photo whose matches with one of them are crowded. A single link does
+        connect one or two photos with a group, and parts that several pairs joined.
 
         Args:
             without: photos whose links are not used.
@@ -163,8 +170,11 @@ class Placement:
         photos = sorted(set(self.poses) - set(without))
         at = {photo: k for k, photo in enumerate(photos)}
         links = [(at[a], at[b], n) for (a, b), n in self.links().items() if a in at and b in at]
-        weak = {pair for pair in bridges(len(photos), links) if not self._joins(*(photos[k] for k in pair))}
-        parts = [set(part) for part in groups(len(photos), [link for link in links if link[:2] not in weak])]
+        graph = graph_of(len(photos), links)
+        weak = {pair for pair in bridges(graph) if not self._joins(*(photos[k] for k in pair))}
+        graph.remove_edges_from(weak)
+        self._cut_crowded(graph, photos)
+        parts = [set(part) for part in groups(graph)]
         for _, a, b in sorted((-n, a, b) for a, b, n in links if (a, b) in weak):
             first, second = (next(part for part in parts if k in part) for k in (a, b))
             if min(len(first), len(second)) < LEAST_PHOTOS:
@@ -172,6 +182,31 @@ class Placement:
                 first |= second
         named = [{photos[k] for k in part} for part in parts]
         return sorted(named, key=lambda part: (-len(part), min(part)))
+
+    def _cut_crowded(self, graph: nx.Graph, photos: Sequence[int]) -> None:
+        """Remove the links of a photo with a group that it alone connects, if they may show a distractor."""
+        rays = self.matched.rays()
+        for k in sorted(nx.articulation_points(graph)):
+            if not graph.degree(k):
+                continue
+            linked = set(graph[k])
+            around = nx.restricted_view(graph, [k], [])
+            sides = [
+                linked & side
+                for side in nx.connected_components(around)
+                if linked & side and len(side) >= LEAST_PHOTOS
+            ]
+            photo = photos[k]
+            evidence = self._judge(photo, self.poses[photo], rays).evidence
+            places = []
+            for side in sides:
+                pairs = {(min(photo, photos[j]), max(photo, photos[j])) for j in side}
+                held = {key: rows for key, rows in evidence.items() if key[0] in pairs}
+                places.append((self.place(photo, self.poses[photo], held), side))
+            places.sort(key=lambda item: -item[0].weight)
+            for place, side in places[1:]:
+                if place.crowded and place.area < AREA_NEW:
+                    graph.remove_edges_from([(k, j) for j in side])
 
     def cameras(self) -> list[CameraFact]:
         """Return the focal length of every camera, with its standard deviation if it can be estimated."""
@@ -259,14 +294,14 @@ class Placement:
             if _turn_deg(place.pose, best.pose) < NEAR_DEG:
                 # It may be the same place, less precise: evidence for both counts for the best only.
                 evidence = {k: rows for k, rows in evidence.items() if k not in best.evidence}
-            elsewhere.append(self._place(photo, place.pose, evidence))
+            elsewhere.append(self.place(photo, place.pose, evidence))
         elsewhere = [place for place in elsewhere if len(place.partners) >= AGREE]
         elsewhere.append(self._rival_by_motions(photo, best.partners))
         return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
 
     def _unopposed(self, photo: int, best: Place, rival: Place, points: PointLookup) -> bool:
         """Tell whether little evidence for a place is enough, because nothing speaks against it."""
-        if rival.partners or best.area < LITTLE_AREA or best.spread < LITTLE_SPREAD:
+        if rival.partners or best.crowded:
             return False
         if len(best.partners) >= AGREE:
             return True
@@ -292,9 +327,9 @@ class Placement:
                 if fits[motion.matches].mean() >= FITS:
                     rows = motion.matches[fits[motion.matches]]
                     evidence[pair, number] = self.matched.matches[pair][rows, pair.index(photo)]
-        return self._place(photo, pose, evidence)
+        return self.place(photo, pose, evidence)
 
-    def _place(
+    def place(
         self, photo: int, pose: np.ndarray | None, evidence: Mapping[tuple[Pair, int], np.ndarray]
     ) -> Place:
         partners = frozenset(a + b - photo for (a, b), _ in evidence)

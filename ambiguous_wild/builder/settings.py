@@ -23,6 +23,7 @@ WIDER = 40  # partners in the second attempt of a photo that was left out
 ENOUGH = 0.9  # placed share that ends the attempts: more pairs seldom place the rest
 HALF = 0.5  # the same of more than `FEW` photos, before all pairs are matched
 MANY_FEATURES = 8000  # of a photo in the last attempt at a small capture, whose photos may overlap little
+RATIO, LOOSE_RATIO = 0.8, 0.9  # of the distances of matches; the second where photos may overlap little
 MOST_FEATURES = 100_000  # largest --max-features; SIFT finds fewer in any photo
 
 
@@ -63,8 +64,9 @@ class SfmPlan:
     """Settings of one attempt; `benchmarks/results/poses.md` compares the plans on real captures."""
 
     name: str  # "fast", "wider" or "thorough"
-    sift: str  # implementation: "opencv", or "colmap", which takes three to five times as long
+    sift: str  # "opencv"; "colmap", three to five times as long; "covariant", twice as long again
     max_features: int  # a photo
+    ratio: float  # largest ratio of the distances to the best and the second best match
     matcher: str  # "exhaustive", "retrieval" or "sequential"
     similar: int  # photos that each is matched with, for "retrieval"
     neighbours: int  # next photos in the order of capture, for "retrieval"
@@ -100,6 +102,7 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
         "fast",
         sift="opencv",
         max_features=settings.max_features,
+        ratio=RATIO,
         matcher=matcher,
         similar=16 if many else 14,
         neighbours=5 if many else 2,
@@ -113,10 +116,12 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
 
 
 def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
+    little = count <= FEW
     return SfmPlan(
         "thorough",
-        sift="colmap",
-        max_features=max(settings.max_features, MANY_FEATURES * (count <= FEW)),
+        sift="covariant" if little else "colmap",
+        max_features=max(settings.max_features, MANY_FEATURES * little),
+        ratio=LOOSE_RATIO if little else RATIO,
         matcher=_matcher(count, settings, EXHAUSTIVE_LIMIT),
         similar=16,
         neighbours=5,

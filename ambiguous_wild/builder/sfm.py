@@ -64,6 +64,7 @@ class MatchJob(TypedDict):
     names: list[str]
     test_names: list[str]
     matcher: str  # of `SfmPlan`, as the two below
+    ratio: float
     similar: int
     neighbours: int
     only: list[str] | None  # names that look for partners; None: all
@@ -273,6 +274,7 @@ def match(
         "names": names,
         "test_names": test_names,
         "matcher": matcher,
+        "ratio": plan.ratio,
         "similar": plan.similar,
         "neighbours": plan.neighbours,
         "only": list(left_out) if left_out is not None else None,

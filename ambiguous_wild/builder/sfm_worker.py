@@ -157,6 +157,7 @@ def run_features(job: FeatureJob) -> None:
     options.num_threads = job["jobs"]
     options.max_image_size = job["max_side"]
     options.sift.max_num_features = job["max_features"]
+    options.sift.estimate_affine_shape = options.sift.domain_size_pooling = job["sift"] == "covariant"
     pycolmap.extract_features(
         job["database"],
         job["photos"],
@@ -193,6 +194,7 @@ def run_matches(job: MatchJob) -> None:
     options.use_gpu = False
     options.num_threads = job["jobs"]
     options.skip_geometric_verification = True
+    options.sift.max_ratio = job["ratio"]
     database = Path(job["database"])
     if job["matcher"] == "exhaustive":
         pycolmap.match_exhaustive(job["database"], matching_options=options)

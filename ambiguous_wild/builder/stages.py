@@ -322,8 +322,8 @@ class Stages:
         left_out = (sorted(earlier.mapping.facts["left_out"]) or None) if earlier else None
         matches = work.run(
             "matches",
-            [features.key, plan.matcher, plan.similar, plan.neighbours, earlier and earlier.matches.key,
-             left_out, settings.seed],
+            [features.key, plan.matcher, plan.ratio, plan.similar, plan.neighbours,
+             earlier and earlier.matches.key, left_out, settings.seed],
             lambda f: match(
                 f, features.folder, facts, settings, plan, self.jobs, self.bar,
                 earlier.matches.folder if earlier else None, left_out, photos=photos,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ SPLITS = 5  # times at most that photos without a link to the others are taken o
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
+UNSURE_DEG = 0.33  # standard deviation of a rotation above which the photo is provisional: 1 degree is three
 ADJUSTMENTS = 3  # joint adjustments at most
 STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
 
@@ -189,31 +191,24 @@ class Placement:
         for k in sorted(nx.articulation_points(graph)):
             if not graph.degree(k):
                 continue
-            linked = set(graph[k])
-            around = nx.restricted_view(graph, [k], [])
-            sides = [
-                linked & side
-                for side in nx.connected_components(around)
-                if linked & side and len(side) >= LEAST_PHOTOS
-            ]
-            photo = photos[k]
+            photo, linked = photos[k], set(graph[k])
             evidence = self._judge(photo, self.poses[photo], rays).evidence
-            places = []
-            for side in sides:
-                pairs = {(min(photo, photos[j]), max(photo, photos[j])) for j in side}
+            sides = []
+            for side in nx.connected_components(nx.restricted_view(graph, [k], [])):
+                pairs = {(min(photo, photos[j]), max(photo, photos[j])) for j in linked & side}
                 held = {key: rows for key, rows in evidence.items() if key[0] in pairs}
-                places.append((self.place(photo, self.poses[photo], held), side))
-            places.sort(key=lambda item: -item[0].weight)
-            for place, side in places[1:]:
-                if place.crowded and place.area < AREA_NEW:
-                    graph.remove_edges_from([(k, j) for j in side])
+                sides.append((self.place(photo, self.poses[photo], held), side))
+            sides.sort(key=lambda item: -item[0].weight)
+            for place, side in sides[1:]:
+                if len(side) >= LEAST_PHOTOS and place.crowded and place.area < AREA_NEW:
+                    graph.remove_edges_from([(k, j) for j in linked & side])
 
     def cameras(self) -> list[CameraFact]:
         """Return the focal length of every camera, with its standard deviation if it can be estimated."""
         numbers: dict[int, list[int]] = {}
         for photo in self.poses:
             numbers.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
-        covariance = self._covariance() if len(self.poses) <= COVARIANCE_LIMIT else None
+        covariance = self._covariance
         facts: list[CameraFact] = []
         for number, photos in numbers.items():
             params = self.model.cameras[number].params
@@ -228,8 +223,24 @@ class Placement:
             )
         return facts
 
+    def name_unsure(self) -> None:
+        """Make photos provisional whose rotation the matches leave open; all, if that holds for most."""
+        if self._covariance is None:
+            return
+        found = {k: self._covariance.get_cam_cov_from_world(self.matched.ids[k]) for k in self.poses}
+        deviations_deg = {
+            k: float(np.degrees(np.sqrt(np.linalg.eigvalsh(np.asarray(both)[:3, :3]).max())))
+            for k, both in found.items()
+            if both is not None  # the first photo is held
+        }
+        unsure = {k for k, deviation in deviations_deg.items() if deviation > UNSURE_DEG}
+        self.provisional |= self.poses.keys() if 2 * len(unsure) > len(deviations_deg) else unsure
+
+    @cached_property
     def _covariance(self) -> Any:
-        """Return the covariance of a joint adjustment of the whole model; None if it is not determined."""
+        """The covariance of a joint adjustment of the whole model; None if it is not determined."""
+        if not LEAST_PHOTOS <= len(self.poses) <= COVARIANCE_LIMIT:
+            return None
         config = pycolmap.BundleAdjustmentConfig()
         for number in self.model.reg_image_ids():
             config.add_image(number)

@@ -145,7 +145,7 @@ class MappingResult(TypedDict):
     parts: list[list[str]]  # work names of parts that no photo joins, the largest first
     firm: int  # photos of the largest part that are not provisional
     cameras: list[CameraFact]
-    plan: str  # "fast", "wider" or "thorough"
+    plan: str  # "fast", "wider", "thorough" or "covariant"
 
 
 def no_model() -> MappingResult:
@@ -200,7 +200,7 @@ class ChosenMethods(TypedDict):
     """The choices that the settings "auto" led to."""
 
     camera: str
-    sfm: str  # "fast", "wider" or "thorough"
+    sfm: str  # "fast", "wider", "thorough" or "covariant"
     matcher: str
     mapper: str
 

@@ -63,8 +63,8 @@ class BuildSettings:
 class SfmPlan:
     """Settings of one attempt; `benchmarks/results/poses.md` compares the plans on real captures."""
 
-    name: str  # "fast", "wider" or "thorough"
-    sift: str  # "opencv"; "colmap", three to five times as long; "covariant", twice as long again
+    name: str  # "fast", "wider", "thorough" or "covariant"
+    sift: str  # "opencv"; "colmap", three to five times as long; "covariant" (affine shape), twice that
     max_features: int  # a photo
     ratio: float  # largest ratio of the distances to the best and the second best match
     matcher: str  # "exhaustive", "retrieval" or "sequential"
@@ -83,16 +83,20 @@ class SfmPlan:
 def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPlan]:
     """Return the attempts in order; each next one runs if the one before leaves photos out."""
     thorough = _thorough(len(photos), settings)
+    # Other features find other pairs: a capture that one kind leaves in parts may be whole by the other.
+    covariant = replace(thorough, name="covariant", sift="covariant", ratio=LOOSE_RATIO, below=ENOUGH)
+    careful = [thorough, covariant] if len(photos) <= FEW else [thorough]
     if settings.sfm == "thorough":
-        return [thorough]
+        return careful
     fast = _fast(photos, settings)
     if settings.sfm == "fast":
         return [fast]
     fast = replace(fast, worth=HALF)
     if fast.matcher != "retrieval":
-        return [fast, thorough]
+        return [fast, *careful]
     wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True, below=ENOUGH)
-    return [fast, wider, replace(thorough, below=ENOUGH if len(photos) <= FEW else HALF)]
+    below = ENOUGH if len(photos) <= FEW else HALF
+    return [fast, wider, replace(thorough, below=below), *careful[1:]]
 
 
 def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
@@ -116,12 +120,11 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
 
 
 def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
-    little = count <= FEW
     return SfmPlan(
         "thorough",
-        sift="covariant" if little else "colmap",
-        max_features=max(settings.max_features, MANY_FEATURES * little),
-        ratio=LOOSE_RATIO if little else RATIO,
+        sift="colmap",
+        max_features=max(settings.max_features, MANY_FEATURES * (count <= FEW)),
+        ratio=RATIO,
         matcher=_matcher(count, settings, EXHAUSTIVE_LIMIT),
         similar=16,
         neighbours=5,

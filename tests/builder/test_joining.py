@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.builder.joining import Similarity, join
 from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.motions import Motion
-from ambiguous_wild.builder.placing import Place, Placement, centre_of
+from ambiguous_wild.builder.placing import Place, Placement, _cells, centre_of
 from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -65,6 +65,7 @@ def parts(across: dict[tuple[int, int], np.ndarray | None], bend: float = 1.0) -
         part.pairs = [[p for p in matches if k in p] for k in range(6)]
         part.poses = {k: poses[k] for k in photos}
         part.model = SimpleNamespace(points3D={})
+        part.cells = [_cells(xy, WIDTH, HEIGHT) for xy in pixels]
         found.append(part)
     back = Similarity(1 / WORLD.scale, WORLD.rotation.T, -WORLD.rotation.T @ WORLD.shift / WORLD.scale)
     for part in found:
@@ -194,6 +195,46 @@ def test_a_single_link_does_not_connect_two_groups_but_a_photo_with_one():
     part, _ = parts({(2, 3): None})
     part.poses, part.joined = {k: pose(k) for k in range(6)}, [frozenset(THERE)]
     assert part.components() == [set(range(6))]
+
+
+@pytest.mark.parametrize(("most", "whole"), [(None, True), (2, False)])
+def test_a_photo_connects_two_groups_only_if_its_matches_are_not_crowded(most, whole):
+    """Photo 2 alone has links to the other group: with all its matches, or with those in one corner."""
+    part, _ = parts({(2, 3): None, (2, 4): None, (2, 5): None})
+    part.poses = {k: pose(k) for k in range(6)}
+    for other in THERE:
+        pixels = part.matched.features[2][part.matched.matches[2, other][:, 0]]
+        rows = np.argsort(pixels.sum(axis=1))[:most]
+        motion = part.matched.motions[2, other][0]
+        part.matched.motions[2, other] = [replace(motion, matches=rows)]
+    assert part.components() == ([set(range(6))] if whole else [{0, 1, 2}, {3, 4, 5}])
+
+
+def test_pairs_whose_matches_are_crowded_join_no_parts():
+    first, second = parts({(2, 3): None, (1, 4): None})
+    for (a, b), (motion,) in first.matched.motions.items():
+        if (a, b) in ((2, 3), (1, 4)):
+            pixels = first.matched.features[a][first.matched.matches[a, b][:, 0]]
+            rows = np.argsort(pixels.sum(axis=1))[:4]
+            first.matched.motions[a, b] = [replace(motion, matches=rows)]
+    assert not join(first, second)
+
+
+def test_photos_are_provisional_whose_rotation_the_matches_leave_open():
+    def covariance(deviations_deg: list[float | None]) -> SimpleNamespace:
+        found = [None if d is None else np.diag([np.radians(d) ** 2] * 3 + [1.0] * 3) for d in deviations_deg]
+        return SimpleNamespace(get_cam_cov_from_world=lambda number: found[number - 1])
+
+    for deviations_deg, named in (
+        ([None, 0.1, 0.5], {2}),  # the first photo is held
+        ([None, 0.1, 0.1], set()),
+        ([None, 0.5, 0.5], {0, 1, 2}),  # most: the others are no better known
+    ):
+        part, _ = parts({})
+        part.provisional = set()
+        part._covariance = covariance(deviations_deg)
+        part.name_unsure()
+        assert part.provisional == named
 
 
 def test_little_evidence_is_enough_only_where_nothing_speaks_against_it():

@@ -26,6 +26,8 @@ def attempts(
     def attempt(self: Stages, work: Any, screened: Any, masks: Any, plan: Any, before: Any) -> SfmStages:
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
+        if plan.name not in placed:  # it places nothing
+            placed[plan.name] = 0
         model = {"images": placed[plan.name], "points": 9999} if placed[plan.name] else None
         facts = {"model": model, "plan": plan.name, "fixed": [], "firm": (firm or placed)[plan.name]}
         facts["parts"] = [["p.jpg"] * placed[plan.name]]
@@ -47,26 +49,26 @@ def test_fast_is_enough_where_it_places_everything(monkeypatch):
     ("fast", "wider", "thorough", "tried", "chosen"),
     [
         (20, 28, 30, 2, "wider"),
-        (26, 25, 20, 3, "fast"),
+        (26, 25, 20, 4, "fast"),
         (28, 30, 30, 1, "fast"),  # two of thirty may have no clear place
-        (26, 26, 26, 3, "thorough"),  # of equal ones the later
-        (0, 14, 12, 3, "wider"),
+        (26, 26, 26, 4, "thorough"),  # of equal ones the later
+        (0, 14, 12, 4, "wider"),
         (0, 14, 28, 3, "thorough"),
     ],
 )
 def test_the_attempt_that_places_more_is_kept(monkeypatch, fast, wider, thorough, tried, chosen):
     """All pairs are matched only if less than nine tenths are placed."""
     names, kept = attempts(monkeypatch, {"fast": fast, "wider": wider, "thorough": thorough}, 30)
-    assert names == ["fast", "wider", "thorough"][:tried] and kept == chosen
+    assert names == ["fast", "wider", "thorough", "covariant"][:tried] and kept == chosen
 
 
 def test_photos_placed_without_doubt_count_first(monkeypatch):
-    placed, firm = {"fast": 10, "thorough": 12}, {"fast": 10, "thorough": 3}
+    placed, firm = {"fast": 20, "thorough": 23}, {"fast": 20, "thorough": 3}
     assert attempts(monkeypatch, placed, 25, firm) == (["fast", "thorough"], "fast")
 
 
 def test_nothing_is_mapped_where_pairs_connect_too_few_photos(tmp_path):
-    plan = SfmPlan("fast", "opencv", 3000, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4, worth=0.5)
+    plan = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4, worth=0.5)
     settings, bar = BuildSettings(), Bar(enabled=False)
     result = sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 4, settings, plan, 1, bar)
     assert result["model"] is None and result["parts"] == [] and result["plan"] == "fast"
@@ -82,6 +84,11 @@ def test_all_pairs_of_many_photos_are_matched_only_if_less_than_half_is_placed(m
 
 def test_few_photos_are_matched_thoroughly_at_once(monkeypatch):
     assert attempts(monkeypatch, {"fast": 20, "thorough": 24}, 25) == (["fast", "thorough"], "thorough")
+
+
+def test_other_features_are_tried_where_the_careful_ones_leave_over_a_tenth_out(monkeypatch):
+    placed = {"fast": 8, "thorough": 13, "covariant": 16}
+    assert attempts(monkeypatch, placed, 16) == (["fast", "thorough", "covariant"], "covariant")
 
 
 def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):
@@ -105,7 +112,7 @@ def test_photos_that_are_left_out_look_for_more_partners(monkeypatch, tmp_path):
     """Pairs that are matched already stay, and are not matched again."""
     write_capture(tmp_path / "raw", 8)
     # a partner each: the photos do not chain
-    fast = SfmPlan("fast", "opencv", 3000, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4)
+    fast = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4)
     wider = dataclasses.replace(fast, name="wider", similar=7, continues=True)
     monkeypatch.setattr(stages, "plans", lambda photos, settings: [fast, wider])
     info = build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(factor=2), jobs=2).info

@@ -24,7 +24,7 @@ from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 
 
@@ -35,8 +35,12 @@ def costs(path: Path, rounds: int, steps: int = 5) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         data = small_data(scene, Path(name))
         config = TrainConfig(iterations=30_000, probes=0)
-        ways = {"off": Parts(), "off again": Parts(), "idle effect": Parts(effects=(Effect(),))}
-        ways |= {effect: with_effects(Parts(), (effect,)) for effect in ALL}
+        ways = {
+            "off": MethodHooks(),
+            "off again": MethodHooks(),
+            "idle effect": MethodHooks(effects=(Effect(),)),
+        }
+        ways |= {effect: with_effects(MethodHooks(), (effect,)) for effect in ALL}
         trainers = {n: Trainer(data, parts, config, folder=Path(name) / n) for n, parts in ways.items()}
         times: dict[str, list[float]] = {n: [] for n in ways}
         for turn in range(rounds + 2):

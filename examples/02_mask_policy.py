@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.step import Step
 
 
@@ -34,6 +34,6 @@ class TrimmedMask(MaskPolicy):
         return (smooth <= torch.quantile(smooth, self.config.share)).float()  # 1 = static, 0 = distractor
 
 
-def trimmed(config: Config) -> Parts:
+def trimmed(config: Config) -> MethodHooks:
     """The rest of the loop is that of 3DGS."""
-    return Parts(mask=TrimmedMask(config))
+    return MethodHooks(mask=TrimmedMask(config))

@@ -13,7 +13,7 @@ import torch
 
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
 from ambiguous_wild.splat.field import GaussianAttribute
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 
 LAMPS = 2
 
@@ -37,6 +37,6 @@ class Lamps(Learnt):
         return visible.base * (1.0 + light)
 
 
-def lamps() -> Parts:
+def lamps() -> MethodHooks:
     """The rest of the loop is that of 3DGS."""
-    return Parts(effects=(Lamps(),))
+    return MethodHooks(effects=(Lamps(),))

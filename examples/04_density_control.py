@@ -12,7 +12,7 @@ per Gaussian, carried through growth and pruning, and saved in checkpoints.
 import torch
 
 from ambiguous_wild.splat.density import DensityControl, Growth, largest
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 
 
 class ByPixels(DensityControl):
@@ -38,6 +38,6 @@ class ByPixels(DensityControl):
         return Growth(clones, splits)
 
 
-def by_pixels() -> Parts:
+def by_pixels() -> MethodHooks:
     """The rest of the loop is that of 3DGS."""
-    return Parts(density=ByPixels)
+    return MethodHooks(density=ByPixels)

@@ -13,7 +13,7 @@ import torch
 
 from ambiguous_wild.splat.fields import STATIC, Fields, FieldStart, over
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 
 SIDE, DEPTH, COVER = 24, 0.1, 0.1  # grid of Gaussians; distance from the camera; price of a covered pixel
@@ -47,6 +47,6 @@ class ViewLayers(Fields):
         return {str(shot.view): Cotangents(alpha=torch.full_like(alpha, COVER / alpha.numel()))}
 
 
-def view_layers() -> Parts:
+def view_layers() -> MethodHooks:
     """The rest of the loop is that of 3DGS."""
-    return Parts(fields=ViewLayers())
+    return MethodHooks(fields=ViewLayers())

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step
 
@@ -29,5 +29,5 @@ class Smooth(MaskPolicy):
         return Cotangents(image=torch.autograd.grad(self.config.weight * variation, image)[0])
 
 
-def smooth(config: Config) -> Parts:
-    return Parts(mask=Smooth(config))
+def smooth(config: Config) -> MethodHooks:
+    return MethodHooks(mask=Smooth(config))

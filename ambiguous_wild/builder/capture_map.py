@@ -17,7 +17,7 @@ import numpy as np
 from ambiguous_wild.builder.growth import GrowthForecast
 from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, graph_of, lay_out, weakly_held
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.colmap_records import ColmapModel
 
 MOST_POINTS = 5000  # of the backdrop
 STRONGEST = 4  # links drawn of each photo, besides the weak ones
@@ -80,7 +80,7 @@ class CaptureMap:
 
 
 def map_of_model(
-    model: Model,  # named by work names
+    model: ColmapModel,  # named by work names
     mapping: Mapping[str, Any],  # `MappingResult`; what it lacks is not drawn
     sources: Mapping[str, str],  # work name -> path in the capture, in the order of capture
     tests: Collection[str],  # work names

@@ -51,7 +51,7 @@ FORWARD = 0.8
 
 
 @dataclass(frozen=True)
-class Check:
+class CaptureCheck:
     """Result of one check."""
 
     name: str
@@ -68,7 +68,7 @@ def run_checks(
     compared: PhotoComparison,
     growth: GrowthForecast,
     gaps: Sequence[tuple[int, int]],  # of `joins`
-) -> list[Check]:
+) -> list[CaptureCheck]:
     """Run all checks, in the order of the table."""
     return [
         exposure(facts, compared),
@@ -84,7 +84,7 @@ def run_checks(
     ]
 
 
-def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Compare exposure settings in stops, and the brightness of the same surfaces."""
     advice = "lock exposure (hold the finger on the screen: AE/AF lock), or train with an appearance model"
     stops = [exposure_stops(f["exif"]) for f in facts]
@@ -92,30 +92,32 @@ def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
     if all(s is not None for s in stops):
         span = max(s for s in stops if s is not None) - min(s for s in stops if s is not None)
         if span <= EXIF_STOPS:
-            return Check("exposure", "ok", "EXIF", f"locked: settings span {span:.1f} stops")
+            return CaptureCheck("exposure", "ok", "EXIF", f"locked: settings span {span:.1f} stops")
         if spread is None:
-            return Check("exposure", "warning", "EXIF", f"drifts: settings span {span:.1f} stops", advice)
+            return CaptureCheck(
+                "exposure", "warning", "EXIF", f"drifts: settings span {span:.1f} stops", advice
+            )
         # Settings may follow the light, as under clouds; only a surface that changes brightness is harmful.
         finding = f"automatic: settings span {span:.1f} stops, the same surfaces differ by {spread:.1f}"
         return _row("exposure", "EXIF and pixels", spread > PIXEL_STOPS, finding, advice)
     if spread is None:
-        return Check(
+        return CaptureCheck(
             "exposure", "unknown", _silent(facts, stops), "no two photos share enough surface to measure it"
         )
     finding = f"the same surfaces differ by {spread:.1f} stops"
     return _row("exposure", _basis(stops), spread > PIXEL_STOPS, finding, advice)
 
 
-def white_balance(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+def white_balance(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Check that white balance is locked: by EXIF if manual in every photo, else on the same surfaces."""
     advice = "lock white balance (manual, or a fixed preset), or train with an appearance model"
     modes = [f["exif"].get("white_balance") for f in facts]
     if all(m == 1 for m in modes):
-        return Check("white balance", "ok", "EXIF", "manual in every photo")
+        return CaptureCheck("white balance", "ok", "EXIF", "manual in every photo")
     source = "EXIF: automatic" if any(m == 0 for m in modes) else "EXIF silent"
     red, blue = _spread(compared, 1), _spread(compared, 2)
     if red is None or blue is None:
-        return Check(
+        return CaptureCheck(
             "white balance", "unknown", source, "no two photos share enough surface to measure it", advice
         )
     worst = 100 * (2 ** max(red, blue) - 1)
@@ -123,7 +125,7 @@ def white_balance(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> C
     return _row("white balance", f"pixels ({source})", max(red, blue) > PIXEL_BALANCE, finding, advice)
 
 
-def iso(facts: Sequence[CheckedPhoto]) -> Check:
+def iso(facts: Sequence[CheckedPhoto]) -> CaptureCheck:
     """Compare ISO by EXIF; without EXIF report the noise of flat areas."""
     advice = "fix ISO (pro mode), as low as the light allows"
     values = [f["exif"].get("iso") for f in facts]
@@ -137,28 +139,30 @@ def iso(facts: Sequence[CheckedPhoto]) -> Check:
         return _row("ISO", "EXIF", max(recorded) > ISO_RATIO * min(recorded), finding, advice)
     noise = np.array([f["noise"] for f in facts])
     if not np.isfinite(noise).any() or np.nanmedian(noise) <= 0:
-        return Check("ISO", "unknown", _silent(facts, values), "no flat areas in which to measure noise")
+        return CaptureCheck(
+            "ISO", "unknown", _silent(facts, values), "no flat areas in which to measure noise"
+        )
     low, high = np.nanpercentile(noise, [5, 95])
     finding = f"not recorded; noise of flat areas {low:.1f} to {high:.1f} of 255"
     # Texture and compression look like noise, so this is not certain enough for a warning.
-    return Check("ISO", "unknown", "pixels (EXIF silent)", finding, "")
+    return CaptureCheck("ISO", "unknown", "pixels (EXIF silent)", finding, "")
 
 
-def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Compare fine detail of the same surfaces across photos; EXIF does not record the focus."""
     spread = _spread(compared, 3)
     if spread is None:
-        return Check("focus", "unknown", "pixels", "no two photos share enough surface to measure it")
+        return CaptureCheck("focus", "unknown", "pixels", "no two photos share enough surface to measure it")
     finding = f"fine detail of the same surfaces differs by a factor of {2**spread:.1f}"
     return _row(
         "focus", "pixels", spread > FOCUS_SPREAD, finding, "lock focus (AE/AF lock), keep one distance"
     )
 
 
-def focal_length(facts: Sequence[CheckedPhoto]) -> Check:
+def focal_length(facts: Sequence[CheckedPhoto]) -> CaptureCheck:
     """Check for one focal length per camera and one picture size, as a single-camera model assumes."""
     if wide := panorama_warnings(facts):
-        return Check("focal length", "warning", "picture size", wide[0])
+        return CaptureCheck("focal length", "warning", "picture size", wide[0])
     advice = "do not zoom; or build with --camera per-image"
     spans = []
     for camera in sorted({f["camera"] or "" for f in facts}):
@@ -168,7 +172,7 @@ def focal_length(facts: Sequence[CheckedPhoto]) -> Check:
         if values and max(values) > FOCAL_RATIO * min(values):
             spans.append(f"{camera or 'camera'}: {min(values):.1f} to {max(values):.1f} mm")
     if spans:
-        return Check("focal length", "warning", "EXIF", shortlist(spans, 3), advice)
+        return CaptureCheck("focal length", "warning", "EXIF", shortlist(spans, 3), advice)
     silent = [f["source"] for f in facts if "focal_mm" not in f["exif"]]
     sizes = len({(f["width"], f["height"]) for f in facts})
     cameras = len({f["camera"] for f in facts if f["camera"]})
@@ -176,13 +180,13 @@ def focal_length(facts: Sequence[CheckedPhoto]) -> Check:
     if silent:
         state: State = "warning" if sizes > 2 else "unknown"
         what = f"not recorded in {len(silent)} of {len(facts)} photos{several}"
-        return Check(
+        return CaptureCheck(
             "focal length", state, "EXIF silent", what, "build with --camera per-image" if sizes > 2 else ""
         )
-    return Check("focal length", "ok", "EXIF", f"one per camera ({cameras or 1}){several}")
+    return CaptureCheck("focal length", "ok", "EXIF", f"one per camera ({cameras or 1}){several}")
 
 
-def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
+def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Find photos much softer than the median, or softer than others on the same surfaces."""
     sharp = np.array([f["blur"] for f in facts])
     soft = sharp < BLUR_RATIO * np.median(sharp)
@@ -199,7 +203,7 @@ def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Check:
     )
 
 
-def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Check:
+def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> CaptureCheck:
     """Find pairs of photos that are nearly the same picture."""
     close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
     pairs = [(facts[i]["source"], facts[j]["source"]) for i, j in np.argwhere(close)]
@@ -221,18 +225,18 @@ def overlap(
     compared: PhotoComparison,
     growth: GrowthForecast,
     gaps: Sequence[tuple[int, int]],  # of `joins`
-) -> Check:
+) -> CaptureCheck:
     """Predict how many photos will be placed, and name those that share too little with the others."""
     names, count = [f["source"] for f in facts], len(facts)
     if not growth.parts:
         finding = "no three photos share enough features: none will be placed"
         advice = "take more photos, each sharing two thirds of the picture with the next"
-        return Check("overlap", "warning", "pixels", finding, advice, tuple(names))
+        return CaptureCheck("overlap", "warning", "pixels", finding, advice, tuple(names))
     main = growth.parts[0]
     if len(main) == count:
         median = float(np.median(compared.partners))
         finding = f"each overlaps with {median:.0f} others (median); all {count} photos will be placed"
-        return Check("overlap", "ok", "pixels", finding)
+        return CaptureCheck("overlap", "ok", "pixels", finding)
     finding = f"about {len(main)} of {count} photos will be placed"
     if len(growth.parts) > 1:
         finding += f"; parts: {', '.join(str(len(part)) for part in growth.parts)}"
@@ -242,22 +246,22 @@ def overlap(
     pairs = [f"{names[a]} and {names[b]}" for a, b in gaps]
     advice = f"take 2 or 3 photos between {shortlist(pairs, 3)}"
     outside = tuple(names[k] for k in range(count) if k not in main)
-    return Check("overlap", "warning", "pixels", finding, advice, outside)
+    return CaptureCheck("overlap", "warning", "pixels", finding, advice, outside)
 
 
-def motion(compared: PhotoComparison) -> Check:
+def motion(compared: PhotoComparison) -> CaptureCheck:
     """Find motion along the viewing direction: such photos overlap but give little parallax."""
     if math.isnan(compared.forward):
-        return Check("motion", "unknown", "pixels", "no two photos overlap enough to measure it")
+        return CaptureCheck("motion", "unknown", "pixels", "no two photos overlap enough to measure it")
     finding = f"{100 * compared.forward:.0f} % of overlapping pairs differ by motion along the line of sight"
     advice = "walk sideways or around the subject too: motion along the line of sight leaves depth imprecise"
     return _row("motion", "pixels", compared.forward > FORWARD, finding, advice)
 
 
-def fixed_to_camera(compared: PhotoComparison) -> Check:
+def fixed_to_camera(compared: PhotoComparison) -> CaptureCheck:
     """Find what stands still in the photos while the rest moves: a bonnet, a rig, a watermark."""
     if not compared.fixed:
-        return Check("fixed to camera", "ok", "pixels", "nothing stands still while the rest moves")
+        return CaptureCheck("fixed to camera", "ok", "pixels", "nothing stands still while the rest moves")
     shown = "; ".join(
         words_of(area.share, area.where())
         + (f" of {area.size[0]}x{area.size[1]}" if len(compared.fixed) > 1 else "")
@@ -265,11 +269,13 @@ def fixed_to_camera(compared: PhotoComparison) -> Check:
     )
     finding = f"{shown} stands still while the rest moves"
     advice = "aw build-scene masks it; take the photos without it (a bonnet, a rig, a stamp) if you can"
-    return Check("fixed to camera", "warning", "pixels", finding, advice)
+    return CaptureCheck("fixed to camera", "warning", "pixels", finding, advice)
 
 
-def _row(name: str, basis: str, bad: bool, finding: str, advice: str, photos: tuple[str, ...] = ()) -> Check:
-    return Check(name, "warning" if bad else "ok", basis, finding, advice if bad else "", photos)
+def _row(
+    name: str, basis: str, bad: bool, finding: str, advice: str, photos: tuple[str, ...] = ()
+) -> CaptureCheck:
+    return CaptureCheck(name, "warning" if bad else "ok", basis, finding, advice if bad else "", photos)
 
 
 def _spread(compared: PhotoComparison, quantity: int) -> float | None:
@@ -298,14 +304,14 @@ class CaptureReport:
     root: Path
     photos: int  # readable photos
     skipped: list[SkippedPhoto]  # unreadable files and copies
-    checks: list[Check]
+    checks: list[CaptureCheck]
     sources: list[str]  # of the readable photos, in the order of capture
     links: list[Link]  # photos that overlap
     growth: GrowthForecast
     gaps: list[tuple[int, int]]  # photos between which more are needed
 
     @property
-    def warnings(self) -> list[Check]:
+    def warnings(self) -> list[CaptureCheck]:
         """The checks that failed."""
         return [c for c in self.checks if c.state == "warning"]
 
@@ -347,12 +353,12 @@ def check_capture(
     return CaptureReport(capture.root, len(facts), read.skipped, checks, names, compared.links, growth, gaps)
 
 
-def _files_check(skipped: list[SkippedPhoto], total: int) -> Check:
+def _files_check(skipped: list[SkippedPhoto], total: int) -> CaptureCheck:
     """Return the failed check of a capture with photos that are left out."""
     reasons = shortlist((f"{s['source']} ({s['skipped']})" for s in skipped), 3)
     finding = f"{len(skipped)} of {total} photos are left out: {reasons}"
     names = tuple(s["source"] for s in skipped)
-    return Check("files", "warning", "files", finding, "repair or remove them", names)
+    return CaptureCheck("files", "warning", "files", finding, "repair or remove them", names)
 
 
 def refuse_failed(report: CaptureReport) -> None:

@@ -31,7 +31,7 @@ _MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the u
 
 
 @dataclass(frozen=True)
-class Source:
+class PhotoSource:
     """One photo of the capture and the name it has in the scene."""
 
     path: Path  # absolute
@@ -52,7 +52,7 @@ class Capture:
     """The user's folders of photos; they are not changed."""
 
     root: Path  # the folder, or the parent of several folders
-    sources: tuple[Source, ...]  # natural order of their relative names
+    sources: tuple[PhotoSource, ...]  # natural order of their relative names
     has_sides: bool  # the photos are in train/ and test/
     truth: Path | None  # truth/ of a simulated capture
     ignored: tuple[str, ...]  # names of other files
@@ -100,7 +100,7 @@ def collect(
         digests = list(pool.map(lambda item: sha256_file(item[0]), files))
     stems = _unique_stems(files, labels)
     sources = tuple(
-        Source(path, path.relative_to(root).as_posix(), stem, side, digest, label)
+        PhotoSource(path, path.relative_to(root).as_posix(), stem, side, digest, label)
         for (path, side), stem, digest, label in zip(files, stems, digests, labels, strict=True)
     )
     truth = root / "truth"

@@ -140,7 +140,7 @@ def words_of(share: float, where: str) -> str:
 
 
 @dataclass
-class _Evidence:
+class _MatchCounts:
     """Counts of matches by cell, over the pairs that move: [h, w] each."""
 
     still: np.ndarray
@@ -221,7 +221,7 @@ def _of_group(
 
 def _count(
     pairs: Mapping[Pair, tuple[np.ndarray, np.ndarray]], size: tuple[int, int], photos: int
-) -> _Evidence:
+) -> _MatchCounts:
     """Count the matches of every cell by their displacement, over the pairs that move."""
     side = max(size)
     width, height = (int(np.ceil(CELLS * length / side - 1e-9)) for length in size)
@@ -242,7 +242,7 @@ def _count(
     counts[3] /= 2  # both ends of a match that moves were counted
     still_count, near_count, slow_count, moving_count = counts.reshape(4, height, width)
     by_photo = shown.reshape(photos, height, width)
-    return _Evidence(still_count, near_count, slow_count, moving_count, by_photo)
+    return _MatchCounts(still_count, near_count, slow_count, moving_count, by_photo)
 
 
 def still_px(size: tuple[int, int]) -> float:
@@ -250,7 +250,7 @@ def still_px(size: tuple[int, int]) -> float:
     return STILL_PX * max(1.0, max(size) / STILL_SIDE)
 
 
-def _fixed_cells(evidence: _Evidence) -> np.ndarray:
+def _fixed_cells(evidence: _MatchCounts) -> np.ndarray:
     """Return the cells [h, w] bool that stay while the rest moves; each counts with its eight neighbours."""
     still, near, slow, moving = (
         _around(x) for x in (evidence.still, evidence.near, evidence.slow, evidence.moving)
@@ -270,7 +270,7 @@ def _around(counts: np.ndarray) -> np.ndarray:
     return cv2.boxFilter(counts, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
-def _moves_around(cells: np.ndarray, evidence: _Evidence) -> bool:
+def _moves_around(cells: np.ndarray, evidence: _MatchCounts) -> bool:
     """Tell whether the matches around an area move as the scene does, and not a little only."""
     near = cv2.dilate(cells.astype(np.uint8), _disc(RING)) > 0
     ring = near & ~(cv2.dilate(cells.astype(np.uint8), _disc(1)) > 0)
@@ -278,7 +278,7 @@ def _moves_around(cells: np.ndarray, evidence: _Evidence) -> bool:
     return slow + moving < RING_MATCHES or slow <= SLOW_RING * (slow + moving)
 
 
-def _moving_cells(evidence: _Evidence) -> np.ndarray:
+def _moving_cells(evidence: _MatchCounts) -> np.ndarray:
     """Return the cells [h, w] bool whose matches move."""
     still, moving = _around(evidence.still), _around(evidence.moving)
     return (moving >= MOVING_CELL) & (still < FIXED_SHARE * (still + moving))

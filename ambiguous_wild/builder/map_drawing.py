@@ -23,7 +23,7 @@ from ambiguous_wild.builder.capture_map import (
 )
 from ambiguous_wild.builder.records import MappingResult, MapResult
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import atomic_path, check_output
 from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
 
@@ -52,7 +52,7 @@ COLOURS: dict[Kind, tuple[int, int, int]] = {
 
 def draw_built(
     folder: Path,
-    model: Model,
+    model: ColmapModel,
     mapping: MappingResult,
     sources: Mapping[str, str],
     tests: Collection[str],

@@ -56,7 +56,7 @@ STILL = 2e-3  # share of changed observations that ends them, and share of moved
 
 
 @dataclass(frozen=True)
-class Place:
+class PoseHypothesis:
     """A possible pose of a photo, and the evidence for it."""
 
     pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
@@ -88,7 +88,7 @@ class Placement:
                 self.pairs[photo].append(pair)
         self.cells = [_cells(f, c.width, c.height) for f, c in zip(matched.features, matched.cameras)]
         self.poses: dict[int, np.ndarray] = {}  # photo -> [3, 4] camera from world
-        self.places: dict[int, Place] = {}  # of the placed photos
+        self.places: dict[int, PoseHypothesis] = {}  # of the placed photos
         self.left_out: dict[int, str] = {}  # photo -> reason
         self.provisional: set[int] = set()  # placed photos with little evidence
         self.hypotheses: dict[int, np.ndarray] = {}  # best pose of photos, those left out among them
@@ -292,11 +292,11 @@ class Placement:
 
     def _best(
         self, photo: int, now: np.ndarray | None, rays: Sequence[np.ndarray], points: PointLookup
-    ) -> tuple[Place, Place]:
+    ) -> tuple[PoseHypothesis, PoseHypothesis]:
         """Return the place with most weight, and the strongest place elsewhere."""
         places = [] if now is None else [self._judge(photo, now, rays)]
         places += [self._judge(photo, pose, rays) for pose in self.resections(photo, points)]
-        best = max(places, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
+        best = max(places, key=lambda place: place.weight, default=PoseHypothesis(None, frozenset(), 0.0))
         elsewhere = []
         for place in places:
             if place is best or self._same(place.pose, best.pose):
@@ -308,9 +308,13 @@ class Placement:
             elsewhere.append(self.place(photo, place.pose, evidence))
         elsewhere = [place for place in elsewhere if len(place.partners) >= AGREE]
         elsewhere.append(self._rival_by_motions(photo, best.partners))
-        return best, max(elsewhere, key=lambda place: place.weight, default=Place(None, frozenset(), 0.0))
+        return best, max(
+            elsewhere, key=lambda place: place.weight, default=PoseHypothesis(None, frozenset(), 0.0)
+        )
 
-    def _unopposed(self, photo: int, best: Place, rival: Place, points: PointLookup) -> bool:
+    def _unopposed(
+        self, photo: int, best: PoseHypothesis, rival: PoseHypothesis, points: PointLookup
+    ) -> bool:
         """Tell whether little evidence for a place is enough, because nothing speaks against it."""
         if rival.partners or best.crowded:
             return False
@@ -325,7 +329,7 @@ class Placement:
         off = np.linalg.norm(pixels - self.matched.features[photo][features[front]], axis=1)
         return bool(np.count_nonzero(off < RESECTION_PX) >= LEAST_POINTS)
 
-    def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> Place:
+    def _judge(self, photo: int, pose: np.ndarray, rays: Sequence[np.ndarray]) -> PoseHypothesis:
         """Score a pose hypothesis: a placed photo supports it if most matches of a relative pose fit."""
         evidence = {}
         for pair in self.pairs[photo]:
@@ -342,12 +346,12 @@ class Placement:
 
     def place(
         self, photo: int, pose: np.ndarray | None, evidence: Mapping[tuple[Pair, int], np.ndarray]
-    ) -> Place:
+    ) -> PoseHypothesis:
         partners = frozenset(a + b - photo for (a, b), _ in evidence)
         rows = list(evidence.values())
-        return Place(pose, partners, self._area(photo, rows), self._spread(photo, rows), evidence)
+        return PoseHypothesis(pose, partners, self._area(photo, rows), self._spread(photo, rows), evidence)
 
-    def _rival_by_motions(self, photo: int, agree: frozenset[int]) -> Place:
+    def _rival_by_motions(self, photo: int, agree: frozenset[int]) -> PoseHypothesis:
         """Return the place that most other placed partners imply, by motions that turn the photo alike."""
         owners, turns, rows = [], [], []
         for pair in self.pairs[photo]:
@@ -360,13 +364,13 @@ class Placement:
                     turns.append((rotation if pair[1] == photo else rotation.T) @ self.poses[other][:, :3])
                     rows.append(self.matched.matches[pair][motion.matches, pair.index(photo)])
         if not owners:
-            return Place(None, frozenset(), 0.0)
+            return PoseHypothesis(None, frozenset(), 0.0)
         stack = np.array(turns).reshape(-1, 9)
         alike = stack @ stack.T > trace_of(ALIKE_DEG)
         groups = [np.flatnonzero(row) for row in alike]
         largest = max(groups, key=lambda group: len({owners[k] for k in group}))
         area = self._area(photo, [rows[k] for k in largest])
-        return Place(None, frozenset(owners[k] for k in largest), area)
+        return PoseHypothesis(None, frozenset(owners[k] for k in largest), area)
 
     def _same(self, first: np.ndarray | None, second: np.ndarray | None) -> bool:
         """Tell whether two poses are one place."""
@@ -470,7 +474,7 @@ class Placement:
         self.radius = float(np.median(apart))  # radius of the path of cameras
 
 
-def _reason(best: Place, rival: Place, needed: int) -> str | None:
+def _reason(best: PoseHypothesis, rival: PoseHypothesis, needed: int) -> str | None:
     """Return why a photo cannot stay at its best place; None if it can."""
     if not best.partners:
         return "no placed photo agrees with it on a place"

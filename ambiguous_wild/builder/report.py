@@ -35,7 +35,7 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import exif_focal
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import counted, shortlist
-from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.colmap_records import ColmapModel
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
 ENOUGH_PHOTOS = 20  # with fewer, most of a place is seen in one or two of them
@@ -49,7 +49,7 @@ def scene_record(
     features: FeatureResult,
     matches: MatchResult,
     mapping: MappingResult,
-    model: Model,
+    model: ColmapModel,
     *,
     train: list[str],
     test: list[str],
@@ -130,7 +130,7 @@ def scene_record(
     }
 
 
-def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[int, int]:
+def point_checks(model: ColmapModel, names: dict[str, str], test: set[str]) -> tuple[int, int]:
     """Count the points that only test photos see (leaked) and those of track length 2 (poorly determined)."""
     points = model.points
     tests = [i.image_id for i in model.images.values() if names[i.name] in test]
@@ -143,7 +143,7 @@ def point_checks(model: Model, names: dict[str, str], test: set[str]) -> tuple[i
     return int(((trained == 0) & (lengths > 0)).sum()), int((lengths == 2).sum())
 
 
-def parallax_deg(model: Model) -> float:
+def parallax_deg(model: ColmapModel) -> float:
     """Return the median over points of the widest angle between first ray and another; NaN without points."""
     points = model.points
     owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.track_offsets))
@@ -304,7 +304,7 @@ def map_warnings(result: MapResult) -> list[str]:
     return [f"the capture has weak places, see {MAP}: {shortlist(advice, 2)}"] if advice else []
 
 
-def _parallax_warnings(model: Model) -> list[str]:
+def _parallax_warnings(model: ColmapModel) -> list[str]:
     angle = parallax_deg(model)
     if not angle < LEAST_PARALLAX_DEG:
         return []

@@ -17,7 +17,7 @@ from typing import Generic, TypeVar, cast
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.collect import MIN_PHOTOS, VIDEO_SUFFIXES, Capture, Source, identical
+from ambiguous_wild.builder.collect import MIN_PHOTOS, VIDEO_SUFFIXES, Capture, PhotoSource, identical
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     ExifRecord,
@@ -91,7 +91,7 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
 
 def read_capture(
     capture: Capture,
-    more: Callable[[Source, Photo, np.ndarray], More],
+    more: Callable[[PhotoSource, Photo, np.ndarray], More],
     *,
     strict: bool,
     jobs: int,
@@ -112,7 +112,7 @@ def read_capture(
     sources, copies = without_copies(capture)
     bar.start("reading photos", len(sources))
 
-    def one(source: Source) -> tuple[PhotoRecord, np.ndarray, More] | SkippedPhoto:
+    def one(source: PhotoSource) -> tuple[PhotoRecord, np.ndarray, More] | SkippedPhoto:
         try:
             photo, pixels = read_photo(source.path)
         except UnreadablePhoto as error:
@@ -137,7 +137,7 @@ def read_capture(
     )
 
 
-def photo_record(source: Source, photo: Photo, pixels: np.ndarray) -> PhotoRecord:
+def photo_record(source: PhotoSource, photo: Photo, pixels: np.ndarray) -> PhotoRecord:
     """Measure size, EXIF, blur and brightness of one photo."""
     exif = {k: v for k, v in dataclasses.asdict(photo.exif).items() if v is not None}
     return {
@@ -155,7 +155,7 @@ def photo_record(source: Source, photo: Photo, pixels: np.ndarray) -> PhotoRecor
     }
 
 
-def without_copies(capture: Capture) -> tuple[list[Source], dict[str, str]]:
+def without_copies(capture: Capture) -> tuple[list[PhotoSource], dict[str, str]]:
     """Return the photos to use, and the copies to leave out: relative name -> first file with the same bytes.
 
     One of two copies could be a training photo and the other a test photo, which leaks test data. In a
@@ -163,7 +163,7 @@ def without_copies(capture: Capture) -> tuple[list[Source], dict[str, str]]:
     """
     if capture.has_sides:
         return list(capture.sources), {}
-    first: dict[str, Source] = {}
+    first: dict[str, PhotoSource] = {}
     copies = {}
     for source in capture.sources:
         kept = first.setdefault(source.sha256, source)
@@ -310,7 +310,7 @@ def _live_photo_warnings(capture: Capture) -> list[str]:
     return [f"{len(videos)} videos of live photos are left out: {shortlist(videos, 3)}"] if videos else []
 
 
-def _lay_out(source: Source, photo: Photo, pixels: np.ndarray, folder: Path) -> str:
+def _lay_out(source: PhotoSource, photo: Photo, pixels: np.ndarray, folder: Path) -> str:
     if photo.plain:
         (folder / source.work_name).symlink_to(source.path)
         return source.work_name

@@ -54,7 +54,7 @@ from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.motion_points import FILE
@@ -352,7 +352,7 @@ class Stages:
         screened: StageResult[ScreenResult],
         masks: StageResult[MaskResult] | None,
         mapping: StageResult[MappingResult],
-        model: Model,
+        model: ColmapModel,
     ) -> StageResult[UndistortResult]:
         from ambiguous_wild.builder.undistort import undistort
 

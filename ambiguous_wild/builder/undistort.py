@@ -19,7 +19,7 @@ from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto, UndistortResult
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.colmap_model import write_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -104,7 +104,7 @@ def _source_pixels(lens: Any, pinhole: ModelCamera, shear: float) -> tuple[np.nd
 
 def undistort(
     folder: Path,
-    model: Model,
+    model: ColmapModel,
     facts: list[ScreenedPhoto],
     read: Callable[[ScreenedPhoto], np.ndarray],
     masks: Path | None,
@@ -151,7 +151,7 @@ def undistort(
     if lenses and (least := min(lens.share for lens in lenses.values())) < MOST_LOST:
         bar.say(f"undistortion leaves {least:.0%} of the photos, the middle of what the lens sees")
     cameras, images = {c.camera_id: c for _, c, _ in done}, {image.image_id: image for image, _, _ in done}
-    write_model(folder / "sparse" / "0", Model(cameras, images, model.points))
+    write_model(folder / "sparse" / "0", ColmapModel(cameras, images, model.points))
     photos_with = {part: sum(part in parts for _, _, parts in done) for part in TRUTH_PARTS}
     return {"truth": photos_with if truth is not None else None}
 

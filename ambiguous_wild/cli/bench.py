@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import (
-    Number,
+    FiniteFloat,
     PathName,
     engine_options,
     metric_file_option,
@@ -132,7 +132,7 @@ def parse_budget(text: str) -> float:
 )
 @click.option(
     "--checkpoint-every",
-    type=Number(min=0.0, min_open=True),
+    type=FiniteFloat(min=0.0, min_open=True),
     default=60.0,
     show_default=True,
     help="Seconds between checkpoints.",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import Number, PathName, threads_option
+from ambiguous_wild.cli.options import FiniteFloat, PathName, threads_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
 )
 @click.option(
     "--every",
-    type=Number(0.05, 3600),
+    type=FiniteFloat(0.05, 3600),
     default=1.0,
     show_default=True,
     help="Seconds between photos of a camera.",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import Number, PathName, command_line, only_option
+from ambiguous_wild.cli.options import FiniteFloat, PathName, command_line, only_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     help="Folder for plots, CSV and JSON.",
 )  # fmt: skip
 @click.option(
-    "--target", "targets", multiple=True, type=Number(), metavar="DB",
+    "--target", "targets", multiple=True, type=FiniteFloat(), metavar="DB",
     help="A test PSNR to reach; repeatable.  [default: 3, 1 and 0.5 dB below the best of each scene]",
 )  # fmt: skip
 @only_option

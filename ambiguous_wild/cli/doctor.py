@@ -97,7 +97,7 @@ _PIP = f"{shlex.quote(sys.executable)} -m pip"
 
 
 @dataclass(frozen=True)
-class Check:
+class SystemCheck:
     """One line of the report."""
 
     group: Literal["core", "optional"]
@@ -107,15 +107,15 @@ class Check:
     fix: str = ""  # shell command to paste, or a # comment where no command can do it; "" if nothing is to do
 
 
-def _core(name: str, ok: bool, detail: str, fix: str = "") -> Check:
-    return Check("core", name, ok, detail, "" if ok else fix)
+def _core(name: str, ok: bool, detail: str, fix: str = "") -> SystemCheck:
+    return SystemCheck("core", name, ok, detail, "" if ok else fix)
 
 
-def _optional(name: str, ok: bool, detail: str, fix: str = "") -> Check:
-    return Check("optional", name, ok, detail, "" if ok else fix)
+def _optional(name: str, ok: bool, detail: str, fix: str = "") -> SystemCheck:
+    return SystemCheck("optional", name, ok, detail, "" if ok else fix)
 
 
-def all_checks() -> list[Check]:
+def all_checks() -> list[SystemCheck]:
     """Make all checks, core first."""
     names = [n for n in PROBES if n != "torchvision" or importlib.util.find_spec(n) is not None]
     with ThreadPoolExecutor(len(names)) as pool:
@@ -138,7 +138,7 @@ def all_checks() -> list[Check]:
     ]
 
 
-def _machine() -> list[Check]:
+def _machine() -> list[SystemCheck]:
     python = _system_install("python3.11", "https://www.python.org/downloads")
     checks = [
         _core("python", sys.version_info >= (3, 11), platform.python_version(), python),
@@ -162,7 +162,7 @@ def _system_install(package: str, page: str) -> str:
     return f"# install {package} from {page}"
 
 
-def _packages() -> Check:
+def _packages() -> SystemCheck:
     """Check the required packages: allowed ranges, and tested versions."""
     try:
         required = [r for r in importlib.metadata.requires(DISTRIBUTION) or [] if "extra ==" not in r]
@@ -215,12 +215,12 @@ def _install_again(words: str) -> str:
     return f"{_PIP} install{tested} --force-reinstall {words}"
 
 
-def _library(name: str, probed: Probe, use: str) -> Check:
+def _library(name: str, probed: Probe, use: str) -> SystemCheck:
     detail = probed.error if probed.facts is None else str(probed.facts["version"])
     return _core(name, probed.facts is not None, f"{detail} ({use})", _install_again(f"--no-deps {name}"))
 
 
-def _numba(probed: Probe) -> list[Check]:
+def _numba(probed: Probe) -> list[SystemCheck]:
     if probed.facts is None:
         return [_core("numba", False, probed.error, _install_again("numba llvmlite"))]
     from ambiguous_wild.splat.cpu.compile import kernel_cache
@@ -238,7 +238,7 @@ def _numba(probed: Probe) -> list[Check]:
     ]
 
 
-def _gpu(torch: Probe) -> list[Check]:
+def _gpu(torch: Probe) -> list[SystemCheck]:
     """Check the GPU, with the same messages as `--device`."""
     if torch.facts is None:
         return [_optional("torch cuda", False, torch.error, _install_again("--no-deps torch"))]
@@ -263,7 +263,7 @@ def _driver_install() -> str:
     return "# if this machine has an NVIDIA GPU, install its driver: https://www.nvidia.com/drivers"
 
 
-def _part(name: str, fine: str, lack: readiness.Lack | None) -> Check:
+def _part(name: str, fine: str, lack: readiness.Lack | None) -> SystemCheck:
     if lack is None:
         return _optional(name, True, fine)
     return _optional(name, False, lack.what, pastable(lack.fix))
@@ -277,13 +277,13 @@ def pastable(fix: str) -> str:
     return fix if fix.startswith(COMMANDS) else f"# {fix}"
 
 
-def _installed(name: str, extra: str, use: str) -> Check:
+def _installed(name: str, extra: str, use: str) -> SystemCheck:
     version = installed(name)
     detail = f"{version or 'not installed'} ({use})"
     return _optional(name, version is not None, detail, install_command(extra))
 
 
-def _extras() -> list[Check]:
+def _extras() -> list[SystemCheck]:
     """Check packages for single commands, and nerfbaselines, which has its own environment."""
     from ambiguous_wild.methods.nerfbaselines import find_program
 
@@ -301,7 +301,7 @@ def _extras() -> list[Check]:
         return [*checks, _optional("nerfbaselines", False, what, fix)]
 
 
-def _vision() -> list[Check]:
+def _vision() -> list[SystemCheck]:
     """Check foundation models: transformers and the weights."""
     from ambiguous_wild.vision import weights
 
@@ -316,7 +316,7 @@ def _vision() -> list[Check]:
     ]
 
 
-def _torchvision(probed: Probe | None) -> Check:
+def _torchvision(probed: Probe | None) -> SystemCheck:
     """Check torchvision: it is not needed, but a broken one keeps transformers from being imported."""
     if probed is None:
         return _optional("torchvision", True, "not installed, not needed")
@@ -326,7 +326,7 @@ def _torchvision(probed: Probe | None) -> Check:
     return _optional("torchvision", False, why, f"{_PIP} uninstall -y torchvision")
 
 
-def _metrics() -> list[Check]:
+def _metrics() -> list[SystemCheck]:
     """Check LPIPS metric by metric, because each needs two files."""
     from ambiguous_wild.metrics import lpips
     from ambiguous_wild.vision import weights
@@ -339,7 +339,7 @@ def _metrics() -> list[Check]:
     return checks
 
 
-def _git() -> Check:
+def _git() -> SystemCheck:
     version = readiness.first_line("git", "--version")
     fix = _system_install("git", "https://git-scm.com/downloads")
     return _optional("git", version is not None, version or "not installed", fix)
@@ -371,7 +371,7 @@ def command(as_json: bool) -> None:
         )
 
 
-def _print_group(group: str, checks: list[Check]) -> None:
+def _print_group(group: str, checks: list[SystemCheck]) -> None:
     if not checks:
         return
     click.secho(("" if group == "core" else "\n") + group, bold=True)
@@ -382,7 +382,7 @@ def _print_group(group: str, checks: list[Check]) -> None:
             click.echo(f"    {' ' * width}  → {c.fix}")
 
 
-def _mark(check: Check) -> str:
+def _mark(check: SystemCheck) -> str:
     if check.ok:
         return click.style("✓", fg="green")
     return click.style("✗", fg="red" if check.group == "core" else "yellow")

@@ -26,7 +26,7 @@ class PathName(click.Path):
         return super().convert(value, param, ctx)
 
 
-class Number(click.FloatRange):
+class FiniteFloat(click.FloatRange):
     """A finite number; click lets NaN pass every range."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -141,17 +141,17 @@ engine_options = _all(  # the fields of `Engine`
                  help="Runs at a time on this machine; they share cores.  [default: 1; on cuda one per GPU]"),
     click.option("--address",
                  help="Ray: auto, HOST:PORT, ray://HOST:10001.  [default: $RAY_ADDRESS, else this machine]"),
-    click.option("--cpus-per-cell", type=Number(min=0, min_open=True),
+    click.option("--cpus-per-cell", type=FiniteFloat(min=0, min_open=True),
                  help="Ray: CPUs per run, also its threads.  [default: --threads, else 1]"),
-    click.option("--gpus-per-cell", type=Number(min=0),
+    click.option("--gpus-per-cell", type=FiniteFloat(min=0),
                  help="Ray: GPUs per run; with 0.5 two runs share one.  [default: 1 on cuda]"),
-    click.option("--memory-per-cell", type=Number(min=0), metavar="GB",
+    click.option("--memory-per-cell", type=FiniteFloat(min=0), metavar="GB",
                  help="Ray: memory per run."),
     click.option("--retries", type=click.IntRange(0), default=3, show_default=True,
                  help="How often to repeat a run whose process or node was lost."),
     click.option("--transfer", type=click.Choice(["shared", "store"]), default="shared", show_default=True,
                  help="Ray: shared: -o and scenes are on shared storage; store: they are sent through Ray."),
-    click.option("--transfer-limit", type=Number(min=0, min_open=True), default=4000.0,
+    click.option("--transfer-limit", type=FiniteFloat(min=0, min_open=True), default=4000.0,
                  show_default=True, metavar="MB", help="Ray: largest scene or run that is sent through Ray."),
 )  # fmt: skip
 

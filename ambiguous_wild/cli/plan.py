@@ -16,7 +16,7 @@ from ambiguous_wild.cli.options import PathName, prepare_cpu
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.effects_plan import Decision, Plan
+    from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan
 
 COLUMNS = 100  # of the table
 MASKS = (
@@ -108,7 +108,7 @@ def _check_overwrite(path: Path, probe: bool) -> None:
         )
 
 
-def table(plan: Plan) -> list[str]:
+def table(plan: EffectsPlan) -> list[str]:
     """Return the plan as lines of at most `COLUMNS` characters: a table, and a sentence for each effect."""
     head = ("effect", "decision", "found", "limit", "gain on held-back pixels", "ms/iteration")
     rows = [head, *(_row(d) for d in plan.decisions)]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from ambiguous_wild.cli.options import Number, PathName, seed_option
+from ambiguous_wild.cli.options import FiniteFloat, PathName, seed_option
 from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
@@ -185,11 +185,15 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
 @click.option("--cutouts", type=PathName(), help="Folder of PNG files with alpha as the mask.")
 @click.option("--patches", is_flag=True, help="Fill the shapes with pieces of the photos.")
 @click.option(
-    "--coverage", type=Number(), default=0.15, show_default=True, help="Mean covered share of a train photo."
+    "--coverage",
+    type=FiniteFloat(),
+    default=0.15,
+    show_default=True,
+    help="Mean covered share of a train photo.",
 )
 @click.option(
     "--presence",
-    type=Number(),
+    type=FiniteFloat(),
     default=0.8,
     show_default=True,
     help="Share of the train photos that show each distractor; of plain photos: any distractor.",
@@ -203,7 +207,7 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
 )
 @click.option(
     "--shadow",
-    type=Number(),
+    type=FiniteFloat(),
     default=0.0,
     show_default=True,
     help="Darkness of the shadows: 0 none, 1 black. Scenes only.",

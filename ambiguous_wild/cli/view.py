@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import (
-    Number,
+    FiniteFloat,
     PathName,
     device_option,
     plugin_option,
@@ -24,7 +24,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
 
 if TYPE_CHECKING:
-    from ambiguous_wild.viewing.model import Exported
+    from ambiguous_wild.viewing.model import ExportedModel
 
 MOST_GAUSSIANS = 150_000
 _one_scene = click.option(
@@ -138,14 +138,14 @@ def view_command(
     "--path", "path", default="test", show_default=True, metavar="test|orbit|FILE",
     help="Along the test cameras, around the scene, or FILE saved by 'aw view', nerfstudio or a 3DGS viewer.",
 )  # fmt: skip
-@click.option("--seconds", type=Number(0.1, 600), default=8.0, show_default=True)
-@click.option("--fps", type=Number(1, 120), default=24.0, show_default=True, help="Frames per second.")
+@click.option("--seconds", type=FiniteFloat(0.1, 600), default=8.0, show_default=True)
+@click.option("--fps", type=FiniteFloat(1, 120), default=24.0, show_default=True, help="Frames per second.")
 @click.option(
     "--width", type=click.IntRange(16, 4096), help="Width of each render, px.  [default: as the photos]"
 )
 @click.option("--columns", type=click.IntRange(1), help="Renders in a row.  [default: up to three]")
 @click.option("--gif", type=PathName(dir_okay=False), help="Also write this GIF of the whole path.")
-@click.option("--gif-seconds", type=Number(0.5, 30), default=4.0, show_default=True)
+@click.option("--gif-seconds", type=FiniteFloat(0.5, 30), default=4.0, show_default=True)
 @click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
 @_one_scene
 @scene_folder_option
@@ -230,7 +230,7 @@ def export_command(
             click.echo(f"  {_line(e)}")
 
 
-def _place(e: Exported) -> str:
+def _place(e: ExportedModel) -> str:
     x, y, z = e.place.centre
     smaller = "" if e.place.scale == 1 else f"divide by {e.place.scale:g}, then "
     w, *axis = e.place.turn
@@ -242,7 +242,7 @@ def _place(e: Exported) -> str:
     return f"{smaller}{back}add ({x:.15g}, {y:.15g}, {z:.15g})"
 
 
-def _line(e: Exported) -> str:
+def _line(e: ExportedModel) -> str:
     text = f"{e.format:<14} {e.bytes / 1e6:8.2f} MB  {100 * e.share:5.1f} % of {e.source}"
     if e.psnr_to_model is not None and e.lost_db is not None:
         same = "renders the same" if math.isinf(e.psnr_to_model) else f"{e.psnr_to_model:.1f} dB to the model"

@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 # imported when they are asked for: a command that needs an error alone loads no numpy
 _MODULES = {"AwError": "errors", "Camera": "camera", "UNMOVED": "scene"}
-_MODULES |= dict.fromkeys(("Place", "Points", "Scene", "View"), "scene")
+_MODULES |= dict.fromkeys(("Scene", "SceneTransform", "SparsePoints", "View"), "scene")
 
 if TYPE_CHECKING:
     from ambiguous_wild.core.camera import Camera as Camera
     from ambiguous_wild.core.errors import AwError as AwError
     from ambiguous_wild.core.scene import UNMOVED as UNMOVED
-    from ambiguous_wild.core.scene import Place as Place
-    from ambiguous_wild.core.scene import Points as Points
     from ambiguous_wild.core.scene import Scene as Scene
+    from ambiguous_wild.core.scene import SceneTransform as SceneTransform
+    from ambiguous_wild.core.scene import SparsePoints as SparsePoints
     from ambiguous_wild.core.scene import View as View
 
 

@@ -72,7 +72,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Points:
+class SparsePoints:
     """Sparse points of structure from motion; tracks in compressed rows (CSR).
 
     Observation k of point i, for ``track_offsets[i] <= k < track_offsets[i + 1]``, is at
@@ -97,7 +97,7 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Place:
+class SceneTransform:
     """The change of coordinates from a scene's files to training: ``x -> R (x - centre) * scale``."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -121,7 +121,7 @@ class Place:
         return replace(camera, cam_from_world=pose)
 
 
-UNMOVED = Place()
+UNMOVED = SceneTransform()
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,9 @@ class Scene:
     root: Path
     name: str
     views: tuple[View, ...]
-    points: Points
+    points: SparsePoints
     info: SceneInfo = field(default_factory=SceneInfo, repr=False)
-    place: Place = UNMOVED  # how views and points were moved from the coordinates of the files
+    place: SceneTransform = UNMOVED  # how views and points were moved from the coordinates of the files
 
     @cached_property
     def train(self) -> tuple[View, ...]:
@@ -174,7 +174,7 @@ def centred(scene: Scene) -> Scene:
     far = np.abs(middle).max() > _FAR_PLACE * size
     x, y, z = (np.round(middle / unit) * unit if far else np.zeros(3)).tolist()
     scale = 1.0 if _ORDINARY[0] <= size <= _ORDINARY[1] else float(2.0 ** np.round(np.log2(_SIZE / size)))
-    place = Place((x, y, z), scale)
+    place = SceneTransform((x, y, z), scale)
     if place == UNMOVED:
         return scene
     views = tuple(replace(v, camera=place.inside(v.camera)) for v in scene.views)

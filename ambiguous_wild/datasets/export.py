@@ -18,7 +18,7 @@ from ambiguous_wild.datasets.foreign import without_suffix
 from ambiguous_wild.datasets.photos import link_file
 from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.colmap_model import read_model, write_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.files import atomic_dir, check_output
 from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.ply import write_point_ply
@@ -29,7 +29,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportedScene:
     """Folder, numbers of photos, and what was left out."""
 
     folder: Path
@@ -39,7 +39,7 @@ class Exported:
     left_out: tuple[str, ...]  # parts of the scene that the layout cannot hold
 
 
-def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> Exported:
+def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> ExportedScene:
     """Write a scene in another layout, at the size that it is trained at (On-the-go: full size).
 
     Args:
@@ -64,7 +64,7 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
         left_out = [*WRITERS[form](scene, folder, place)]
     if (scene.root / motion_points.FILE).is_file():
         left_out.append("features that move (motion.npz)")
-    return Exported(output, len(scene.views), len(scene.train), len(scene.test), tuple(left_out))
+    return ExportedScene(output, len(scene.views), len(scene.train), len(scene.test), tuple(left_out))
 
 
 Place = Callable[[Path, Path], None]
@@ -80,7 +80,7 @@ def _stored(view: View) -> str:
     return without_suffix(view.name) + view.image_path.suffix
 
 
-def _sized_model(scene: Scene) -> Model:
+def _sized_model(scene: Scene) -> ColmapModel:
     """Return the model of the listed photos at the size of the loaded files, with equal cameras merged."""
     model = read_model(model_folder(scene.root))
     by_name = {view.name: view for view in scene.views}
@@ -99,7 +99,7 @@ def _sized_model(scene: Scene) -> Model:
         images[number] = replace(
             image, camera_id=cameras[key].camera_id, name=_stored(view), xys=image.xys * scale
         )
-    return Model({c.camera_id: c for c in cameras.values()}, images, model.points.seen_in(images))
+    return ColmapModel({c.camera_id: c for c in cameras.values()}, images, model.points.seen_in(images))
 
 
 def _write_lists(scene: Scene, folder: Path) -> None:

@@ -94,7 +94,7 @@ class Fetched:
     downloaded: int  # bytes downloaded in this call
 
 
-class _Broken(Exception):
+class _TransferBroken(Exception):
     """The transfer stopped before its end; another try may continue it."""
 
 
@@ -184,7 +184,7 @@ def _download(
             os.replace(part, archive)
             state.unlink(missing_ok=True)
             return moved
-        except _Broken as error:
+        except _TransferBroken as error:
             now = part.stat().st_size if part.is_file() else 0
             moved += max(0, now - before)
             reason = str(error)
@@ -231,16 +231,16 @@ def _transfer(
     except urllib.error.HTTPError as error:
         if error.code == 416:  # the part has all bytes or too many: start again
             part.unlink(missing_ok=True)
-            raise _Broken("the server has no further bytes") from error
+            raise _TransferBroken("the server has no further bytes") from error
         if error.code >= 500 or error.code in (408, 429):
-            raise _Broken(f"the server answers {error.code}") from error
+            raise _TransferBroken(f"the server answers {error.code}") from error
         raise AwError(
             f"{data.name}: {data.url} answers {error.code} ({error.reason}); look at "
             f"{data.page or 'its page'}"
         ) from error
     except (urllib.error.URLError, HTTPException, TimeoutError, ConnectionError) as error:
         reason = getattr(error, "reason", None) or error
-        raise _Broken(f"no connection ({reason})") from error
+        raise _TransferBroken(f"no connection ({reason})") from error
 
 
 def _start_of(reply: Any, have: int) -> int:
@@ -249,7 +249,7 @@ def _start_of(reply: Any, have: int) -> int:
         return 0
     match = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", reply.headers.get("Content-Range") or "")
     if match is None or int(match[1]) != have:
-        raise _Broken("the server resumes at another place than asked for")
+        raise _TransferBroken("the server resumes at another place than asked for")
     return have
 
 
@@ -262,7 +262,7 @@ def _copy(
         except (HTTPException, TimeoutError, ConnectionError) as error:
             partial = getattr(error, "partial", b"")
             target.write(partial)
-            raise _Broken(f"broken off after {done + len(partial)} bytes") from error
+            raise _TransferBroken(f"broken off after {done + len(partial)} bytes") from error
         if not chunk:
             break
         done += len(chunk)
@@ -271,7 +271,7 @@ def _copy(
         target.write(chunk)
         tick(done, total)
     if total is not None and done < total:
-        raise _Broken(f"broken off after {done} of {total} bytes")
+        raise _TransferBroken(f"broken off after {done} of {total} bytes")
 
 
 def _read_record(folder: Path) -> dict[str, Download]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Evaluation, Split
-from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, Model
+from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
 from ambiguous_wild.io.scene_folder import TEST_EVERY
 
 SIDES: tuple[Split, Split] = ("train", "test")
@@ -25,7 +25,7 @@ class ForeignScene:
 
     kind: str  # the layout, a key of `readers.READERS`
     root: Path
-    model: Model  # poses and cameras at full size; may have no points
+    model: ColmapModel  # poses and cameras at full size; may have no points
     photos: Path  # folder that the model's names refer to
     split: dict[str, Split]  # photos of neither side are left out
     factor: int = 1  # downsampling in the published tables

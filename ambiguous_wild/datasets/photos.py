@@ -16,7 +16,7 @@ from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo,
 from ambiguous_wild.builder.undistort import MOST_LOST, Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
-from ambiguous_wild.io.colmap_records import ONE_FOCAL, Model, ModelCamera, ModelImage
+from ambiguous_wild.io.colmap_records import ONE_FOCAL, ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import (
     MAX_PIXELS,
     header_size,
@@ -83,7 +83,7 @@ def at_photo_size(scene: ForeignScene) -> tuple[ForeignScene, float]:
         images[number] = dataclasses.replace(image, camera_id=taken[key], xys=xys)
     used = {image.camera_id for image in images.values()}
     cameras = {number: camera for number, camera in cameras.items() if number in used}
-    model = Model(cameras, images, scene.model.points)
+    model = ColmapModel(cameras, images, scene.model.points)
     times = float(np.median(ratios)) if ratios and taken else 1.0
     return dataclasses.replace(scene, model=model) if taken else scene, times
 
@@ -134,7 +134,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     return plans
 
 
-def _turn(model: Model, image: ModelImage, source: Path, size: tuple[int, int]) -> int | None:
+def _turn(model: ColmapModel, image: ModelImage, source: Path, size: tuple[int, int]) -> int | None:
     """Return the EXIF orientation if the model was made of the upright photo, else 1; None: neither fits.
 
     The shape of the camera decides; where both shapes fit, the colours of the points do.

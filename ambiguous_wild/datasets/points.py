@@ -22,7 +22,13 @@ from ambiguous_wild.builder.sfm import DATABASE, MotionJob, TriangulationJob, ex
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split, near_others
 from ambiguous_wild.io.colmap_model import read_model, write_model
-from ambiguous_wild.io.colmap_records import MODELS, Model, ModelImage, ModelPoints, points_without_tracks
+from ambiguous_wild.io.colmap_records import (
+    MODELS,
+    ColmapModel,
+    ModelImage,
+    ModelPoints,
+    points_without_tracks,
+)
 
 RANDOM_POINTS = 100_000  # as in 3DGS for Blender scenes and in gsplat's random start
 BLENDER_SIDE = 1.3  # half the side of 3DGS's cube for Blender scenes
@@ -30,7 +36,7 @@ CAMERA_SIDE = 3.0  # half the side of gsplat's cube over the largest distance of
 LEAST_POINTS = 100  # smallest number of triangulated points to start from
 
 
-def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int]:
+def drop_test_only(model: ColmapModel, split: Mapping[str, Split]) -> tuple[ColmapModel, int]:
     """Return the model without points that no training photo sees, and the number of dropped points.
 
     Points without a track are kept, because the photos that see them are not known.
@@ -46,10 +52,12 @@ def drop_test_only(model: Model, split: Mapping[str, Split]) -> tuple[Model, int
         )
         for number, image in model.images.items()
     }
-    return Model(model.cameras, images, kept), int((~keep).sum())
+    return ColmapModel(model.cameras, images, kept), int((~keep).sum())
 
 
-def random_points(model: Model, split: Mapping[str, Split], *, blender: bool, seed: int = 0) -> ModelPoints:
+def random_points(
+    model: ColmapModel, split: Mapping[str, Split], *, blender: bool, seed: int = 0
+) -> ModelPoints:
     """Return points of random position and colour, as the reference trainers use without a model.
 
     Args:
@@ -72,14 +80,14 @@ def random_points(model: Model, split: Mapping[str, Split], *, blender: bool, se
 
 def triangulate(
     folder: Path,
-    model: Model,
+    model: ColmapModel,
     photos: Path,
     split: Mapping[str, Split],
     *,
     seed: int,
     jobs: int,
     bar: Bar,
-) -> Model:
+) -> ColmapModel:
     """Match the photos and triangulate points with the known poses, which do not change.
 
     Args:
@@ -120,7 +128,7 @@ def triangulate(
         for name, i in used.items()
         if name in by_name
     }
-    return Model(model.cameras, images, triangulated.points)
+    return ColmapModel(model.cameras, images, triangulated.points)
 
 
 def find_motion(
@@ -169,7 +177,7 @@ def find_motion(
 
 def _match_posed(
     folder: Path,
-    model: Model,
+    model: ColmapModel,
     photos: Path,
     split: Mapping[str, Split],
     sfm: Effort,
@@ -193,7 +201,7 @@ def _match_posed(
     return folder / "matches" / DATABASE
 
 
-def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, ModelImage]) -> None:
+def _set_cameras(database: Path, known: Path, model: ColmapModel, used: Mapping[str, ModelImage]) -> None:
     """Write the known cameras to the database, and the model with the database's ids to `known`."""
     with closing(sqlite3.connect(database)) as db, db:
         rows = db.execute("SELECT name, image_id, camera_id FROM images").fetchall()
@@ -214,4 +222,4 @@ def _set_cameras(database: Path, known: Path, model: Model, used: Mapping[str, M
                 "UPDATE cameras SET model = ?, params = ?, prior_focal_length = 1 WHERE camera_id = ?",
                 (MODELS[camera.model][0], params, camera.camera_id),
             )
-    write_model(known, Model(cameras, images, points_without_tracks()))
+    write_model(known, ColmapModel(cameras, images, points_without_tracks()))

@@ -21,7 +21,7 @@ from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_f
 
 
 @dataclass
-class Verified:
+class VerifiedPackage:
     """Scenes and files that were checked."""
 
     scenes: list[str] = field(default_factory=list)
@@ -29,7 +29,7 @@ class Verified:
     warnings: list[str] = field(default_factory=list)  # why a whole package is not ready for release
 
 
-def verify(path: Path, *, scratch: Path | None = None) -> Verified:
+def verify(path: Path, *, scratch: Path | None = None) -> VerifiedPackage:
     """Check checksums, tables, metadata and every scene of a package folder, or one scene's archive.
 
     Archives are unpacked into a temporary folder, which is removed.
@@ -42,7 +42,7 @@ def verify(path: Path, *, scratch: Path | None = None) -> Verified:
         AwError: the first error, with its file.
     """
     if path.is_file():
-        verified = Verified()
+        verified = VerifiedPackage()
         _scene(path, None, verified, scratch)
         return verified
     if not path.is_dir():
@@ -65,7 +65,7 @@ def verify(path: Path, *, scratch: Path | None = None) -> Verified:
     _check_md5(path)
     _check_croissant(path, sums)
     rows = _rows(path / "files.csv")
-    verified = Verified()
+    verified = VerifiedPackage()
     for name in sorted(sums):
         if name.endswith(".zip"):
             _scene(path / name, {r["path"]: r for r in rows if r["archive"] == name}, verified, scratch)
@@ -130,7 +130,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def _scene(
-    archive: Path, rows: dict[str, dict[str, str]] | None, found: Verified, scratch: Path | None
+    archive: Path, rows: dict[str, dict[str, str]] | None, found: VerifiedPackage, scratch: Path | None
 ) -> None:
     with tempfile.TemporaryDirectory(prefix="aw-verify-", dir=scratch) as temporary:
         folder = Path(temporary) / "scene"

@@ -35,7 +35,7 @@ from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_p
 from ambiguous_wild.datasets.readers import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.colmap_model import write_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.files import check_output, refuse_foreign_files, sweep, write_json, write_text
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
@@ -280,7 +280,7 @@ def _write_scene(
 
 def _with_points(
     work: Path, foreign: ForeignScene, settings: ImportSettings, jobs: int, bar: Bar, notes: list[str]
-) -> Model:
+) -> ColmapModel:
     model = foreign.model
     if foreign.points == "triangulate":
         scratch = work / "points"
@@ -294,11 +294,11 @@ def _with_points(
         if foreign.points == "model":
             notes.append("the model has no points: training starts from random ones")
         points = random_points(model, foreign.split, blender=foreign.points == "random", seed=settings.seed)
-        model = Model(model.cameras, model.images, points)
+        model = ColmapModel(model.cameras, model.images, points)
     return model
 
 
-def _write_model(folder: Path, model: Model, placed: list[PlacedPhoto]) -> Model:
+def _write_model(folder: Path, model: ColmapModel, placed: list[PlacedPhoto]) -> ColmapModel:
     """Write sparse/0 with the placed photos; a camera whose photos share one size keeps its number."""
     cameras: dict[int, ModelCamera] = {}
     images = {}
@@ -313,7 +313,7 @@ def _write_model(folder: Path, model: Model, placed: list[PlacedPhoto]) -> Model
             taken[same] = number
             cameras[number] = dataclasses.replace(camera, camera_id=number)
         images[photo.image.image_id] = dataclasses.replace(photo.image, camera_id=taken[same])
-    written = Model(cameras, images, model.points.seen_in(images))
+    written = ColmapModel(cameras, images, model.points.seen_in(images))
     write_model(folder / "sparse" / "0", written)
     return written
 
@@ -323,7 +323,7 @@ def _record(
     settings: ImportSettings,
     name: str,
     sides: Mapping[str, Split],
-    model: Model,
+    model: ColmapModel,
     placed: list[PlacedPhoto],
     notes: list[str],
     key: str,

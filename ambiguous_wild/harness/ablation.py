@@ -50,7 +50,7 @@ class GroupFacts(TypedDict):
     source: str  # table or section of the paper; empty if there is none
 
 
-class Summary(TypedDict):
+class SummaryRecord(TypedDict):
     """Mean and sample deviation over the runs of a variant; None = missing."""
 
     mean: float | None
@@ -67,8 +67,8 @@ class VariantRow(TypedDict):
     status: Literal["ok", "failed", "missing"]
     reason: str  # why the status is not ok
     same_as: str  # the row that has the same runs; empty if there is none
-    values: dict[str, Summary]  # by the keys of `METRICS`
-    differences: dict[str, Summary]  # by the keys of `DIFFERENCES`
+    values: dict[str, SummaryRecord]  # by the keys of `METRICS`
+    differences: dict[str, SummaryRecord]  # by the keys of `DIFFERENCES`
     runs: list[Facts]  # scene, seed, folder, error, untimed (why times are not ranked), and `METRICS`
 
 
@@ -267,7 +267,7 @@ def _check_features(variant: Variant) -> None:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class VariantResult:
     """The result of one cell."""
 
     scene: str
@@ -308,16 +308,16 @@ METRICS = (
 DIFFERENCES = tuple(m for m in METRICS if m.key in ("psnr", "iou", "ms_per_iteration"))
 
 
-def read_outcomes(cells: Sequence[Cell], output: Path) -> list[Outcome]:
+def read_outcomes(cells: Sequence[Cell], output: Path) -> list[VariantResult]:
     """Read the results of cells from their folders."""
     outcomes = []
     for cell in cells:
         folder = cell_folder(output, cell)
         where = (cell.scene.name, cell.train.seed, folder)
         if (folder / RESULT).is_file():
-            outcomes.append(Outcome(*where, read_result(folder / RESULT)))
+            outcomes.append(VariantResult(*where, read_result(folder / RESULT)))
         elif (folder / FAILED).is_file():
-            outcomes.append(Outcome(*where, None, str(read_result(folder / FAILED)["error"])))
+            outcomes.append(VariantResult(*where, None, str(read_result(folder / FAILED)["error"])))
         else:
-            outcomes.append(Outcome(*where, None, "not run"))
+            outcomes.append(VariantResult(*where, None, "not run"))
     return outcomes

@@ -30,7 +30,7 @@ from ambiguous_wild.harness.session import Session
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport, Outcome, Overwrite, Protocol
-    from ambiguous_wild.harness.effects_plan import Plan
+    from ambiguous_wild.harness.effects_plan import EffectsPlan
     from ambiguous_wild.harness.result_file import RunResult
     from ambiguous_wild.harness.store import Runs
     from ambiguous_wild.harness.trained_models import Viewer
@@ -144,7 +144,7 @@ def bench(
     iterations: int | None = None,
     budgets_s: Sequence[float] = (),
     effects: str | Sequence[str] = "auto",
-    plan: Plan | Words | None = None,
+    plan: EffectsPlan | Words | None = None,
     settings: Sequence[str] = (),
     parts: Mapping[Place, str] | None = None,
     passes: int = 1,
@@ -319,7 +319,7 @@ def find_methods(
 
 def _check_effects(
     choices: Sequence[str],
-    plan: Plan | Words | None,
+    plan: EffectsPlan | Words | None,
     scenes: Sequence[Path],
     methods: Collection[MethodEntry],
 ) -> None:

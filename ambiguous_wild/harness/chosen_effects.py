@@ -15,7 +15,7 @@ from ambiguous_wild.methods.registry import MethodEntry
 from ambiguous_wild.splat.effects import check_effects
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.effects_plan import Plan
+    from ambiguous_wild.harness.effects_plan import EffectsPlan
 
 
 def scene_protocol(scene: Scene) -> Literal["full", "half"]:
@@ -72,7 +72,7 @@ class Chosen:
 
     effects: tuple[str, ...] = ()
     asked: str = ""  # empty: no effects were asked for, and no effects.json is written
-    plan: Plan | None = None
+    plan: EffectsPlan | None = None
 
     def write(self, path: Path) -> None:
         """Write effects.json of the run."""

@@ -237,7 +237,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Plan:
+class EffectsPlan:
     """The effects that a scene needs, with the evidence for each."""
 
     scene: str
@@ -265,7 +265,7 @@ class Plan:
             "decisions": [d.plain() for d in self.decisions],
         }
 
-    def with_costs(self, costs: dict[str, float]) -> Plan:
+    def with_costs(self, costs: dict[str, float]) -> EffectsPlan:
         """Return the plan with the extra ms per iteration of each effect, by its name for `--effects`."""
         lines = (
             replace(d, cost_ms=costs.get(d.how.removeprefix("--effects "), d.cost_ms)) for d in self.decisions
@@ -280,7 +280,7 @@ def answer(value: float, threshold: float) -> Answer:
     return "on" if value >= threshold else "off"
 
 
-def decide(scene: str, evidence: Evidence) -> Plan:
+def decide(scene: str, evidence: Evidence) -> EffectsPlan:
     """Return the plan that follows from the evidence alone."""
     shine = 0.0 if math.isnan(evidence.view_dependence) else OF_SHINE * evidence.view_dependence
     by_place = evidence.appearance - min(shine, evidence.appearance)  # NaN stays NaN
@@ -316,7 +316,7 @@ def decide(scene: str, evidence: Evidence) -> Plan:
     )  # fmt: skip
     too_few = f"{evidence.observations} observations of SfM points are too few to decide"
     lines = tuple(replace(d, why=too_few) if d.decision == "unknown" else d for d in lines)
-    return Plan(scene, lines)
+    return EffectsPlan(scene, lines)
 
 
 def _dense_start(evidence: Evidence) -> Decision:
@@ -357,7 +357,7 @@ def _skybox(dense: Decision) -> Decision:
                     "off" if taken else "on", why, "--effects skybox")  # fmt: skip
 
 
-def plan_effects(scene: Scene) -> Plan:
+def plan_effects(scene: Scene) -> EffectsPlan:
     """Measure the train photos at the SfM points and decide; without tracks no photo is read.
 
     Raises:
@@ -371,7 +371,7 @@ def plan_effects(scene: Scene) -> Plan:
     return decide(scene.name, measure(scene, (load_image_float(v.image_path) for v in scene.train)))
 
 
-def read_plan(path: Path) -> Plan:
+def read_plan(path: Path) -> EffectsPlan:
     """Read a plan that `aw plan` wrote.
 
     Raises:
@@ -386,7 +386,7 @@ def read_plan(path: Path) -> Plan:
         ]
         decisions = msgspec.convert(rows, tuple[Decision, ...])
         name, identity = msgspec.convert([data["scene"], data.get("scene_hash", "")], tuple[str, str])
-        return Plan(name, decisions, bool(data.get("probed")), identity)
+        return EffectsPlan(name, decisions, bool(data.get("probed")), identity)
     except FileNotFoundError:
         raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as error:

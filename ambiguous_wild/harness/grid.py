@@ -25,7 +25,7 @@ from ambiguous_wild.harness.chosen_effects import (
     scene_protocol,
     takes_effects,
 )
-from ambiguous_wild.harness.effects_plan import Plan, plan_effects
+from ambiguous_wild.harness.effects_plan import EffectsPlan, plan_effects
 from ambiguous_wild.harness.run import (
     left_alone,
     made_anew,
@@ -41,7 +41,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.effects import ALL, check_effects
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 
 
 def try_recipes(cells: Sequence[Cell]) -> list[str]:
@@ -98,7 +98,7 @@ def plan_cells(
     device: str = "cpu",
     factor: int | None = None,
     effects: str = "none",
-    plan: Plan | None = None,
+    plan: EffectsPlan | None = None,
     protocol: Protocol | None = None,
     start: Path | None = None,
 ) -> list[Cell]:
@@ -148,7 +148,7 @@ def plan_cells(
             "without --start"
         )
     for scene in loaded:
-        started(Parts(), file, scene)
+        started(MethodHooks(), file, scene)
     cells = []
     for scene in loaded:
         identity = scene_identity(scene)
@@ -304,7 +304,7 @@ def choose(
     wanted: str,
     scene: Scene,
     methods: Sequence[MethodEntry],
-    plan: Plan | None = None,
+    plan: EffectsPlan | None = None,
 ) -> dict[str, Chosen]:
     """Return the effects that every method trains with on this scene, by the method's name.
 

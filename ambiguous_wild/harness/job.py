@@ -37,7 +37,7 @@ LOCK_WAIT_S = 150.0
 
 
 @dataclass(frozen=True)
-class Source:
+class CodeSource:
     """Code that a run needs: a plugin, metrics, or a method given as ``recipe.py:my_recipe``."""
 
     text: str  # the reference as typed, or the file's path
@@ -56,7 +56,7 @@ class Job:
     scene: str  # absolute path
     folder: str  # absolute path of the run folder
     options: RunOptions
-    sources: tuple[Source, ...]
+    sources: tuple[CodeSource, ...]
     threads: int | None  # of the CPU kernels; None = all cores
     code: str  # `code_hash` of the sender
     token: str = ""  # path of a file that the receiver must see, see `check_storage`
@@ -64,7 +64,7 @@ class Job:
 
 def read_sources(
     plugins: Sequence[str | Path], methods: Sequence[str], metrics: Sequence[str | Path] = ()
-) -> tuple[Source, ...]:
+) -> tuple[CodeSource, ...]:
     """Read the code of plugins, and of methods and metrics given as files; other methods need none."""
     sources = [_source(str(path), "plugin", Path(path)) for path in plugins]
     sources += [_source(str(path), "metric", Path(path)) for path in metrics]
@@ -75,19 +75,19 @@ def read_sources(
         if file is not None:
             sources.append(_source(host, "method", file))
         elif host.startswith("nerfbaselines:"):
-            sources.append(Source(host, "method"))
+            sources.append(CodeSource(host, "method"))
     return tuple(sources)
 
 
-def _source(text: str, kind: str, path: Path) -> Source:
-    return Source(text, kind, str(path.resolve()), path.read_bytes())
+def _source(text: str, kind: str, path: Path) -> CodeSource:
+    return CodeSource(text, kind, str(path.resolve()), path.read_bytes())
 
 
 def make_job(
     cell: Cell,
     folder: Path,
     options: RunOptions,
-    sources: tuple[Source, ...] = (),
+    sources: tuple[CodeSource, ...] = (),
     threads: int | None = None,
 ) -> Job:
     """Return the job of a cell; `get_method` must find its method once the sources are loaded."""
@@ -179,7 +179,7 @@ def record_lost(cell: Cell, folder: Path, error: str) -> CellReport:
     return CellReport(folder, "failed", error=error)
 
 
-def _load(source: Source) -> None:
+def _load(source: CodeSource) -> None:
     if not source.path:
         load_reference(source.text)
         return
@@ -193,7 +193,7 @@ def _load(source: Source) -> None:
 
 
 @functools.cache
-def _local_file(source: Source) -> Path:
+def _local_file(source: CodeSource) -> Path:
     """Return the source's own file where this machine has it unchanged, else a copy."""
     path = Path(source.path)
     with contextlib.suppress(OSError):  # the file is absent, or another user's

@@ -27,16 +27,16 @@ from scipy.ndimage import label, maximum_filter, uniform_filter
 from torch import Tensor
 from tqdm import tqdm
 
-from ambiguous_wild.core import Points, Scene
+from ambiguous_wild.core import Scene, SparsePoints
 from ambiguous_wild.harness.cell import scene_identity
-from ambiguous_wild.harness.effects_plan import Decision, Plan, answer, plan_effects
+from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan, answer, plan_effects
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.splat.data import load_train_data, shrink_keep
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
 
@@ -167,7 +167,7 @@ def occlusion(
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as folder:
         data = small_data(scene, Path(folder))
         config = TrainConfig(iterations=iterations, probes=0, checkpoint_every_s=1e9)
-        trainer = Trainer(data, with_effects(Parts(), effects), config, folder=Path(folder))
+        trainer = Trainer(data, with_effects(MethodHooks(), effects), config, folder=Path(folder))
         trainer.train(tick=lambda _: tick())
         patches, counted = [], []
         places = [i for i, v in enumerate(scene.views) if v.split == "train"]
@@ -277,7 +277,7 @@ def sampled(scene: Scene) -> tuple[Scene, list[int]]:
     return dataclasses.replace(scene, views=views), places
 
 
-def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> Points:
+def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> SparsePoints:
     """Return the points without observations in held-back pixels, from whose colours effects would start."""
     points, views = scene.points, scene.points.track_views.copy()
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
@@ -325,7 +325,7 @@ class Pair:
         """
         policy = HeldBack(self.blocks, patches, masked)
         # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
-        parts = dataclasses.replace(Parts(), mask=policy, density_config=FIXED, weighting="images")
+        parts = dataclasses.replace(MethodHooks(), mask=policy, density_config=FIXED, weighting="images")
         config = TrainConfig(iterations=iterations, seed=SEED, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(self.data, with_effects(parts, effects), config, folder=self.folder)
         trainer.train(tick=lambda _: tick())
@@ -353,14 +353,14 @@ def compare(with_it: Mapping[str, float], without: Mapping[str, float]) -> Gain 
     return Gain(float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference))))
 
 
-def plan(scene: Path | str) -> Plan:
+def plan(scene: Path | str) -> EffectsPlan:
     """Decide which effects a scene needs, and whether masks, as `aw plan` does."""
     prepare_cpu(None)
     loaded = load_scene(scene)
     return with_masks(replace(plan_effects(loaded), scene_hash=scene_identity(loaded)), loaded)
 
 
-def with_masks(plan: Plan, scene: Scene, bar: Bar = NO_BAR) -> Plan:
+def with_masks(plan: EffectsPlan, scene: Scene, bar: Bar = NO_BAR) -> EffectsPlan:
     """Return the plan with its lines about masks, from probes.
 
     Args:
@@ -386,7 +386,7 @@ def with_masks(plan: Plan, scene: Scene, bar: Bar = NO_BAR) -> Plan:
     return with_gain(plan, compare(*psnr))
 
 
-def with_gain(plan: Plan, gain: Gain | None) -> Plan:
+def with_gain(plan: EffectsPlan, gain: Gain | None) -> EffectsPlan:
     """Return the plan with masks off if few pixels are unexplained and leaving them out does not help.
 
     From `CERTAIN` on masks stay on: a sparse model of few points is too coarse to show the difference.
@@ -410,7 +410,7 @@ def with_gain(plan: Plan, gain: Gain | None) -> Plan:
     return replace(plan, decisions=tuple(line(d) for d in plan.decisions))
 
 
-def with_occlusion(plan: Plan, occlusion: Occlusion) -> Plan:
+def with_occlusion(plan: EffectsPlan, occlusion: Occlusion) -> EffectsPlan:
     """Return the plan with the lines about masks, which come first."""
 
     def line(
@@ -444,7 +444,7 @@ def effect_costs(scene: Scene) -> dict[str, float]:
         folder, config = Path(name), TrainConfig(iterations=10_000, probes=0)
         data = small_data(scene, folder)
         trainers = {
-            e: Trainer(data, with_effects(Parts(), (e,) if e else ()), config, folder=folder / e)
+            e: Trainer(data, with_effects(MethodHooks(), (e,) if e else ()), config, folder=folder / e)
             for e in ("", *ALL)
         }
         times: dict[str, list[float]] = {e: [] for e in trainers}

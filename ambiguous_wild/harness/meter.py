@@ -60,7 +60,7 @@ def unit(device: str) -> str:
     return _gpu_name(device) if device.startswith("cuda") else "cpu"
 
 
-class Presence:
+class ActiveRuns:
     """Announce a run of this program to others on the same hardware, and count them."""
 
     def __init__(self, unit: str, folder: Path | None = None) -> None:
@@ -154,7 +154,7 @@ class Meter:
         threads: int,
         *,
         read: Callable[[], Reading] | None = None,
-        presence: Presence | None = None,
+        presence: ActiveRuns | None = None,
     ) -> None:
         """
         Args:
@@ -166,7 +166,7 @@ class Meter:
         self.device, self.threads = device, threads
         self.kernel = KERNELS["cuda" if device.startswith("cuda") else "cpu"]
         self._read = read or (lambda: calibration(torch.device(device)).read())
-        self.presence = presence or Presence(unit(device))
+        self.presence = presence or ActiveRuns(unit(device))
         self._stack = ExitStack()
         self.samples: list[list[float]] = []  # trained seconds and the numbers of a Reading; NaN = missing
         self.runs = 1

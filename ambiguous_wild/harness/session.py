@@ -18,7 +18,7 @@ from ambiguous_wild.harness.callbacks import Callbacks, Engine, allowed_cores
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions
-    from ambiguous_wild.harness.job import Job, Source
+    from ambiguous_wild.harness.job import CodeSource, Job
     from ambiguous_wild.harness.ray_cluster import RayCluster
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -83,7 +83,7 @@ class Session:
         cells: Sequence[Cell],
         output: Path,
         options: RunOptions,
-        sources: tuple[Source, ...] = (),  # code that the runs need
+        sources: tuple[CodeSource, ...] = (),  # code that the runs need
     ) -> list[CellReport]:
         """Run the cells in processes of this machine or on the cluster; return reports in their order."""
         from ambiguous_wild.harness.grid import checked_folders

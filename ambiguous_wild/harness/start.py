@@ -11,11 +11,11 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.ply import has_splats, read_point_ply
-from ambiguous_wild.io.splat_files import Splats, read_splats
+from ambiguous_wild.io.splat_files import SplatFile, read_splats
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.pace import TrainConfig
-    from ambiguous_wild.splat.parts import Parts
+    from ambiguous_wild.splat.parts import MethodHooks
 
 _CHECKED_POINTS = 2000  # number of points that are projected into the train views
 
@@ -43,12 +43,12 @@ def start_file(path: Path) -> StartFile:
         AwError: the file cannot be read, or is of another kind.
     """
     content = _read(path)
-    is_splats = isinstance(content, Splats)
-    count = len(content.gaussians["means"]) if isinstance(content, Splats) else len(content[0])
+    is_splats = isinstance(content, SplatFile)
+    count = len(content.gaussians["means"]) if isinstance(content, SplatFile) else len(content[0])
     return StartFile(path.resolve(), sha256_file(path), count, "splats" if is_splats else "points")
 
 
-def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
+def started(parts: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
     """Return the parts of a method with the content of the file to start from.
 
     Raises:
@@ -61,7 +61,7 @@ def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
     content, place = _read(start.path), scene.place
     if sha256_file(start.path) != start.sha256:
         raise AwError(f"{start.path} has changed since the run was planned; bench again")
-    if isinstance(content, Splats):
+    if isinstance(content, SplatFile):
         arrays = moved(content.gaussians, content.place, place)
         _refuse_unseen(start.path, arrays["means"], scene)
         return replace(parts, given=gaussians_of(arrays))
@@ -70,7 +70,7 @@ def started(parts: Parts, start: StartFile | None, scene: Scene) -> Parts:
     return replace(parts, given=(xyz, content[1]))
 
 
-def start_line(start: StartFile, method: str, parts: Parts, train: TrainConfig, scene: Scene) -> str:
+def start_line(start: StartFile, method: str, parts: MethodHooks, train: TrainConfig, scene: Scene) -> str:
     """Return a line that says how many splats or points of the file a run starts from."""
     from ambiguous_wild.splat.pace import room
     from ambiguous_wild.splat.parts import thinned
@@ -85,7 +85,7 @@ def start_line(start: StartFile, method: str, parts: Parts, train: TrainConfig, 
     return f"{scene.name}: {method} starts from {of}{thin}"
 
 
-def _read(path: Path) -> Splats | tuple[np.ndarray, np.ndarray]:
+def _read(path: Path) -> SplatFile | tuple[np.ndarray, np.ndarray]:
     """Read the Gaussians of a splat file, or the points [M, 3] and colours [M, 3] of another PLY."""
     if has_splats(path):
         return read_splats(path)

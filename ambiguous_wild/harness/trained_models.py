@@ -20,7 +20,7 @@ from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
-from ambiguous_wild.viewing.model import Model, RenderSettings, file_model
+from ambiguous_wild.viewing.model import RenderSettings, ViewedModel, file_model
 from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, PAGE, Page, check_page_folder, page_text
 from ambiguous_wild.viewing.video import scene_around
 
@@ -34,7 +34,7 @@ class TrainedModel:
     run: Path
     scene: str  # name
     scene_hash: str
-    model: Model
+    model: ViewedModel
     half: bool  # measured on the right half of each test photo
     note: str = ""  # how it is drawn, where that may differ from training
 
@@ -44,7 +44,7 @@ class SceneModels:
     """Models of one scene."""
 
     scene: Scene
-    models: tuple[Model, ...]
+    models: tuple[ViewedModel, ...]
     notes: tuple[str, ...]  # which runs are not shown, and why; the meaning of numbers
 
 
@@ -89,7 +89,7 @@ def read_models(
     return SceneModels(opened, models, tuple(notes))
 
 
-def read_files(paths: Sequence[Path]) -> tuple[list[Model], list[str]]:
+def read_files(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
     """Read the models of the splat files among the paths, with unique labels, and notes on them.
 
     Raises:
@@ -185,7 +185,7 @@ def _read_model(run: Path) -> TrainedModel:
     config = read_config(run)
     look, note = read_render_settings(config)
     psnr = {row["name"]: metrics_of(row).get("psnr") for row in result["per_image"]}
-    model = Model(
+    model = ViewedModel(
         label=result["method"],
         ply=ply,
         render_settings=look,

@@ -33,7 +33,7 @@ from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.run import Stopped
 from ambiguous_wild.splat.trainer import Trainer
 
@@ -193,7 +193,7 @@ def check_passes(cell: Cell) -> None:
         refuse_without_masks(cell.method.base, cell.method.build(cell.options))
 
 
-def refuse_without_masks(name: str, parts: Parts) -> None:
+def refuse_without_masks(name: str, parts: MethodHooks) -> None:
     """Raise AwError if the method's mask policy keeps every pixel."""
     policy = parts.mask.mask if isinstance(parts.mask, GraftedPolicy) else parts.mask
     kind = type(policy)

@@ -91,7 +91,7 @@ def unpack(
     name = source if isinstance(source, Path) else Path("the archive")
     try:
         packed = source.stat().st_size if isinstance(source, Path) else len(source)
-        target = _Target(name, packed, limits or Limits(), folder, wanted)
+        target = _UnpackFolder(name, packed, limits or Limits(), folder, wanted)
         opened = open(source, "rb") if isinstance(source, Path) else io.BytesIO(source)  # noqa: SIM115
         with opened as raw, _named_errors(name):
             members = _zip_members if zipfile.is_zipfile(raw) else _tar_members
@@ -150,7 +150,7 @@ def _named_errors(source: Path) -> Iterator[None]:
         raise AwError(f"{source} is a damaged or cut archive ({error}); download it again") from error
 
 
-class _Target:
+class _UnpackFolder:
     """The folder that one archive is unpacked into; counts its files and bytes."""
 
     def __init__(

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.scene import Points, View
+from ambiguous_wild.core.scene import SparsePoints, View
 from ambiguous_wild.io.colmap_records import (
     FOCAL_RANGE,
     LARGEST_COORDINATE,
@@ -23,7 +23,7 @@ from ambiguous_wild.io.colmap_records import (
     MODELS,
     ONE_FOCAL,
     SPLIT_PANORAMAS,
-    Model,
+    ColmapModel,
     ModelCamera,
     ModelImage,
     ModelPoints,
@@ -41,7 +41,7 @@ _POINT_ROW = np.dtype(
 )
 
 
-def read_model(folder: Path | str) -> Model:
+def read_model(folder: Path | str) -> ColmapModel:
     """Read cameras, images and, if present, points3D of a model folder: .bin files if it has them, else .txt.
 
     Raises:
@@ -56,7 +56,7 @@ def read_model(folder: Path | str) -> Model:
         raise AwError(f"{root} holds no COLMAP model: cameras and images (.bin or .txt) are needed")
     cameras, images, points = _BINARY if suffix == ".bin" else _TEXT
     none = points_without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    model = Model(cameras(paths[0]), images(paths[1]), points(paths[2]) if paths[2].is_file() else none)
+    model = ColmapModel(cameras(paths[0]), images(paths[1]), points(paths[2]) if paths[2].is_file() else none)
     for camera in model.cameras.values():
         check_camera(root, camera)
     names: set[str] = set()
@@ -314,14 +314,14 @@ _BINARY = (_binary_cameras, _binary_images, _binary_points)
 _TEXT = (_text_cameras, _text_images, _text_points)
 
 
-def write_model(folder: Path, model: Model) -> None:
+def write_model(folder: Path, model: ColmapModel) -> None:
     """Write cameras.bin and images.bin, ordered by id, and points3D.bin, in the order given."""
     _write_cameras(folder / "cameras.bin", model.cameras.values())
     _write_images(folder / "images.bin", model.images.values())
     _write_points(folder / "points3D.bin", model.points)
 
 
-def write_views(folder: Path, views: Sequence[View], points: Points) -> None:
+def write_views(folder: Path, views: Sequence[View], points: SparsePoints) -> None:
     """Write a model with a pinhole camera a view, at the views' size, and points without tracks."""
     from scipy.spatial.transform import Rotation
 
@@ -331,7 +331,7 @@ def write_views(folder: Path, views: Sequence[View], points: Points) -> None:
         cameras[number] = ModelCamera(number, "PINHOLE", c.width, c.height, (c.fx, c.fy, c.cx, c.cy))
         qvec = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
         images[number] = ModelImage(number, qvec, pose[:3, 3], number, view.name, np.zeros((0, 2)), none)
-    write_model(folder, Model(cameras, images, points_without_tracks(points.xyz, points.rgb)))
+    write_model(folder, ColmapModel(cameras, images, points_without_tracks(points.xyz, points.rgb)))
 
 
 def _write_cameras(path: Path, cameras: Iterable[ModelCamera]) -> None:

@@ -129,7 +129,7 @@ class ModelPoints:
 
 
 @dataclass(frozen=True)
-class Model:
+class ColmapModel:
     """cameras, images and points of one sparse model."""
 
     cameras: dict[int, ModelCamera]

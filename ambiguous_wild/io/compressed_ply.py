@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.ply import place_comments
 from ambiguous_wild.io.splat_arrays import (
@@ -40,7 +40,7 @@ _SQRT_2 = 2.0**0.5
 _MOST_BYTES = 1 << 33
 
 
-def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
+def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UNMOVED) -> int:
     """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
 
     Args:

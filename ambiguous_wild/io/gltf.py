@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     SH_C0,
@@ -39,7 +39,7 @@ def _harmonics(rest: int) -> list[str]:
     return [f"SH_DEGREE_{d}_COEF_{c}" for d in range(1, degree + 1) for c in range(2 * d + 1)]
 
 
-def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
+def write_gltf(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UNMOVED) -> int:
     """Write a .glb atomically and return how many Gaussians were written.
 
     Args:
@@ -125,7 +125,7 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -
     return n
 
 
-def gltf_place(path: Path | str) -> Place:
+def gltf_place(path: Path | str) -> SceneTransform:
     """Return the place of the scene of a file that `read_gltf` has read."""
     data = read_bytes(path, _MOST_BYTES)
     (length,) = struct.unpack_from("<I", data, 12)

@@ -10,7 +10,7 @@ from typing import IO
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.files import atomic_path
 
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
@@ -31,7 +31,9 @@ def _columns(rest: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def write_splat_ply(path: Path | str, gaussians: Mapping[str, np.ndarray], place: Place = UNMOVED) -> None:
+def write_splat_ply(
+    path: Path | str, gaussians: Mapping[str, np.ndarray], place: SceneTransform = UNMOVED
+) -> None:
     """Write Gaussians atomically.
 
     If the scene was moved, the file has the units of the scene's files, and a comment in the header gives the
@@ -88,7 +90,7 @@ def rescaled(gaussians: Mapping[str, np.ndarray], factor: float) -> Mapping[str,
     return {**gaussians, "means": (means * factor).astype(means.dtype), **sizes}
 
 
-def place_comments(place: Place) -> list[str]:
+def place_comments(place: SceneTransform) -> list[str]:
     """Return header lines of a PLY that record the place of its scene."""
     values = {"offset": place.centre, "training_scale": (place.scale,), "rotation": place.turn}
     if place.turn == UNMOVED.turn:
@@ -97,7 +99,7 @@ def place_comments(place: Place) -> list[str]:
     return [] if place == UNMOVED else lines
 
 
-def read_place(path: Path | str) -> Place:
+def read_place(path: Path | str) -> SceneTransform:
     """Return the place of the scene of a splat PLY; `UNMOVED` if another tool wrote it.
 
     Raises:
@@ -118,7 +120,9 @@ def read_place(path: Path | str) -> Place:
         raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
 
 
-def checked_place(offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn) -> Place:
+def checked_place(
+    offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn
+) -> SceneTransform:
     """Return the place that a file records.
 
     Raises:
@@ -127,7 +131,9 @@ def checked_place(offset: Sequence[float], scale: float, turn: Sequence[float] =
     (x, y, z), (a, b, c, d) = offset, turn
     if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(turn)):
         raise ValueError("invalid place")
-    return Place((float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d)))
+    return SceneTransform(
+        (float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d))
+    )
 
 
 def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:

@@ -10,12 +10,12 @@ from typing import Any, Literal, TypeGuard, cast
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split, centred, unlikely
 from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import Model, ModelImage
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelImage
 from ambiguous_wild.io.files import sha256_file, unique_keys
 from ambiguous_wild.io.images import image_size
 
@@ -338,7 +338,9 @@ def _refuse_same_stems(root: Path, views: tuple[View, ...]) -> None:
         seen[key] = view.name
 
 
-def _view(root: Path, folder: Path, model: Model, image: ModelImage, side: Split, mask: Path | None) -> View:
+def _view(
+    root: Path, folder: Path, model: ColmapModel, image: ModelImage, side: Split, mask: Path | None
+) -> View:
     path = _image_path(folder, _inside(image.name, root))
     width, height = image_size(path)
     full = model.cameras[image.camera_id]
@@ -364,7 +366,7 @@ def _image_path(folder: Path, name: str) -> Path:
     raise AwError(f"{folder} lacks {name}, which the model registers; restore it or build the scene again")
 
 
-def _points(model: Model, views: tuple[View, ...]) -> Points:
+def _points(model: ColmapModel, views: tuple[View, ...]) -> SparsePoints:
     """Return the model's points, with tracks in view indices and px of the loaded files."""
     points = model.points
     count = len(points.track_image_ids)
@@ -390,4 +392,4 @@ def _points(model: Model, views: tuple[View, ...]) -> Points:
             scale = np.array([view.camera.width / full.width, view.camera.height / full.height])
             track_views[rows] = position
         track_xy[rows] = image.xys[index] * scale
-    return Points(points.xyz, points.rgb, points.error_px, points.track_offsets, track_views, track_xy)
+    return SparsePoints(points.xyz, points.rgb, points.error_px, points.track_offsets, track_views, track_xy)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
@@ -41,7 +41,7 @@ _MOST_BYTES, _MOST_TEXTURE = 1 << 32, 1 << 28
 _LOSSLESS = 101  # WebP quality above 100
 
 
-def write_sog(path: Path | str, gaussians: Arrays, *, place: Place = UNMOVED) -> int:
+def write_sog(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UNMOVED) -> int:
     """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
 
     Args:
@@ -117,7 +117,7 @@ def read_sog(path: Path | str) -> dict[str, np.ndarray]:
         raise AwError(f"{path} is no SOG of version 2, or damaged: {error}") from None
 
 
-def sog_place(path: Path | str) -> Place:
+def sog_place(path: Path | str) -> SceneTransform:
     """Return the place of the scene of a file that `read_sog` has read."""
     with zipfile.ZipFile(path) as archive:
         return place_from(json.loads(_member(archive, "meta.json")).get("asset"))

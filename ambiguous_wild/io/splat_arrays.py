@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.ply import checked_place
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
@@ -109,13 +109,13 @@ def read_bytes(path: Path | str, most: int) -> bytes:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
 
 
-def place_facts(place: Place) -> dict[str, float | list[float]]:
+def place_facts(place: SceneTransform) -> dict[str, float | list[float]]:
     """Return the place as written to files: the user's coordinates are positions / scale + offset."""
     turned = {} if place.turn == UNMOVED.turn else {"rotation": list(place.turn)}
     return {} if place == UNMOVED else {"offset": list(place.centre), "scale": place.scale, **turned}
 
 
-def place_from(facts: Any) -> Place:
+def place_from(facts: Any) -> SceneTransform:
     """Return the place for a result of `place_facts`; `UNMOVED` for anything else."""
     try:
         return checked_place(facts["offset"], facts["scale"], facts.get("rotation", UNMOVED.turn))

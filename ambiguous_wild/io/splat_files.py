@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io import compressed_ply, gltf, sog, spz
 from ambiguous_wild.io.ply import read_place, read_splat_ply
 from ambiguous_wild.io.splat_arrays import finite, read_bytes
@@ -17,16 +17,16 @@ _MOST_BYTES = 1 << 33
 
 
 @dataclass(frozen=True)
-class Splats:
+class SplatFile:
     """The Gaussians of a file whose values are all finite, at least one."""
 
     gaussians: dict[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
-    place: Place  # place of the scene in whose coordinates they are
+    place: SceneTransform  # place of the scene in whose coordinates they are
     antialias: bool  # whether the file says that it is drawn with Mip-Splatting's filter
     left_out: int  # number of Gaussians with values that are not finite
 
 
-def read_splats(path: Path) -> Splats:
+def read_splats(path: Path) -> SplatFile:
     """Read a splat PLY, a compressed PLY, SPZ, SOG, or a glTF of 'aw export'.
 
     Raises:
@@ -55,4 +55,4 @@ def read_splats(path: Path) -> Splats:
     kept = finite(arrays)
     if not len(kept["means"]):
         raise AwError(f"{path} holds no Gaussian that is finite")
-    return Splats(kept, place, antialias, len(arrays["means"]) - len(kept["means"]))
+    return SplatFile(kept, place, antialias, len(arrays["means"]) - len(kept["means"]))

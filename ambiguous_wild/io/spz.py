@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Place
+from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
@@ -45,7 +45,9 @@ FLIP = np.array([1.0, -1.0, -1.0], np.float32)  # signs that turn positions from
 SH_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
-def write_spz(path: Path | str, gaussians: Arrays, *, antialias: bool = False, place: Place = UNMOVED) -> int:
+def write_spz(
+    path: Path | str, gaussians: Arrays, *, antialias: bool = False, place: SceneTransform = UNMOVED
+) -> int:
     """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
 
     Args:
@@ -100,7 +102,7 @@ def read_spz(path: Path | str) -> dict[str, np.ndarray]:
     return spz_arrays(read_bytes(path, _MOST_BYTES), path)
 
 
-def spz_facts(packed: bytes) -> tuple[bool, Place]:
+def spz_facts(packed: bytes) -> tuple[bool, SceneTransform]:
     """Tell whether an SPZ model is drawn with Mip-Splatting's filter, and return the place of its scene."""
     zipped = packed[:4] != _FOURTH
     head = zlib.decompressobj(wbits=31).decompress(packed, _HEADER.size) if zipped else packed

@@ -18,7 +18,7 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
 
@@ -41,9 +41,9 @@ class AbsGsConfig(DensityConfig):
         )  # fmt: skip
 
 
-def build(options: AbsGsConfig) -> Parts:
+def build(options: AbsGsConfig) -> MethodHooks:
     """Return 3DGS with growth by two gradients."""
-    return Parts(density=AbsDensity, density_config=options)
+    return MethodHooks(density=AbsDensity, density_config=options)
 
 
 class AbsoluteSums(DensityControl):

@@ -34,9 +34,9 @@ from ambiguous_wild.splat.field import GaussianAttribute, Rates
 from ambiguous_wild.splat.fields import STATIC, Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MaskPolicy, Parts, Schedule
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
@@ -97,10 +97,10 @@ class AsymGsConfig:
     support: float = 0.1  # instances with this share of the photo's density of points are static
 
 
-def build(options: AsymGsConfig) -> Parts:
+def build(options: AsymGsConfig) -> MethodHooks:
     """Return 3DGS with masks, the average as an effect, and growth that updates it."""
     average, rates = SlowAverage(0.8), Schedule(lr_opacity=0.1)
-    return Parts(AsymMask(options, average), SlowDensity, options.density, rates, effects=(average,))
+    return MethodHooks(AsymMask(options, average), SlowDensity, options.density, rates, effects=(average,))
 
 
 class AsymMask(MaskPolicy):
@@ -185,10 +185,10 @@ class TwinConfig(AsymGsConfig):
     colour: float = 0.9
 
 
-def build_twin(options: TwinConfig) -> Parts:
+def build_twin(options: TwinConfig) -> MethodHooks:
     """Return 3DGS with the hard mask, and the second model as a field that no picture shows."""
     masks, rates = HardMask(options), Schedule(lr_opacity=0.1)
-    return Parts(masks, DensityControl, options.density, rates, fields=Twin(options, masks))
+    return MethodHooks(masks, DensityControl, options.density, rates, fields=SecondModel(options, masks))
 
 
 class HardMask(AsymMask):
@@ -199,10 +199,10 @@ class HardMask(AsymMask):
 
     predict = keep
 
-    cotangent = MaskPolicy.cotangent  # type: ignore[assignment]  # no loss here: `Twin` compares the models
+    cotangent = MaskPolicy.cotangent  # type: ignore[assignment]  # no loss here: `SecondModel` compares the models
 
 
-class Twin(Fields):
+class SecondModel(Fields):
     """The second model. It is drawn beside the first and is part of no picture; both must agree."""
 
     def __init__(self, config: TwinConfig, masks: AsymMask) -> None:
@@ -215,10 +215,10 @@ class Twin(Fields):
         density = DensityControl(self.config.density, data.scene.extent, data.seed + 1)
         return {TWIN: FieldStart(start, rates, density, most=None)}
 
-    def drawn(self, shot: Shot) -> tuple[str, ...]:
+    def drawn(self, shot: ViewContext) -> tuple[str, ...]:
         return (TWIN,)
 
-    def regularise(self, frames: Mapping[str, Frame], shot: Shot) -> Mapping[str, Cotangents]:
+    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
         """Return gradients of the models' difference and of the second one's loss in its own view."""
         apart = frames[STATIC].image - frames[TWIN].image
         weight = self.config.consistency if shot.nominal > self.config.warm_up else 0.0

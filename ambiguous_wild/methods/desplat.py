@@ -21,9 +21,9 @@ from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.field import Rates
 from ambiguous_wild.splat.fields import STATIC, ComposePull, Fields, FieldStart, frames_of, over
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Frame
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 _NEAREST = 0.02  # least distance of a layer; the renderer draws nothing nearer than 0.01
 
@@ -56,12 +56,12 @@ class DeSplatConfig:
         )
 
 
-def build(options: DeSplatConfig) -> Parts:
+def build(options: DeSplatConfig) -> MethodHooks:
     """Return 3DGS with one field for each photo; its mask is what the layer leaves uncovered."""
-    return Parts(fields=Layers(options), mask=Uncovered(), density_config=options.density)
+    return MethodHooks(fields=Layers(options), mask=LayerMask(), density_config=options.density)
 
 
-class Uncovered(MaskPolicy):
+class LayerMask(MaskPolicy):
     """1 - A of the photo's layer, for pictures and metrics: the loss uses the composite instead."""
 
     def composed_keep(self, step: Step) -> Tensor | None:
@@ -99,17 +99,17 @@ class Layers(Fields):
         gaussians = Gaussians.from_points(world, colours, sh_degree=0, opacity=self.config.start_opacity)
         return replace(gaussians, quats=torch.from_numpy(rng.standard_normal((n, 4)).astype(np.float32)))
 
-    def drawn(self, shot: Shot) -> Sequence[str]:
+    def drawn(self, shot: ViewContext) -> Sequence[str]:
         return () if shot.view is None or shot.iteration < self.config.min_start else (str(shot.view),)
 
-    def compose(self, frames: Mapping[str, Frame], shot: Shot) -> tuple[Frame, ComposePull]:
+    def compose(self, frames: Mapping[str, Frame], shot: ViewContext) -> tuple[Frame, ComposePull]:
         front = next(iter(self.drawn(shot)), None)
         if front is None:
             return frames[STATIC], lambda given: {STATIC: given}
         frame, pull = over(frames[front], frames[STATIC])
         return frame, lambda given: dict(zip((front, STATIC), pull(given)))
 
-    def regularise(self, frames: Mapping[str, Frame], shot: Shot) -> Mapping[str, Cotangents]:
+    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
         weights = dict.fromkeys(frames, self.config.alpha_own) | {STATIC: -self.config.alpha_static}
         alphas = {name: frame.alpha for name, frame in frames.items()}
         return {k: Cotangents(alpha=torch.full_like(a, weights[k] / a.numel())) for k, a in alphas.items()}

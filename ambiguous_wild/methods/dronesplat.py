@@ -22,7 +22,7 @@ from ambiguous_wild.methods.masking_common import CountingMask, MaskedShares, Wa
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
 from ambiguous_wild.vision.precompute import instance_labels
@@ -46,9 +46,9 @@ class DroneSplatConfig:
             raise AwError(f"dronesplat.weight_l1 cannot be negative, got {self.weight_l1}")
 
 
-def build(options: DroneSplatConfig) -> Parts:
+def build(options: DroneSplatConfig) -> MethodHooks:
     """Return 3DGS with local masks."""
-    return Parts(
+    return MethodHooks(
         mask=DroneSplatMask(options), density_config=options.density, lambda_dssim=options.lambda_dssim
     )
 

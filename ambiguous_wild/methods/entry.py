@@ -22,21 +22,21 @@ from ambiguous_wild.methods.ablation import Group
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.external_process import Program
-    from ambiguous_wild.splat.parts import Parts
+    from ambiguous_wild.splat.parts import MethodHooks
 
 
 @dataclass(frozen=True)
 class MethodEntry:
     """A method: its line in `aw methods`, and where its recipe and options are.
 
-    `recipe` is "module:function" or a function; it takes the options and returns `Parts`. `config` is
+    `recipe` is "module:function" or a function; it takes the options and returns `MethodHooks`. `config` is
     "module:Class" or a frozen dataclass: the options of the method, all with defaults. It need not be given
     if it is the type of the function's argument.
     """
 
     name: str
     summary: str
-    recipe: str | Callable[[Any], Parts]
+    recipe: str | Callable[[Any], MethodHooks]
     config: str | type | None = None
     paper: str = ""
     needs: str = ""  # required extras, weights or hardware; empty = none
@@ -113,13 +113,13 @@ class MethodEntry:
         """Return the ablations that the method declares; may be empty."""
         return tuple(resolve(self.ablations))
 
-    def build(self, options: Any) -> Parts:
+    def build(self, options: Any) -> MethodHooks:
         """Call the recipe; returns the parts that fill the training loop.
 
         Raises:
             AwError: the recipe returned something else, or takes more than the options.
         """
-        from ambiguous_wild.splat.parts import Parts
+        from ambiguous_wild.splat.parts import MethodHooks
 
         recipe = resolve(self.recipe)
         needed = required(recipe)
@@ -129,7 +129,7 @@ class MethodEntry:
                 "or one argument whose type is a dataclass of options"
             )
         parts = recipe(options) if needed or self.config else recipe()
-        if not isinstance(parts, Parts):
+        if not isinstance(parts, MethodHooks):
             what = "None" if parts is None else type(parts).__name__
             raise AwError(f"{self.name} returned {what}, it must return Parts (see docs/extend.md)")
         return parts

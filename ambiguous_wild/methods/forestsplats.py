@@ -29,14 +29,14 @@ from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansCo
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, mlp_leaves
-from ambiguous_wild.splat.effects.placing import Unit, conv_leaves, frequencies
+from ambiguous_wild.splat.effects.placing import SceneNormaliser, conv_leaves, frequencies
 from ambiguous_wild.splat.field import Rates
 from ambiguous_wild.splat.fields import STATIC, ComposePull, Fields, FieldStart
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Pull
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 OCTAVES, LAYERS, SKIP = 10, 8, 4
 
@@ -76,7 +76,7 @@ class Nets(Learnt):
 
     def setup(self, data: TrainData) -> None:
         super().setup(data)
-        self.unit = Unit(data.scene.points.xyz, data.device)
+        self.unit = SceneNormaliser(data.scene.points.xyz, data.device)
         self.segments = [self._superpixels(photo).to(data.device) for photo in data.photos]
 
     def _superpixels(self, photo: Tensor) -> Tensor:
@@ -102,7 +102,9 @@ class Nets(Learnt):
             leaves |= conv_leaves(name, channels, rng, self.config.lr_mask)
         return leaves | conv_leaves("last", (128, 1), rng, self.config.lr_mask, side=1)
 
-    def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
+    def change(
+        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext
+    ) -> Mapping[str, Tensor]:
         """Deform the transient Gaussians for this photo."""
         assert shot.view is not None
         time = torch.full_like(gaussians.means[:, :1], shot.view / max(self.photos - 1, 1))
@@ -151,13 +153,13 @@ def fill(mask: Tensor, segments: Tensor, count: int, share: float) -> Tensor:
 TRANSIENT = "transient"
 
 
-def build(options: ForestSplatsConfig) -> Parts:
+def build(options: ForestSplatsConfig) -> MethodHooks:
     """Return a static and a transient field, mixed by the mask."""
     nets = Nets(options)
     effects: tuple[Effect, ...] = (nets,)
     if options.appearance:
         effects = (nets, WildAppearance(WildGaussiansConfig()))
-    return Parts(mask=Mixed(nets), density_config=options.density, fields=Forest(nets), effects=effects)
+    return MethodHooks(mask=Mixed(nets), density_config=options.density, fields=Forest(nets), effects=effects)
 
 
 class Forest(Fields):
@@ -175,19 +177,19 @@ class Forest(Fields):
         rows = torch.from_numpy(np.sort(rng.choice(len(static), count, replace=False))).to(static.device)
         return {TRANSIENT: FieldStart(replace(static.select(rows), attributes={}), rates)}
 
-    def drawn(self, shot: Shot) -> Sequence[str]:
+    def drawn(self, shot: ViewContext) -> Sequence[str]:
         return () if shot.view is None else (TRANSIENT,)
 
-    def deform(self, name: str, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+    def deform(self, name: str, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
         return self.nets.model(gaussians, shot)
 
     @torch.no_grad()
-    def mask(self, shot: Shot) -> Tensor:
+    def mask(self, shot: ViewContext) -> Tensor:
         """Return M_f of a train photo."""
         assert shot.photo is not None and shot.view is not None
         return self.nets.filled(self.nets.masked(shot.photo, self.nets._leaf(shot)), shot.view)
 
-    def compose(self, frames: Mapping[str, Frame], shot: Shot) -> tuple[Frame, ComposePull]:
+    def compose(self, frames: Mapping[str, Frame], shot: ViewContext) -> tuple[Frame, ComposePull]:
         front, back, mask = frames[TRANSIENT], frames[STATIC], self.mask(shot)
         share = {TRANSIENT: mask, STATIC: 1.0 - mask}
         image = mask[..., None] * front.image + (1.0 - mask)[..., None] * back.image
@@ -211,7 +213,7 @@ class Forest(Fields):
 
         return Frame(image, alpha, lambda: back.depth), pull
 
-    def regularise(self, frames: Mapping[str, Frame], shot: Shot) -> Mapping[str, Cotangents]:
+    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
         assert shot.photo is not None
         config, nets, photo = self.config, self.nets, shot.photo
         static, transient = frames[STATIC].image.detach(), frames[TRANSIENT].image.detach()

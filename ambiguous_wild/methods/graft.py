@@ -6,7 +6,7 @@ ones. The places, and what a donor fills them with:
 mask         the keep map (`MaskPolicy.keep`, `predict`), and what it learns
 density      the density control and its config
 regulariser  the donor policy's loss on the render (`MaskPolicy.cotangent`), under the host's keep map
-effects      the donor's own effects (`Parts.effects`) instead of the host's
+effects      the donor's own effects (`MethodHooks.effects`) instead of the host's
 
 Everything else stays the host's: schedule, how the keep map enters SSIM, which photos. Grafts that cannot
 work are refused, see graft_checks.py. Imports no torch: names are checked before anything heavy is loaded.
@@ -26,7 +26,7 @@ from ambiguous_wild.methods.references import is_program, is_reference, referenc
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.graft_checks import Member
-    from ambiguous_wild.splat.parts import Parts
+    from ambiguous_wild.splat.parts import MethodHooks
 
 PLACES = ("mask", "density", "regulariser", "effects")
 ALIASES = {"none": "3dgs", "motion": "3dgs+motion", "truth": "3dgs+truth"}  # short names of donors
@@ -137,11 +137,11 @@ class Graft:
     name: str
     entries: Mapping[str, MethodEntry]  # "host", and the donor of every place that is filled
 
-    def __call__(self, options: Any) -> Parts:
+    def __call__(self, options: Any) -> MethodHooks:
         return build(self.name, self.entries, options)
 
 
-def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Parts:
+def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> MethodHooks:
     """Return the host's parts with those of the donors in their places.
 
     A method that fills two places with the same options is built once, so its frozen inputs are prepared
@@ -183,7 +183,7 @@ def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tup
     from ambiguous_wild.methods.graft_checks import Member
 
     typed, members = dict(_pairs(name)), {}
-    built: list[tuple[str, Any, Parts]] = []  # method, options, parts
+    built: list[tuple[str, Any, MethodHooks]] = []  # method, options, parts
     for place, entry in entries.items():
         own = getattr(options, place)
         parts = next((parts for method, set_, parts in built if method == entry.name and set_ == own), None)

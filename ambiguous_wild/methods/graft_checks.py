@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 
 NOTHING = ("none", "3dgs")  # donors that leave a place empty
 # hooks by which an effect changes a picture, or the Gaussians in it
@@ -19,7 +19,7 @@ class Member:
     """The host or a donor of a graft."""
 
     name: str  # as in the name of the graft
-    parts: Parts
+    parts: MethodHooks
 
 
 def check_members(host: Member, donors: Mapping[str, Member]) -> None:
@@ -61,12 +61,12 @@ def left_out(host: Member, donors: Mapping[str, Member]) -> list[str]:
     return list(warnings.values())
 
 
-def has_masks(parts: Parts) -> bool:
+def has_masks(parts: MethodHooks) -> bool:
     """Whether another method can take this method's masks."""
     return type(parts.mask).keep is not MaskPolicy.keep
 
 
-def masks_of_fields(parts: Parts) -> bool:
+def masks_of_fields(parts: MethodHooks) -> bool:
     """Whether the method's masks only show what its own fields have learnt, and weight no loss."""
     shown = type(parts.mask).predict is not MaskPolicy.predict
     return parts.fields is not None and shown and not has_masks(parts)

@@ -29,7 +29,7 @@ from ambiguous_wild.methods.masking_common import EffectMask, d_keep, hashed_uni
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.placing import (
-    Unit,
+    SceneNormaliser,
     conv_leaves,
     directions,
     frequencies,
@@ -39,9 +39,9 @@ from ambiguous_wild.splat.effects.placing import (
 )
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import Parts, Schedule
+from ambiguous_wild.splat.parts import MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 CHANNELS, FREE = 16, 2  # channels of a map; number of maps that are sampled at learnt places
 DYNAMIC = (FREE + 1) * CHANNELS
@@ -125,10 +125,10 @@ class GswConfig:
         check_limits(self, "gs-w", side=(16, 4096), width=(1, 512), dropout=(0, 0.9))
 
 
-def build(options: GswConfig) -> Parts:
+def build(options: GswConfig) -> MethodHooks:
     """Return 3DGS with such colours, masks of the same U-Net, and a higher threshold of growth."""
     effect = GswAppearance(options)
-    return Parts(
+    return MethodHooks(
         mask=Visibility(effect), density_config=options.density, weighting="images",
         schedule=Schedule(lr_means_final=1.6e-7), effects=(effect,),
     )  # fmt: skip
@@ -144,7 +144,7 @@ class GswAppearance(Learnt):
 
     def setup(self, data: TrainData) -> None:
         self.seed, self.points, self.all_photos = data.seed, data.sfm_points, data.photos
-        self.unit = Unit(data.scene.points.xyz, data.device)
+        self.unit = SceneNormaliser(data.scene.points.xyz, data.device)
         self.cameras, count = data.cameras, len(data.photos)
         self.chosen = sorted({k * count // min(count, MOST) for k in range(min(count, MOST))})
         self._cached: tuple[float, list[Tensor]] | None = None  # nominal iteration, and maps of those photos
@@ -176,7 +176,7 @@ class GswAppearance(Learnt):
             "gsw_box": GaussianAttribute(torch.ones(len(means), 2, device=means.device), box, box / 100),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         photo, means = self._seen(shot), visible.means.detach()
         intrinsic = visible.attributes["gsw_intrinsic"]
         maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
@@ -203,14 +203,14 @@ class GswAppearance(Learnt):
         beyond = mean_of_seen(F.relu(places.abs() - 1.0), means, shot.camera)
         return with_penalty(colours, self.config.outside * beyond)
 
-    def _seen(self, shot: Shot) -> Tensor | None:
+    def _seen(self, shot: ViewContext) -> Tensor | None:
         """Return the input of the U-Net: the photo, or the left half of a test photo."""
         if shot.photo is None or shot.neutral:
             return None
         return shot.photo[:, : shot.photo.shape[1] // 2] if shot.fitting else shot.photo
 
     @torch.no_grad()
-    def _maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> list[Tensor]:
+    def _maps(self, shot: ViewContext, leaf: Mapping[str, Tensor]) -> list[Tensor]:
         """Return maps of at most `MOST` train photos, evenly chosen; computed once an iteration."""
         if self._cached is None or self._cached[0] != shot.nominal:
             maps = [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen]
@@ -218,14 +218,14 @@ class GswAppearance(Learnt):
         return self._cached[1]
 
     @torch.no_grad()
-    def _mean_maps(self, shot: Shot, leaf: Mapping[str, Tensor]) -> Tensor:
+    def _mean_maps(self, shot: ViewContext, leaf: Mapping[str, Tensor]) -> Tensor:
         """Return the mean of `_maps`, at the size of the first."""
         maps = self._maps(shot, leaf)
         size = maps[0].shape[2:]
         return torch.stack([F.interpolate(m, size=size, mode="bilinear") for m in maps]).mean(dim=0)
 
     @torch.no_grad()
-    def _usual(self, shot: Shot, leaf: Mapping[str, Tensor], means: Tensor, box: Tensor) -> Tensor:
+    def _usual(self, shot: ViewContext, leaf: Mapping[str, Tensor], means: Tensor, box: Tensor) -> Tensor:
         """Return the mean sample of each Gaussian in the train photos that show it, [M, 16]."""
         total, count = means.new_zeros(len(means), CHANNELS), means.new_zeros(len(means), 1)
         for k, maps in zip(self.chosen, self._maps(shot, leaf)):
@@ -233,7 +233,7 @@ class GswAppearance(Learnt):
             total, count = total + own * inside[:, None], count + inside[:, None].float()
         return total / count.clamp(min=1.0)
 
-    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
         self._cached = None
         super().step(own, shot, called_off)
 
@@ -241,7 +241,7 @@ class GswAppearance(Learnt):
         self._cached = None
         super().load_state_dict(state)
 
-    def learnable(self, shot: Shot) -> dict[str, Tensor]:
+    def learnable(self, shot: ViewContext) -> dict[str, Tensor]:
         """Return copies of all leaves that can be differentiated."""
         return {name: value.requires_grad_() for name, value in self._leaf(shot).items()}
 

@@ -24,9 +24,9 @@ from ambiguous_wild.methods.masking_common import CountingMask, EffectMask, Mask
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 COVERED = 1.0 / 4.33  # size of a cell in distances between Gaussians, as released: 1 px with 10 000 a photo
 FAINT = 2.0 * float(np.log(255.0))  # squared distance, in deviations, beyond which a kernel is below 1/255
@@ -48,10 +48,10 @@ class HybridGsConfig:
         check_limits(self, "hybridgs", points=(1, 1e6), reach=(1, 64), joint=(self.apart, 1e9), lr=(0, 10))
 
 
-def build(options: HybridGsConfig) -> Parts:
+def build(options: HybridGsConfig) -> MethodHooks:
     """Return 3DGS with a layer of each photo over its picture."""
     plane = Plane(options)
-    return Parts(mask=Uncovered(plane), density_config=options.density, effects=(plane,))
+    return MethodHooks(mask=PlaneMask(plane), density_config=options.density, effects=(plane,))
 
 
 class Plane(Learnt):
@@ -73,12 +73,12 @@ class Plane(Learnt):
         start[..., 5:8] = rng.uniform(0.0, 1.0, (*shape, 3))
         return {"planar": Leaf(torch.from_numpy(start), self.config.lr, per_photo=True)}
 
-    def layer(self, planar: Tensor, shot: Shot) -> tuple[Tensor, Tensor]:
+    def layer(self, planar: Tensor, shot: ViewContext) -> tuple[Tensor, Tensor]:
         """Return T [H, W, 3] and M [H, W] of the photo."""
         sums = planar_sums(planar, shot.camera.height, shot.camera.width, self.config.reach).clamp(0.0, 1.0)
         return sums[..., :3], sums[..., 3]
 
-    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         if shot.view is None or shot.other_gaussians or shot.nominal < self.config.joint:
             return image
         return composed(*self.layer(leaf["planar"], shot), image)
@@ -89,7 +89,7 @@ def composed(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
     return (front + (1.0 - mask)[..., None] * back.clamp(0.0, 1.0)).clamp(0.0, 1.0)
 
 
-class Uncovered(EffectMask, CountingMask):
+class PlaneMask(EffectMask, CountingMask):
     """1 - M, which weights the loss while both kinds learn separately; afterwards the picture contains M."""
 
     effect: Plane

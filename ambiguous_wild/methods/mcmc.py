@@ -18,7 +18,7 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices, shaped
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
 
@@ -52,9 +52,9 @@ class McmcConfig(DensityConfig):
                 raise AwError(f"mcmc.{name} is not used: its copies are drawn by opacity; leave it out")
 
 
-def build(options: McmcConfig) -> Parts:
+def build(options: McmcConfig) -> MethodHooks:
     """Return 3DGS with another start and another density control."""
-    return Parts(
+    return MethodHooks(
         density=McmcDensity, density_config=options,
         start_opacity=options.start_opacity, start_scale=options.start_scale,
     )  # fmt: skip

@@ -20,7 +20,7 @@ from ambiguous_wild.methods.absgs import AbsoluteSums
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 
 
@@ -36,10 +36,10 @@ class MipConfig:
         check_limits(self, "mip-splatting", kernel=(1e-6, 100))
 
 
-def build(options: MipConfig) -> Parts:
+def build(options: MipConfig) -> MethodHooks:
     """Return 3DGS with both filters, and a reset of the filtered opacity."""
     density = MipDensity if options.growth == "plain" else AbsoluteMipDensity
-    return Parts(
+    return MethodHooks(
         density=density, density_config=options.density, antialias=True, blur=options.kernel,
         effects=(SmoothingFilter(),),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.palette import MASKED, faded, tint
 from ambiguous_wild.methods.given_masks import FixedMasks
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
 from ambiguous_wild.vision.moving import MOVES, POINTS, draw_points, moving_labels, moving_map
@@ -39,9 +39,9 @@ class MotionConfig:
         check_instances(self.instances)
 
 
-def build(options: MotionConfig) -> Parts:
+def build(options: MotionConfig) -> MethodHooks:
     """Return 3DGS with these masks."""
-    return Parts(mask=MotionMask(options))
+    return MethodHooks(mask=MotionMask(options))
 
 
 class MotionMask(FixedMasks):

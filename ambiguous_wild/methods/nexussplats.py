@@ -38,9 +38,9 @@ from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_
 from ambiguous_wild.splat.effects.placing import directions, in_picture
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import check_features
 
 CODE, SHIFT = 32, 4.0  # length of codes; offset of the drawn uncertainty, because the renderer clamps at 0
@@ -81,11 +81,11 @@ class NexusSplatsConfig:
         )
 
 
-def build(options: NexusSplatsConfig) -> Parts:
+def build(options: NexusSplatsConfig) -> MethodHooks:
     """Return 3DGS without resets, with colours and uncertainty from codes."""
     codes = Codes(options)
     control = type("NexusDensity", (SmallVolumes,), {"weight": options.volume})
-    return Parts(Doubt(codes), control, options.density, effects=(codes,))
+    return MethodHooks(Doubt(codes), control, options.density, effects=(codes,))
 
 
 class Codes(Learnt):
@@ -126,7 +126,7 @@ class Codes(Learnt):
             "nexus_doubt": GaussianAttribute(doubt, self.config.lr_code),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         photo = leaf["light"].expand(len(visible.base), CODE)
         towards = directions(visible.means.detach(), shot.camera)
         inputs = torch.cat([visible.base, visible.attributes["nexus_light"], photo, towards], dim=1)

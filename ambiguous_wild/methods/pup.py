@@ -19,7 +19,7 @@ from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 
 
@@ -47,9 +47,9 @@ class PupConfig(DensityConfig):
             )
 
 
-def build(options: PupConfig) -> Parts:
+def build(options: PupConfig) -> MethodHooks:
     """Return 3DGS whose density control prunes after growth."""
-    return Parts(density=PupDensity, density_config=options)
+    return MethodHooks(density=PupDensity, density_config=options)
 
 
 def log_det(blocks: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
-from ambiguous_wild.splat.parts import Parts, Schedule
+from ambiguous_wild.splat.parts import MethodHooks, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import BY_MACHINE, DINO, check_features, first_here, make_features, parse
 from ambiguous_wild.vision.precompute import photo_features
@@ -408,9 +408,9 @@ def coarse_spec(config: RobustSplatConfig) -> str:
     return head + "".join(f",{key}={value}" for key, value in spec.options.items())
 
 
-def build(options: RobustSplatConfig) -> Parts:
+def build(options: RobustSplatConfig) -> MethodHooks:
     """Return 3DGS with a mask net, delayed growth, and both pictures masked before SSIM."""
-    return Parts(
+    return MethodHooks(
         mask=RobustSplatMask(options),
         density_config=options.density,
         schedule=Schedule(lr_opacity=options.lr_opacity),

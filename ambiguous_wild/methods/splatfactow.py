@@ -26,9 +26,9 @@ from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_
 from ambiguous_wild.splat.effects.placing import directions, harmonics, ray_directions
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import Parts, Schedule
+from ambiguous_wild.splat.parts import MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 PHOTO, FEATURE = 48, 72
 
@@ -63,10 +63,10 @@ class SplatfactoWConfig:
         check_limits(self, "splatfacto-w", width=(1, 4096), alpha=(0, 1e3), **shares)
 
 
-def build(options: SplatfactoWConfig) -> Parts:
+def build(options: SplatfactoWConfig) -> MethodHooks:
     """Return 3DGS with colours, background, masks, and growth by absolute gradients."""
     effect = SplatfactoColours(options)
-    return Parts(
+    return MethodHooks(
         mask=TrimmedLoss(effect), density=SplatfactoDensity, density_config=options.density,
         schedule=Schedule(lr_opacity=0.03, resolution="coarse-to-fine"), weighting="images", antialias=True,
         effects=(effect,),
@@ -107,7 +107,7 @@ class SplatfactoColours(Learnt):
             )
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.means), PHOTO)
         feature = visible.attributes["splatfacto_feature"]
         hidden = F.relu(mlp(torch.cat([photo, feature], dim=1), leaf, "net"))
@@ -115,7 +115,7 @@ class SplatfactoColours(Learnt):
         rest = mlp(hidden, leaf, "rest").reshape(-1, 15, 3)
         return 0.5 + basis[:, :1] * mlp(hidden, leaf, "dc") + (basis[:, 1:, None] * rest).sum(dim=1)
 
-    def background(self, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def background(self, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         """Return the background [H, W, 3] of the shot's photo, without an offset."""
         height, width = shot.camera.height, shot.camera.width
         small = (max(height // 4, 1), max(width // 4, 1))
@@ -126,7 +126,7 @@ class SplatfactoColours(Learnt):
         colours = basis @ torch.cat([mlp(hidden, leaf, "sky_dc"), rest])
         return enlarged(colours.reshape(*small, 3), height, width)
 
-    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         return (image + (1.0 - alpha)[..., None] * self.background(leaf, shot)).clamp(0.0, 1.0)
 
 

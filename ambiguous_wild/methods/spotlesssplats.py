@@ -37,7 +37,7 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features
@@ -173,10 +173,10 @@ class ClusterConfig(SpotLessSplatsConfig):
     mask: Literal["mlp", "cluster", "filter"] = "cluster"
 
 
-def build(options: SpotLessSplatsConfig) -> Parts:
+def build(options: SpotLessSplatsConfig) -> MethodHooks:
     """Return 3DGS with masked L1, without opacity resets, and with harmonics that are cut once."""
     density = PruningDensity if options.density.least_use > 0 else SpotLessDensity
-    return Parts(SpotLessMask(options), density, options.density, lambda_dssim=options.lambda_dssim)
+    return MethodHooks(SpotLessMask(options), density, options.density, lambda_dssim=options.lambda_dssim)
 
 
 class SpotLessMask(MaskPolicy):

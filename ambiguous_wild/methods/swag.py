@@ -25,10 +25,10 @@ from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.effects.placing import Unit, in_picture, mean_of_seen, with_penalty
+from ambiguous_wild.splat.effects.placing import SceneNormaliser, in_picture, mean_of_seen, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, TrainData
+from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData, ViewContext
 
 PARTS = 8  # parallel parts of the positions
 PRIMES = (1, 2_654_435_761, 805_459_861)  # as in Instant-NGP
@@ -169,9 +169,9 @@ class SwagConfig:
         )  # fmt: skip
 
 
-def build(options: SwagConfig) -> Parts:
+def build(options: SwagConfig) -> MethodHooks:
     """Return 3DGS with this net."""
-    return Parts(effects=(GatedColours(options),), density_config=options.density)
+    return MethodHooks(effects=(GatedColours(options),), density_config=options.density)
 
 
 class GatedColours(Learnt):
@@ -183,7 +183,11 @@ class GatedColours(Learnt):
         self.config = config
 
     def setup(self, data: TrainData) -> None:
-        self.seed, self.unit, self.cameras = data.seed, Unit(data.scene.points.xyz, data.device), data.cameras
+        self.seed, self.unit, self.cameras = (
+            data.seed,
+            SceneNormaliser(data.scene.points.xyz, data.device),
+            data.cameras,
+        )
         self._left_out: tuple[float, int, Tensor] | None = None  # result of `_transient`, by time and number
         prepare(data.device)
         super().setup(data)
@@ -210,11 +214,13 @@ class GatedColours(Learnt):
         photo = leaf["photo"].expand(len(places), PHOTO)
         return mlp(torch.cat([places, photo, colours], dim=1), leaf, "net")
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         outputs = self._net(self.encoded(visible.means, leaf), visible.base, leaf)
         return visible.base + 2.0 * torch.sigmoid(outputs[:, :3]) - 1.0
 
-    def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
+    def change(
+        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext
+    ) -> Mapping[str, Tensor]:
         logits = gaussians.opacity_logits
         if shot.nominal < self.config.gate_start or shot.other_gaussians:
             return {}
@@ -233,7 +239,7 @@ class GatedColours(Learnt):
         return {"opacity_logits": with_penalty(opened, self.config.off * gate)}
 
     @torch.no_grad()
-    def _transient(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def _transient(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         """Return Gaussians that are off, without noise, in most photos that show them, [N] bool."""
         cached = self._left_out
         if cached is None or cached[:2] != (shot.nominal, len(gaussians)):
@@ -247,6 +253,6 @@ class GatedColours(Learnt):
             self._left_out = cached
         return cached[2]
 
-    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
         self._left_out = None
         super().step(own, shot, called_off)

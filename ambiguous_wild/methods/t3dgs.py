@@ -32,7 +32,7 @@ from ambiguous_wild.methods.masking_common import (
 )
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
-from ambiguous_wild.splat.parts import Parts, Schedule
+from ambiguous_wild.splat.parts import MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features
@@ -65,13 +65,13 @@ class T3dgsConfig:
         )
 
 
-def build(options: T3dgsConfig) -> Parts:
+def build(options: T3dgsConfig) -> MethodHooks:
     """Return 3DGS with masks and smooth depth."""
     rates = Schedule(lr_opacity=options.lr_opacity)
-    return Parts(mask=Divergence(options), density_config=options.density, schedule=rates)
+    return MethodHooks(mask=Divergence(options), density_config=options.density, schedule=rates)
 
 
-class Head(nn.Module):
+class TwoErrorHead(nn.Module):
     """Maps features [B, h, w, C] to (sigma1, sigma2, rho) [B, 3, H, W] of the two errors."""
 
     def __init__(self, channels: int, doublings: int, seed: int) -> None:
@@ -138,7 +138,7 @@ class Divergence(PausingMask):
         self.phi, self.cameras = photo_features(self.features, data.photos, data.cache_dir), data.cameras
         self.seed, grid, photo = data.seed, self.phi[0].shape, data.photos[0]
         doublings = max(int(math.log2(max(photo.shape[0] / grid[0], 1.0))) - 1, 0)
-        self.head = Head(grid[2], min(doublings, 3), data.seed).to(data.device)
+        self.head = TwoErrorHead(grid[2], min(doublings, 3), data.seed).to(data.device)
         self.optimiser = adam_of(self.head, self.config.lr, data.device)
 
     def keep(self, step: Step) -> Tensor | None:

@@ -6,9 +6,9 @@ Source: 3D Gaussian Splatting for Real-Time Radiance Field Rendering, Kerbl et a
 from __future__ import annotations
 
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 
 
-def build(options: NoOptions) -> Parts:
+def build(options: NoOptions) -> MethodHooks:
     """Return the default parts: no mask, growth by `DensityControl` of splat/density.py."""
-    return Parts()
+    return MethodHooks()

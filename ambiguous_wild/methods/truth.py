@@ -21,7 +21,7 @@ from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.methods.entry import NoOptions
 from ambiguous_wild.splat.data import read_photos, shrink_keep
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 
 
@@ -36,14 +36,14 @@ class TruthConfig:
             raise AwError(f"dilation of exact masks is a number of px from 0, got {self.dilation}")
 
 
-def build_masked(options: TruthConfig) -> Parts:
+def build_masked(options: TruthConfig) -> MethodHooks:
     """Return 3DGS with the exact masks."""
-    return Parts(mask=TruthMask(options))
+    return MethodHooks(mask=TruthMask(options))
 
 
-def build_clean(options: NoOptions) -> Parts:
+def build_clean(options: NoOptions) -> MethodHooks:
     """Return 3DGS on the clean photos, with test side, poses and points of the capture."""
-    return Parts(train_data=clean_data)
+    return MethodHooks(train_data=clean_data)
 
 
 class TruthMask(MaskPolicy):

@@ -17,14 +17,14 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
 
 
-def build(options: DensityConfig) -> Parts:
+def build(options: DensityConfig) -> MethodHooks:
     """Return 3DGS with this density control; graft it onto methods with masks: METHOD@density=uad."""
-    return Parts(density=UncertaintyAware, density_config=options)
+    return MethodHooks(density=UncertaintyAware, density_config=options)
 
 
 class UncertaintyAware(DensityControl):

@@ -41,8 +41,8 @@ from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import check_features, make_features
 from ambiguous_wild.vision.precompute import photo_features
 
@@ -115,10 +115,10 @@ class WildGaussiansConfig:
         check_limits(self, "wildgaussians", normal_units=(1e-3, 1e9), dropout=(0, 0.9), prior=(1e-3, 1e3))
 
 
-def build(options: WildGaussiansConfig) -> Parts:
+def build(options: WildGaussiansConfig) -> MethodHooks:
     """Return 3DGS with the masks, the appearance, or both."""
     effects = (WildAppearance(options),) if options.appearance else ()
-    return Parts(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
+    return MethodHooks(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
 
 
 class WildAppearance(Learnt):
@@ -145,7 +145,7 @@ class WildAppearance(Learnt):
         start += torch.from_numpy(noise.astype(np.float32)).to(start.device)
         return {"wild_embedding": GaussianAttribute(start, self.config.lr_gaussian)}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.base), PHOTO)
         inputs = torch.cat([visible.base, visible.attributes["wild_embedding"], photo], dim=1)
         offset, gain = (self.config.scale * mlp(inputs, leaf, "net")).split(3, dim=1)
@@ -164,7 +164,7 @@ def fourier(means: Tensor, points: Tensor) -> Tensor:
     return torch.cat([angles.sin(), (angles + torch.pi / 2).sin()], dim=1)
 
 
-class Head(nn.Module):
+class UncertaintyHead(nn.Module):
     """Maps features [h, w, C] of a photo to sigma [H, W] > 0, which starts near 1."""
 
     def __init__(self, photos: Sequence[Tensor], seed: int) -> None:
@@ -206,7 +206,7 @@ class Uncertainty(PausingMask):
 
     def setup(self, data: TrainData) -> None:
         self.distance.setup(data)
-        self.seed, self.head = data.seed, Head(self.distance.photos, data.seed)
+        self.seed, self.head = data.seed, UncertaintyHead(self.distance.photos, data.seed)
         self.optimiser = adam_of(self.head, self.config.lr_head, data.device)
 
     def keep(self, step: Step) -> Tensor | None:

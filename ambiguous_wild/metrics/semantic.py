@@ -29,7 +29,7 @@ _ANCHOR_REGIONS = 2000  # most static regions used for the anchors, evenly chose
 
 
 @dataclass(frozen=True)
-class Regions:
+class RegionFeatures:
     """Regions of one photo with their mean features."""
 
     labels: np.ndarray  # [R] int, as in the label map
@@ -39,7 +39,7 @@ class Regions:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def whitened(self, mean: np.ndarray, whiten: np.ndarray) -> Regions:
+    def whitened(self, mean: np.ndarray, whiten: np.ndarray) -> RegionFeatures:
         """The regions after subtracting the mean [C] and multiplying by the matrix [C, C]."""
         return replace(self, means=(self.means - mean) @ whiten)
 
@@ -108,7 +108,7 @@ def region_means(
     features: np.ndarray,  # [h, w, C], a coarser grid over the same photo
     labels: np.ndarray,  # [H, W] int, 0 = no region
     min_share: float = 0.0,  # share of the photo; smaller regions are left out
-) -> Regions:
+) -> RegionFeatures:
     """Mean feature of each region; a cell is weighted by the number of its pixels in the region."""
     h, w, channels = features.shape
     cell = _cells(labels.shape, h, w)[labels > 0]
@@ -117,12 +117,12 @@ def region_means(
     pixels = weight.sum(axis=1)
     means = weight @ features.reshape(h * w, channels).astype(np.float64) / np.maximum(pixels, 1)[:, None]
     large = pixels >= max(min_share * labels.size, 1)
-    return Regions(names[large], means[large], pixels[large])
+    return RegionFeatures(names[large], means[large], pixels[large])
 
 
 def matches(
-    distractors: Sequence[Regions],  # one per photo
-    statics: Sequence[Regions],  # one per photo
+    distractors: Sequence[RegionFeatures],  # one per photo
+    statics: Sequence[RegionFeatures],  # one per photo
 ) -> list[list[RegionMatch]]:
     """Find the most similar static region of another photo for each distractor region.
 
@@ -151,8 +151,8 @@ def matches(
 
 
 def anchors(
-    statics: Sequence[Regions],  # the regions that distractors are compared with, one per photo
-    every: Sequence[Regions] | None = None,  # all static regions, if these are more
+    statics: Sequence[RegionFeatures],  # the regions that distractors are compared with, one per photo
+    every: Sequence[RegionFeatures] | None = None,  # all static regions, if these are more
 ) -> Anchors:
     """Similarity of static regions of different photos; NaN if fewer than two photos have regions."""
     units, photo, _ = _stacked(statics)
@@ -164,7 +164,7 @@ def anchors(
     return Anchors(float(np.mean(same)), float(np.mean(different)))
 
 
-def usual_match(statics: Sequence[Regions]) -> float:
+def usual_match(statics: Sequence[RegionFeatures]) -> float:
     """The cosine that 95 % of static regions reach with their best match in another photo, else NaN."""
     units, photo, _ = _stacked(statics)
     if len(np.unique(photo)) < 2:
@@ -200,7 +200,7 @@ def _cells(shape: tuple[int, ...], h: int, w: int) -> np.ndarray:  # [H, W] int
     return np.asarray(rows[:, None] * w + cols[None, :])
 
 
-def _stacked(statics: Sequence[Regions]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _stacked(statics: Sequence[RegionFeatures]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit features [S, C] of all regions with a non-zero feature, their photos [S] and labels [S]."""
     if not any(len(s) for s in statics):
         return np.zeros((0, 1)), np.zeros(0, int), np.zeros(0, int)

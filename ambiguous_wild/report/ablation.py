@@ -22,11 +22,11 @@ from ambiguous_wild.harness.ablation import (
     METRICS,
     REPORT,
     GroupFacts,
-    Outcome,
     Planned,
     Study,
     StudyReport,
-    Summary,
+    SummaryRecord,
+    VariantResult,
     VariantRow,
     read_outcomes,
 )
@@ -37,7 +37,7 @@ from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_plots import label_points, new_figure
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
-from ambiguous_wild.report.table import BLANK, Cell, Column, Row, Table, ranks
+from ambiguous_wild.report.table import BLANK, Column, Row, Table, TableCell, ranks
 
 KEYS = tuple(m.key for m in METRICS)
 
@@ -62,7 +62,7 @@ def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
     }
 
 
-def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> VariantRow:
+def _row(row: Planned, outcomes: list[VariantResult], default: list[VariantResult]) -> VariantRow:
     failed = [o for o in outcomes if o.result is None]
     status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
     reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
@@ -83,13 +83,13 @@ def _row(row: Planned, outcomes: list[Outcome], default: list[Outcome]) -> Varia
     }
 
 
-def _minus(m: Measure, o: Outcome, default: Outcome) -> float | None:
+def _minus(m: Measure, o: VariantResult, default: VariantResult) -> float | None:
     """Return the difference of two runs; None if a value is missing, or a time cannot be compared."""
     a, b = o.value(m.key), default.value(m.key)
     return None if a is None or b is None or (m.timed and (o.untimed or default.untimed)) else a - b
 
 
-def _run_row(o: Outcome) -> Facts:
+def _run_row(o: VariantResult) -> Facts:
     row: Facts = {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
     return row | {"untimed": o.untimed} | {key: o.value(key) for key in KEYS}
 
@@ -102,7 +102,7 @@ def _networks(row: Planned) -> list[str]:
     return [f"{key}={options[key]}" for key in BACK_ENDS if key in options]
 
 
-def _summary(values: list[float | None]) -> Summary:
+def _summary(values: list[float | None]) -> SummaryRecord:
     numbers = [math.nan if v is None else float(v) for v in values]
     mean, spread = stats.mean(numbers), stats.spread(numbers)
     return {"mean": _number(mean), "spread": _number(spread)}
@@ -160,11 +160,11 @@ def _subtitle(data: StudyReport) -> str:
     )
 
 
-def _what(row: VariantRow) -> Cell:
+def _what(row: VariantRow) -> TableCell:
     parts = [row["text"], f"`{' '.join(row['settings'])}`" if row["settings"] else ""]
     parts.append(f"same runs as {row['same_as']}" if row["same_as"] else "")
     text = "; ".join(part for part in parts if part)
-    return Cell(printed=text, markdown=text) if text else BLANK
+    return TableCell(printed=text, markdown=text) if text else BLANK
 
 
 def draw(data: StudyReport, path: Path) -> bool:
@@ -284,22 +284,22 @@ def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool 
     return [*tables[:-1], tables[-1].with_notes(*common)]
 
 
-def _cell(row: VariantRow, column: Measure, rank: int | None) -> Cell:
+def _cell(row: VariantRow, column: Measure, rank: int | None) -> TableCell:
     if row["status"] == "failed":
-        return Cell(state="failed")
+        return TableCell(state="failed")
     value = _mean(row, "values", column.key)
     if math.isnan(value):
-        return Cell(state="missing")
+        return TableCell(state="missing")
     spread = row["values"][column.key]["spread"]
-    return Cell(value, math.nan if spread is None else float(spread), rank=rank)
+    return TableCell(value, math.nan if spread is None else float(spread), rank=rank)
 
 
-def _difference(row: VariantRow, column: Measure) -> Cell:
+def _difference(row: VariantRow, column: Measure) -> TableCell:
     value, spread = _mean(row, "differences", column.key), row["differences"][column.key]["spread"]
     if row["variant"] == DEFAULT or math.isnan(value):
         return BLANK
     text = f"{value:+.{column.digits}f}"
-    return Cell(printed=text if spread is None else f"{text} ± {spread:.{column.digits}f}")
+    return TableCell(printed=text if spread is None else f"{text} ± {spread:.{column.digits}f}")
 
 
 def _mean(row: VariantRow, kind: Literal["values", "differences"], key: str) -> float:

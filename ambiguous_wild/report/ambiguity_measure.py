@@ -18,7 +18,7 @@ from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.report.ambiguity_sources import Background, Masks, load_mask, stem
+from ambiguous_wild.report.ambiguity_sources import Background, DistractorMasks, load_mask, stem
 from ambiguous_wild.vision.moving import MOVES, moving_map
 
 KINDS = ("colour", "structure", "features", "motion")
@@ -27,7 +27,7 @@ CORRELATED = 0.5  # correlation with the background below which the structure at
 
 
 @dataclass(frozen=True)
-class Distractor:
+class MeasuredDistractor:
     """One distractor of a photo, and whether each kind of evidence reveals it; None = not available."""
 
     label: int
@@ -50,7 +50,7 @@ def distractors(
     known: np.ndarray | None,
     segments: np.ndarray,
     points: MotionPoints | None,
-) -> list[Distractor]:
+) -> list[MeasuredDistractor]:
     """Return the distractors of a photo that are not tiny, without the evidence of features.
 
     Args:
@@ -82,7 +82,7 @@ def distractors(
             continue
         at = regions == label
         large.append(
-            Distractor(
+            MeasuredDistractor(
                 label,
                 int(pixels),
                 _most(differs, at, sure),
@@ -108,18 +108,18 @@ Bar = Callable[[list[View]], Iterable[View]]
 
 
 @dataclass(frozen=True)
-class Measured:
+class PhotoMeasures:
     """The measurements of one train photo."""
 
     name: str
     counts: am.ColourCounts
     histogram: np.ndarray  # [52] int64, residual over distractor pixels with a known background
     matches: list[sem.RegionMatch]  # of its distractors
-    distractors: list[Distractor]
+    distractors: list[MeasuredDistractor]
 
 
 @dataclass(frozen=True)
-class SceneFeatures:
+class MappedFeatures:
     """The features of a scene and of its regions, from which maps are drawn."""
 
     spec: str  # name of the features
@@ -127,7 +127,7 @@ class SceneFeatures:
     whitened: bool
     mean: np.ndarray  # [C], subtracted if whitened
     whiten: np.ndarray  # [C, C]
-    distractors: list[sem.Regions]  # of each photo, whitened if the features are
+    distractors: list[sem.RegionFeatures]  # of each photo, whitened if the features are
     anchors: sem.Anchors
     usual: float  # cosine at which a match is as good as those within the static scene; NaN = unknown
     objects: bool  # compared with the objects of --objects, not with every static region
@@ -149,14 +149,14 @@ def weight_free(spec: str) -> bool:
 
 def measure(
     scene: Scene,
-    masks: Masks,
+    masks: DistractorMasks,
     background: Background,
     *,
     features: str = "labhog",
     objects: Path | None = None,
     cache: Path | None = None,
     progress: Bar = iter,
-) -> tuple[list[Measured], SceneFeatures]:
+) -> tuple[list[PhotoMeasures], MappedFeatures]:
     """Score every train photo.
 
     Args:
@@ -212,7 +212,7 @@ def measure(
         every = [r.whitened(mean, whiten) for r in every]
     matches = sem.matches(moving, static)
     anchors, usual = sem.anchors(static, every), sem.usual_match(every)
-    look = SceneFeatures(
+    look = MappedFeatures(
         features, backend, whitened, mean, whiten, moving, anchors, usual, objects is not None
     )
     measured = []
@@ -221,7 +221,7 @@ def measure(
         in_photo = [
             replace(d, features=cosines[d.label] < usual if d.label in cosines else None) for d in in_photo
         ]
-        measured.append(Measured(*score, of_photo, in_photo))
+        measured.append(PhotoMeasures(*score, of_photo, in_photo))
     return measured, look
 
 
@@ -248,7 +248,7 @@ def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
     return backend
 
 
-def cosine_map(look: SceneFeatures, index: int, photo: np.ndarray) -> np.ndarray | None:  # [h, w] in [-1, 1]
+def cosine_map(look: MappedFeatures, index: int, photo: np.ndarray) -> np.ndarray | None:  # [h, w] in [-1, 1]
     """Return the cosine of each cell with the photo's largest distractor; None if it has no distractor."""
     import torch
 

@@ -26,8 +26,8 @@ from ambiguous_wild.io.page_parts import data_uri, jpeg_bytes, narrowed
 from ambiguous_wild.io.palette import ADDED, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.report.ambiguity_measure import BINS, Measured, SceneFeatures, cosine_map
-from ambiguous_wild.report.ambiguity_sources import Background, Masks
+from ambiguous_wild.report.ambiguity_measure import BINS, MappedFeatures, PhotoMeasures, cosine_map
+from ambiguous_wild.report.ambiguity_sources import Background, DistractorMasks
 from ambiguous_wild.report.ambiguity_summary import (
     NO_DISTRACTORS,
     PhotoRow,
@@ -45,7 +45,7 @@ PHOTOS = 4
 SIDE = 480  # px a picture in the figure at most
 
 
-def chosen(measured: list[Measured], most: int = PHOTOS) -> list[int]:
+def chosen(measured: list[PhotoMeasures], most: int = PHOTOS) -> list[int]:
     """Return indices of photos spread evenly over the range of occlusion, from little to much."""
     order = sorted(range(len(measured)), key=lambda i: measured[i].counts.occlusion)
     return spread(order, most)
@@ -67,7 +67,7 @@ def residual_picture(
 
 
 def cosine_picture(
-    look: SceneFeatures, index: int, photo: np.ndarray, distractor: np.ndarray
+    look: MappedFeatures, index: int, photo: np.ndarray, distractor: np.ndarray
 ) -> np.ndarray | None:
     """Draw the cosine of every cell with the photo's largest distractor; distractors are outlined."""
     import cv2
@@ -82,7 +82,7 @@ def cosine_picture(
 
 
 def _maps(
-    scene: Scene, masks: Masks, background: Background, look: SceneFeatures, index: int
+    scene: Scene, masks: DistractorMasks, background: Background, look: MappedFeatures, index: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray | None, ...]]:
     """Return a photo, its mask, and three pictures of it: overlay, residual, cosine; None where unknown."""
     view = scene.train[index]
@@ -95,10 +95,10 @@ def _maps(
 
 def write_figure(
     scene: Scene,
-    masks: Masks,
+    masks: DistractorMasks,
     background: Background,
-    measured: list[Measured],
-    look: SceneFeatures,
+    measured: list[PhotoMeasures],
+    look: MappedFeatures,
     path: Path,
 ) -> None:
     """Write the figure with photos, maps and histograms as PNG."""
@@ -161,7 +161,7 @@ def _legend(figure: Any) -> None:
     )
 
 
-def _histograms(figure: Any, grid: Any, measured: list[Measured], seen: SceneFeatures) -> None:
+def _histograms(figure: Any, grid: Any, measured: list[PhotoMeasures], seen: MappedFeatures) -> None:
     colour, cover, look = (figure.add_subplot(grid[3, s]) for s in (slice(0, 4), slice(4, 8), slice(8, 12)))
     counts = np.sum([m.histogram for m in measured], axis=0)
     colour.stairs(counts / max(counts.sum(), 1), BINS, fill=True, color=plot_colour(ADDED))
@@ -199,10 +199,10 @@ def check_folder(folder: Path) -> None:
 
 def write_report(
     scene: Scene,
-    masks: Masks,
+    masks: DistractorMasks,
     background: Background,
-    measured: list[Measured],
-    look: SceneFeatures,
+    measured: list[PhotoMeasures],
+    look: MappedFeatures,
     summary: Summary,
     out: Path,
 ) -> None:
@@ -220,7 +220,11 @@ def write_report(
 
 
 def _pictures(
-    scene: Scene, masks: Masks, background: Background, measured: list[Measured], look: SceneFeatures
+    scene: Scene,
+    masks: DistractorMasks,
+    background: Background,
+    measured: list[PhotoMeasures],
+    look: MappedFeatures,
 ) -> Iterator[tuple[str, list[tuple[str, bytes]]]]:
     """Yield the name and JPEGs (photo, overlay, residual, cosine) of each photo on the page."""
     captions = ("photo", "distractors", "difference in colour to the background",

@@ -24,7 +24,7 @@ DEPTH_SLACK = 0.05  # largest relative difference of depth at which two photos s
 
 
 @dataclass(frozen=True)
-class Masks:
+class DistractorMasks:
     """Masks of the train photos, by the photo's name."""
 
     source: str  # truth, scene, run or folder; kept in the report
@@ -41,7 +41,7 @@ class Masks:
         return ~white if self.keep else white
 
 
-def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool = False) -> Masks:
+def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool = False) -> DistractorMasks:
     """Find the distractor masks of the train photos.
 
     Args:
@@ -69,16 +69,22 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool
                 "that masks"
             )
     if choice == "truth" and not keep:
-        return Masks("truth", _all(scene, truth, "add them (all black where there is no distractor)"), False)
+        return DistractorMasks(
+            "truth", _all(scene, truth, "add them (all black where there is no distractor)"), False
+        )
     if choice == "scene" and not keep:
         folder = scene.root / "masks" / "train"
-        return Masks("scene", _all(scene, folder, "add them (all white where there is no distractor)"), True)
+        return DistractorMasks(
+            "scene", _all(scene, folder, "add them (all white where there is no distractor)"), True
+        )
     if choice == "run" and not keep:
         if run is None:
             raise AwError("--distractor-masks run needs --run RUN, a folder of 'aw bench'")
-        return Masks("run", _all(scene, run / "masks", "this method draws no masks; take another run"), True)
+        return DistractorMasks(
+            "run", _all(scene, run / "masks", "this method draws no masks; take another run"), True
+        )
     wanted = f"add them (all {'white' if keep else 'black'} where there is no distractor)"
-    return Masks("folder", _all(scene, Path(choice), wanted), keep)
+    return DistractorMasks("folder", _all(scene, Path(choice), wanted), keep)
 
 
 def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
@@ -154,7 +160,7 @@ class RunBackground:
     render is opaque and two other photos see its surface outside of their masks.
     """
 
-    def __init__(self, scene: Scene, run: Path, masks: Masks) -> None:
+    def __init__(self, scene: Scene, run: Path, masks: DistractorMasks) -> None:
         """
         Raises:
             AwError: the run is not finished, or of another scene or size.
@@ -200,7 +206,7 @@ class RunBackground:
         return camera, depth, static & (alpha >= OPAQUE)
 
 
-def find_background(scene: Scene, choice: str | None, run: Path | None, masks: Masks) -> Background:
+def find_background(scene: Scene, choice: str | None, run: Path | None, masks: DistractorMasks) -> Background:
     """Find the background to compare with: clean versions if there are any, else the render of a run.
 
     Raises:

@@ -12,8 +12,8 @@ from ambiguous_wild.metrics import semantic as sem
 from ambiguous_wild.metrics.stats import Interval
 from ambiguous_wild.report.ambiguity_measure import (
     KINDS,
-    Measured,
-    SceneFeatures,
+    MappedFeatures,
+    PhotoMeasures,
     feature_family,
     weight_free,
 )
@@ -94,8 +94,8 @@ def _family(features: str) -> str:
 
 def summarise(
     scene: Scene,
-    measured: list[Measured],
-    look: SceneFeatures,
+    measured: list[PhotoMeasures],
+    look: MappedFeatures,
     *,
     features: str = "labhog",
     masks: str = "truth",
@@ -149,7 +149,7 @@ def classify(colour: bool | None, semantic: bool | None) -> str:
     return "colour" if colour else "semantic" if semantic else "neither"
 
 
-def _colour(measured: list[Measured], seed: int) -> ColourScore:
+def _colour(measured: list[PhotoMeasures], seed: int) -> ColourScore:
     counts = [m.counts for m in measured]
     total = am.pooled(counts)
     share = am.ratio_interval([c.close for c in counts], [c.known for c in counts], seed=seed)
@@ -164,7 +164,7 @@ def _colour(measured: list[Measured], seed: int) -> ColourScore:
     }
 
 
-def _semantic(measured: list[Measured], look: SceneFeatures, features: str, seed: int) -> SemanticScore:
+def _semantic(measured: list[PhotoMeasures], look: MappedFeatures, features: str, seed: int) -> SemanticScore:
     photos = [m.matches for m in measured if m.matches]
     # a mean as a ratio to the number of photos, so that it is missing, and no error, without any
     best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
@@ -190,7 +190,7 @@ def _semantic(measured: list[Measured], look: SceneFeatures, features: str, seed
     }
 
 
-def _count_evidence(measured: list[Measured]) -> EvidenceCounts:
+def _count_evidence(measured: list[PhotoMeasures]) -> EvidenceCounts:
     every = [d for m in measured for d in m.distractors]
 
     def count(kind: str) -> int | None:
@@ -209,7 +209,7 @@ def _evidence_line(counts: EvidenceCounts) -> str:
     return text if counts["motion"] is not None else f"{text} (the scene has no points that move)"
 
 
-def row(m: Measured, metric: str) -> PhotoRow:
+def row(m: PhotoMeasures, metric: str) -> PhotoRow:
     """Return one row of the table of photos."""
     return {
         "photo": m.name,

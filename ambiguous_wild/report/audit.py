@@ -15,8 +15,8 @@ from ambiguous_wild.report.audit_numbers import (
     KINDS,
     MEAN,
     UNKNOWN,
-    Finding,
-    Number,
+    AuditFinding,
+    PrintedNumber,
     finding,
     method_name,
     place_name,
@@ -28,10 +28,10 @@ HIGHER = ("psnr", "ssim", "fps", "mask_", "iou")
 UNITLESS = ("memory", "time", "size")  # metrics that need a unit and a definition
 
 
-def contradictions(numbers: list[Number]) -> list[Finding]:
+def contradictions(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find different numbers, beyond rounding, for the same method, setting, scene and metric."""
-    clashes: dict[tuple[str, ...], list[tuple[Number, Number]]] = defaultdict(list)
-    groups: dict[tuple[str, ...], list[Number]] = defaultdict(list)
+    clashes: dict[tuple[str, ...], list[tuple[PrintedNumber, PrintedNumber]]] = defaultdict(list)
+    groups: dict[tuple[str, ...], list[PrintedNumber]] = defaultdict(list)
     for n in numbers:
         if n.known:
             groups[(*n.identity, n.metric)].append(n)
@@ -54,8 +54,8 @@ def contradictions(numbers: list[Number]) -> list[Finding]:
 
 
 def _exchanged(
-    clashes: list[tuple[Number, Number]],
-) -> list[tuple[Finding, list[tuple[Number, Number]]]]:
+    clashes: list[tuple[PrintedNumber, PrintedNumber]],
+) -> list[tuple[AuditFinding, list[tuple[PrintedNumber, PrintedNumber]]]]:
     """Find pairs of methods whose numbers are exchanged between two tables."""
     findings = []
     for (a, a2), (b, b2) in combinations(clashes, 2):
@@ -69,9 +69,9 @@ def _exchanged(
     return findings
 
 
-def means(numbers: list[Number]) -> list[Finding]:
+def means(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find means over scenes, and over datasets, that differ from their parts by more than rounding."""
-    wrong: dict[tuple[str, ...], list[tuple[Number, float, list[Number]]]] = defaultdict(list)
+    wrong: dict[tuple[str, ...], list[tuple[PrintedNumber, float, list[PrintedNumber]]]] = defaultdict(list)
     for n in numbers:
         if n.scene != MEAN or n.setting:
             continue
@@ -84,7 +84,7 @@ def means(numbers: list[Number]) -> list[Finding]:
     return [_mean(cases) for cases in wrong.values()]
 
 
-def _mean(cases: list[tuple[Number, float, list[Number]]]) -> Finding:
+def _mean(cases: list[tuple[PrintedNumber, float, list[PrintedNumber]]]) -> AuditFinding:
     first, _, parts = cases[0]
     what = "datasets" if first.dataset == ALL else f"scenes of {first.dataset}"
     words = ", ".join(
@@ -94,7 +94,7 @@ def _mean(cases: list[tuple[Number, float, list[Number]]]) -> Finding:
     return finding("mean", text, [m for n, _, parts in cases for m in (n, *parts)])
 
 
-def _of_datasets(mean: Number, numbers: list[Number]) -> list[Number]:
+def _of_datasets(mean: PrintedNumber, numbers: list[PrintedNumber]) -> list[PrintedNumber]:
     """Return the means over single datasets in the same line of the same table."""
     return [
         n
@@ -105,7 +105,7 @@ def _of_datasets(mean: Number, numbers: list[Number]) -> list[Number]:
     ]
 
 
-def _of_scenes(mean: Number, numbers: list[Number]) -> list[Number]:
+def _of_scenes(mean: PrintedNumber, numbers: list[PrintedNumber]) -> list[PrintedNumber]:
     """Return the method's numbers on every scene of the dataset; empty if one is missing."""
     of_dataset = [
         n
@@ -115,7 +115,7 @@ def _of_scenes(mean: Number, numbers: list[Number]) -> list[Number]:
     inside = [n for n in of_dataset if n.table == mean.table]
     of_dataset = inside or of_dataset
     size = Counter(n.table for n in of_dataset)
-    best: dict[str, Number] = {}
+    best: dict[str, PrintedNumber] = {}
     for n in of_dataset:
         # an ablation repeats one scene of the main table; means come from the larger table
         if n.method == mean.method and (n.scene not in best or size[n.table] > size[best[n.scene].table]):
@@ -124,13 +124,13 @@ def _of_scenes(mean: Number, numbers: list[Number]) -> list[Number]:
     return [best[s] for s in sorted(scenes)] if scenes == best.keys() else []
 
 
-def _one_scene(n: Number) -> bool:
+def _one_scene(n: PrintedNumber) -> bool:
     return n.scene not in (MEAN, UNKNOWN, ALL) and "+" not in n.scene
 
 
-def ranks(numbers: list[Number]) -> list[Finding]:
+def ranks(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find marks for first, second and third that contradict the numbers of the column."""
-    columns: dict[tuple[str, ...], list[Number]] = defaultdict(list)
+    columns: dict[tuple[str, ...], list[PrintedNumber]] = defaultdict(list)
     for n in numbers:
         if not n.setting:
             columns[(n.table, *n.place, n.metric)].append(n)
@@ -149,7 +149,7 @@ def ranks(numbers: list[Number]) -> list[Finding]:
     return findings
 
 
-def _places(n: Number, column: list[Number], better: int) -> range:
+def _places(n: PrintedNumber, column: list[PrintedNumber], better: int) -> range:
     """Return the ranks that a number may be marked as; equal numbers may share a rank or take several."""
     ahead = {m.value for m in column if better * (m.value - n.value) > 0}
     before = sum(better * (m.value - n.value) > 0 for m in column)
@@ -162,9 +162,9 @@ def _sign(metric: str) -> int | None:
     return -1 if metric.startswith(LOWER) else None
 
 
-def digits(numbers: list[Number]) -> list[Finding]:
+def digits(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find quality metrics printed with another number of digits than most of their column."""
-    columns: dict[tuple[str, str], list[Number]] = defaultdict(list)
+    columns: dict[tuple[str, str], list[PrintedNumber]] = defaultdict(list)
     for n in numbers:
         if n.metric.startswith(("psnr", "ssim", "lpips")):
             columns[n.table, n.metric].append(n)
@@ -174,7 +174,7 @@ def digits(numbers: list[Number]) -> list[Finding]:
 FULL = 12  # digits of a number that was never rounded, whose last ones may be zeros
 
 
-def _odd_digits(column: list[Number]) -> Iterator[Finding]:
+def _odd_digits(column: list[PrintedNumber]) -> Iterator[AuditFinding]:
     usual, count = Counter(n.digits for n in column).most_common(1)[0]
     if usual >= FULL:
         return
@@ -185,7 +185,7 @@ def _odd_digits(column: list[Number]) -> Iterator[Finding]:
         yield finding("digits", text, odd)
 
 
-def units(numbers: list[Number]) -> list[Finding]:
+def units(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find quantities without a unit, one finding for each metric."""
     findings = []
     for metric in sorted({n.metric for n in numbers if n.metric in UNITLESS}):
@@ -203,21 +203,21 @@ CHECKS = (
 )  # fmt: skip
 
 
-def audit(numbers: list[Number]) -> list[Finding]:
+def audit(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Run all checks; return the findings by kind. The same numbers give the same findings."""
     findings = [f for check in CHECKS for f in check(numbers)]
     order = list(KINDS)
     return sorted(findings, key=lambda f: order.index(f.kind))
 
 
-def _by_kind(findings: list[Finding]) -> Iterator[tuple[str, str, list[str]]]:
+def _by_kind(findings: list[AuditFinding]) -> Iterator[tuple[str, str, list[str]]]:
     """Yield (kind, its meaning, texts of its findings) for each kind that was found."""
     for kind, meaning in KINDS.items():
         if texts := [f.text for f in findings if f.kind == kind]:
             yield kind, meaning, texts
 
 
-def text_of(findings: list[Finding]) -> str:
+def text_of(findings: list[AuditFinding]) -> str:
     """Return the findings by kind, as text for a terminal."""
     lines = []
     for kind, meaning, texts in _by_kind(findings):
@@ -225,7 +225,7 @@ def text_of(findings: list[Finding]) -> str:
     return "\n".join(lines)
 
 
-def markdown_of(findings: list[Finding]) -> str:
+def markdown_of(findings: list[AuditFinding]) -> str:
     """Return the findings by kind, as Markdown lists."""
     lines = []
     for kind, meaning, texts in _by_kind(findings):
@@ -233,7 +233,7 @@ def markdown_of(findings: list[Finding]) -> str:
     return "\n".join(lines)
 
 
-def csv_of(findings: list[Finding]) -> str:
+def csv_of(findings: list[AuditFinding]) -> str:
     """Return the findings as CSV, one per row."""
     rows = ((f.kind, f.text, "; ".join(f.tables), "; ".join(f.where)) for f in findings)
     return to_csv(("kind", "finding", "tables", "where"), rows)

@@ -30,7 +30,7 @@ REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables,
 
 
 @dataclass(frozen=True)
-class Number:
+class PrintedNumber:
     """One number as printed."""
 
     table: str  # name of the table
@@ -68,7 +68,7 @@ class Number:
         return UNKNOWN not in self.place
 
 
-def read_tables(paths: Sequence[Path]) -> list[Number]:
+def read_tables(paths: Sequence[Path]) -> list[PrintedNumber]:
     """Read CSV files, or all *.csv in a folder; rows without a value are left out.
 
     Raises:
@@ -86,13 +86,13 @@ def read_tables(paths: Sequence[Path]) -> list[Number]:
     return numbers
 
 
-def _read(path: Path) -> list[Number]:
+def _read(path: Path) -> list[PrintedNumber]:
     advice = f"a table of results has {', '.join(REQUIRED)} and may have {', '.join(OPTIONAL)}"
     rows = read_csv(path, REQUIRED, LARGEST, advice)[1]
     return [n for line, row in rows if (n := _number(path, line, row)) is not None]
 
 
-def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
+def _number(path: Path, line: int, row: dict[str, str]) -> PrintedNumber | None:
     where = f"{path.name}:{line}"
     cell = {k: row.get(k, "").strip() for k in (*REQUIRED, *OPTIONAL)}
     if not cell["value"]:
@@ -106,7 +106,7 @@ def _number(path: Path, line: int, row: dict[str, str]) -> Number | None:
         )
     if cell["mark"] not in ("", "1", "2", "3"):
         raise AwError(f"{path} line {line}: mark {cell['mark'][:40]!a} is none of 1, 2, 3")
-    return Number(
+    return PrintedNumber(
         cell["table"] or path.stem,
         cell["method"],
         ", ".join(
@@ -137,7 +137,7 @@ KINDS = {
 
 
 @dataclass(frozen=True)
-class Finding:
+class AuditFinding:
     """Something that is unlikely or wrong in reported numbers."""
 
     kind: str  # a key of `KINDS`
@@ -146,10 +146,10 @@ class Finding:
     where: tuple[str, ...]  # file:line of every number involved
 
 
-def finding(kind: str, text: str, numbers: Iterable[Number]) -> Finding:
+def finding(kind: str, text: str, numbers: Iterable[PrintedNumber]) -> AuditFinding:
     """Make a finding about these numbers."""
     involved = list(numbers)
-    return Finding(
+    return AuditFinding(
         kind,
         text,
         tuple(dict.fromkeys(n.table for n in involved)),
@@ -157,7 +157,7 @@ def finding(kind: str, text: str, numbers: Iterable[Number]) -> Finding:
     )
 
 
-def place_name(number: Number) -> str:
+def place_name(number: PrintedNumber) -> str:
     """Return where the number was measured, as text."""
     if number.scene == "mean":
         return f"the mean of {number.dataset}"
@@ -166,7 +166,7 @@ def place_name(number: Number) -> str:
     return number.scene if number.scene != "unknown" else "a scene not named"
 
 
-def method_name(number: Number) -> str:
+def method_name(number: PrintedNumber) -> str:
     return f"{number.method} ({number.setting})" if number.setting else number.method
 
 
@@ -174,10 +174,10 @@ SIZE = "model_mb"  # follows from the number of Gaussians, which many runs let g
 NEAR, CLOSE = 25, 5  # units of the last digit; CLOSE is for numbers that lie in clusters
 ODDS = 0.005  # largest probability of a coincidence, over all comparisons, at which something is reported
 Key = tuple[str, ...]
-Line = dict[Key, Number]
+Line = dict[Key, PrintedNumber]
 
 
-def repeated(numbers: list[Number]) -> list[Finding]:
+def repeated(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find scenes and methods whose lines repeat, then entries (all metrics of a method on a scene)."""
     plain = [n for n in numbers if n.known and n.scene != MEAN and "+" not in n.scene and n.metric != SIZE]
     by_scene = _lines(plain, lambda n: n.place, lambda n: (n.method, n.setting, n.metric))
@@ -189,14 +189,14 @@ def repeated(numbers: list[Number]) -> list[Finding]:
             covered |= {frozenset((a.where, b.where)) for a, b in pairs}
             findings.append(finding("repeated", _words(kind, pairs), involved))
     # a mean is printed in several tables, but its repetition is reported once
-    by_text: dict[str, Finding] = {}
+    by_text: dict[str, AuditFinding] = {}
     for f in _entries(numbers, covered):
         by_text.setdefault(f.text, f)
     return findings + list(by_text.values())
 
 
 def _lines(
-    numbers: list[Number], line: Callable[[Number], Key], cell: Callable[[Number], Key]
+    numbers: list[PrintedNumber], line: Callable[[PrintedNumber], Key], cell: Callable[[PrintedNumber], Key]
 ) -> dict[Key, Line]:
     lines: dict[Key, Line] = defaultdict(dict)
     for n in numbers:
@@ -204,13 +204,13 @@ def _lines(
     return lines
 
 
-def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[Number, Number]]]:
+def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[PrintedNumber, PrintedNumber]]]:
     """Yield pairs of numbers of two lines that share too many, compared metric by metric."""
     from scipy.stats import poisson
 
     trials = []
     for (_, a), (_, b) in combinations(sorted(lines.items()), 2):
-        shared: dict[str, list[tuple[Number, Number]]] = defaultdict(list)
+        shared: dict[str, list[tuple[PrintedNumber, PrintedNumber]]] = defaultdict(list)
         for cell in a.keys() & b.keys():
             shared[cell[-1]].append((a[cell], b[cell]))
         trials.append([sorted(pairs, key=lambda p: p[0].where) for _, pairs in sorted(shared.items())])
@@ -233,7 +233,7 @@ def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[Number, Number]]]:
             yield equal
 
 
-def _words(kind: str, pairs: list[tuple[Number, Number]]) -> str:
+def _words(kind: str, pairs: list[tuple[PrintedNumber, PrintedNumber]]) -> str:
     a, b = pairs[0]
     metrics = ", ".join(dict.fromkeys(p[0].metric for p in pairs))
     if kind == "scenes":
@@ -244,13 +244,13 @@ def _words(kind: str, pairs: list[tuple[Number, Number]]) -> str:
     return f"{method_name(a)} and {method_name(b)}: the same {metrics} on {scenes}"
 
 
-def _entries(numbers: list[Number], covered: set[frozenset[str]]) -> Iterator[Finding]:
-    entries: dict[Key, dict[str, Number]] = defaultdict(dict)
+def _entries(numbers: list[PrintedNumber], covered: set[frozenset[str]]) -> Iterator[AuditFinding]:
+    entries: dict[Key, dict[str, PrintedNumber]] = defaultdict(dict)
     for n in numbers:
         entries[(n.table, *n.identity)].setdefault(n.metric, n)
     wide = [e for e in entries.values() if len(e) >= 2]
     # related pairs are tested apart, because a coincidence is less likely among fewer pairs
-    families: dict[str, list[tuple[dict[str, Number], dict[str, Number]]]] = defaultdict(list)
+    families: dict[str, list[tuple[dict[str, PrintedNumber], dict[str, PrintedNumber]]]] = defaultdict(list)
     for i, j in _near_pairs(wide):
         a, b = wide[i], wide[j]
         first, second = next(iter(a.values())), next(iter(b.values()))
@@ -269,7 +269,7 @@ def _entries(numbers: list[Number], covered: set[frozenset[str]]) -> Iterator[Fi
                 yield _entry(a, b, shared)
 
 
-def _near_pairs(entries: list[dict[str, Number]]) -> list[tuple[int, int]]:
+def _near_pairs(entries: list[dict[str, PrintedNumber]]) -> list[tuple[int, int]]:
     """Return pairs of entries that share three metrics or more and are near in all of them."""
     metrics = sorted({m for e in entries for m in e})
     value, unit = (np.full((len(entries), len(metrics)), np.nan) for _ in range(2))
@@ -286,7 +286,7 @@ def _near_pairs(entries: list[dict[str, Number]]) -> list[tuple[int, int]]:
     return pairs
 
 
-def _entry(a: dict[str, Number], b: dict[str, Number], shared: list[str]) -> Finding:
+def _entry(a: dict[str, PrintedNumber], b: dict[str, PrintedNumber], shared: list[str]) -> AuditFinding:
     first, second = a[shared[0]], b[shared[0]]
     values = " / ".join(a[m].text for m in a if m in shared)
     left = f"{method_name(first)} on {place_name(first)}"
@@ -296,18 +296,22 @@ def _entry(a: dict[str, Number], b: dict[str, Number], shared: list[str]) -> Fin
     )
 
 
-def _may_be_one(a: Number, b: Number) -> bool:
+def _may_be_one(a: PrintedNumber, b: PrintedNumber) -> bool:
     """Return whether both may be the same result, as far as the tables say; then equality is expected."""
     if (a.method, a.setting) != (b.method, b.setting):
         return False
     return all(x == y or UNKNOWN in (x, y) for x, y in zip(a.place, b.place))
 
 
-def _all(a: dict[str, Number], b: dict[str, Number], holds: Callable[[Number, Number], bool]) -> bool:
+def _all(
+    a: dict[str, PrintedNumber],
+    b: dict[str, PrintedNumber],
+    holds: Callable[[PrintedNumber, PrintedNumber], bool],
+) -> bool:
     return all(holds(a[m], b[m]) for m in a.keys() & b.keys())
 
 
-def _near(a: Number, b: Number, units: int) -> bool:
+def _near(a: PrintedNumber, b: PrintedNumber, units: int) -> bool:
     return abs(a.value - b.value) <= units * 10.0 ** -max(a.digits, b.digits) + 1e-12
 
 
@@ -320,11 +324,11 @@ FAR = 8.0  # robust deviations of a residual; in normal noise once in 10^15
 USUAL = 4.0  # robust deviations that the other two metrics may have
 FINEST = 0.0125  # smallest robust deviation that is used
 SMALLEST = 4  # methods and scenes that a table needs for a fit
-Entry = dict[str, Number]  # family -> number
+Entry = dict[str, PrintedNumber]  # family -> number
 Scenes = dict[tuple[str, str, str], dict[str, Entry]]  # (table, dataset, scene) -> method -> entry
 
 
-def out_of_place(numbers: list[Number]) -> list[Finding]:
+def out_of_place(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find values outside the range of the metric."""
     findings = []
     for n in numbers:
@@ -335,7 +339,7 @@ def out_of_place(numbers: list[Number]) -> list[Finding]:
     return findings
 
 
-def exchanged(numbers: list[Number]) -> list[Finding]:
+def exchanged(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find exchanges of SSIM and LPIPS, for one method or for a whole scene of a table."""
     scenes = _scenes(numbers)
     columns = list(_columns(scenes))
@@ -343,7 +347,7 @@ def exchanged(numbers: list[Number]) -> list[Finding]:
     return columns + [f for place in scenes for f in _cells(scenes, place) if f.where[0] not in done]
 
 
-def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[Finding]:
+def _cells(scenes: Scenes, place: tuple[str, str, str]) -> Iterator[AuditFinding]:
     entries = scenes[place]
     for method, entry in entries.items():
         if _unusual(scenes, place, method) is False:
@@ -378,7 +382,7 @@ def _unusual(scenes: Scenes, place: tuple[str, str, str], method: str) -> bool |
     return abs(s - ssim) + abs(d - lpips) > abs(d - ssim) + abs(s - lpips)
 
 
-def _columns(scenes: Scenes) -> Iterator[Finding]:
+def _columns(scenes: Scenes) -> Iterator[AuditFinding]:
     from scipy.stats import spearmanr
 
     for place, entries in scenes.items():
@@ -394,7 +398,7 @@ def _columns(scenes: Scenes) -> Iterator[Finding]:
             yield finding("swapped", text, involved)
 
 
-def unlike(numbers: list[Number]) -> list[Finding]:
+def unlike(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find SSIM or LPIPS far from the value predicted from method and scene, while the other metrics are not.
 
     A method that failed on a scene is bad in all three metrics, which is no misprint.
@@ -445,7 +449,7 @@ def _residuals(grid: dict[tuple[str, str], Entry], family: str) -> dict[tuple[st
     }
 
 
-def _scenes(numbers: list[Number]) -> Scenes:
+def _scenes(numbers: list[PrintedNumber]) -> Scenes:
     """Return PSNR, SSIM and LPIPS of every method on every scene that has all three."""
     scenes: dict[tuple[str, str, str], dict[str, Entry]] = defaultdict(lambda: defaultdict(dict))
     for n in numbers:
@@ -454,7 +458,7 @@ def _scenes(numbers: list[Number]) -> Scenes:
     return {k: {m: e for m, e in v.items() if len(e) == len(LIMITS)} for k, v in scenes.items()}
 
 
-def _family(n: Number) -> str:
+def _family(n: PrintedNumber) -> str:
     return n.metric.partition("_")[0]
 
 

@@ -24,7 +24,7 @@ from ambiguous_wild.report.board import (
     write_board,
 )
 from ambiguous_wild.report.board_reproduce import Scenes
-from ambiguous_wild.report.board_verify import Unfinished, Verified, verify
+from ambiguous_wild.report.board_verify import Unfinished, VerifiedRun, verify
 
 Outcome = Literal["added", "there already", "replaced", "refused", "unfinished"]
 Tick = Callable[[int, int], None]
@@ -78,7 +78,7 @@ def add(
         board_pictures.read_index(board)  # a damaged index is found before anything is written
         finder = Scenes(scenes, dataset, on_board)
         reports: dict[Path, AddReport] = {}
-        passed: list[Verified] = []
+        passed: list[VerifiedRun] = []
         for done, run in enumerate(sorted(runs)):
             tick(done, len(runs))
             try:
@@ -111,7 +111,7 @@ def _find(paths: Sequence[Path]) -> set[Path]:
 
 def _merge(
     on_board: list[Entry],
-    passed: list[Verified],
+    passed: list[VerifiedRun],
     replace_other: bool,
     reports: dict[Path, AddReport],
 ) -> list[Entry]:
@@ -142,7 +142,7 @@ def _merge(
     return [entries[k] for k in sorted(entries)]
 
 
-def _other_numbers(new: Verified, old: Entry) -> str:
+def _other_numbers(new: VerifiedRun, old: Entry) -> str:
     differing = [k for k in old.quality if old.quality[k] != new.entry.quality.get(k)]
     key = differing[0] if differing else None
     shown = (
@@ -156,12 +156,14 @@ def _other_numbers(new: Verified, old: Entry) -> str:
     )
 
 
-def _conflicts(on_board: list[Entry], passed: list[Verified], kept: set[Key]) -> list[tuple[str, Verified]]:
+def _conflicts(
+    on_board: list[Entry], passed: list[VerifiedRun], kept: set[Key]
+) -> list[tuple[str, VerifiedRun]]:
     """Return (reason, run) of runs that contradict others; the result does not depend on their order.
 
     `kept` are the cells of the board that the new runs may not replace.
     """
-    cells: dict[Key, list[Verified]] = defaultdict(list)
+    cells: dict[Key, list[VerifiedRun]] = defaultdict(list)
     hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
     configs: dict[str, list[Entry]] = defaultdict(list)
     fixed = [e for e in on_board if e.key in kept]
@@ -171,7 +173,7 @@ def _conflicts(on_board: list[Entry], passed: list[Verified], kept: set[Key]) ->
         hashes[e.dataset, e.scene].add(e.scene_hash)
         configs[e.config_hash].append(e)
     board_hashes = {(e.dataset, e.scene): e.scene_hash for e in on_board}
-    conflicts: list[tuple[str, Verified]] = []
+    conflicts: list[tuple[str, VerifiedRun]] = []
     for v in passed:
         e = v.entry
         scenes = hashes[e.dataset, e.scene]

@@ -33,7 +33,7 @@ from ambiguous_wild.report.board import (
     unguard,
     unique_slug,
 )
-from ambiguous_wild.report.board_verify import RENDERS, Verified
+from ambiguous_wild.report.board_verify import RENDERS, VerifiedRun
 
 INDEX = "index.csv"
 OLD = (  # columns of an index of earlier versions, which kept no masks: every picture is of kind "test"
@@ -48,7 +48,7 @@ Row = dict[str, str]  # by column; method is empty for photos and exact masks
 
 
 @dataclass(frozen=True)
-class _Place:
+class _PictureSubject:
     """What a picture shows; see the kinds above."""
 
     dataset: str
@@ -103,7 +103,7 @@ def read_index(board: Path) -> list[Row]:
     return rows
 
 
-def keep(board: Path, runs: Iterable[Verified], count: int) -> int:
+def keep(board: Path, runs: Iterable[VerifiedRun], count: int) -> int:
     """Keep pictures of runs: for each method and scene those of the lowest seed.
 
     Args:
@@ -175,14 +175,14 @@ def chosen(names: tuple[str, ...], count: int) -> list[str]:
     return [names[round(float(i))] for i in at]
 
 
-def _keep_one(board: Path, run: Verified, name: str, index: dict[_Place, Row]) -> int:
+def _keep_one(board: Path, run: VerifiedRun, name: str, index: dict[_PictureSubject, Row]) -> int:
     e = run.entry
-    place = _Place(e.dataset, e.scene, name, e.method, e.setting, e.options)
+    place = _PictureSubject(e.dataset, e.scene, name, e.method, e.setting, e.options)
     if _has_lower_seed(index.get(place), e.seed):
         return 0
     written = 0
     if run.scene is not None:
-        photo = _Place(e.dataset, e.scene, name)
+        photo = _PictureSubject(e.dataset, e.scene, name)
         path = next(v.image_path for v in run.scene.test if v.name == name)
         written += _write(board, photo, _jpeg(path), "", math.nan, index)
     render = (run.run / RENDERS / name).with_suffix(".png")
@@ -193,7 +193,7 @@ def _has_lower_seed(row: Row | None, seed: int) -> bool:
     return row is not None and bool(row["seed"]) and int(row["seed"]) < seed
 
 
-def _keep_masks(board: Path, run: Verified, count: int, index: dict[_Place, Row]) -> int:
+def _keep_masks(board: Path, run: VerifiedRun, count: int, index: dict[_PictureSubject, Row]) -> int:
     """Keep train photos, the run's masks of them, and the exact masks if there are any."""
     e, scene = run.entry, run.scene
     if scene is None:
@@ -202,22 +202,33 @@ def _keep_masks(board: Path, run: Verified, count: int, index: dict[_Place, Row]
     written = 0
     for name in chosen(tuple(sorted(n for n, path in masks.items() if path.is_file())), count):
         view = next(v for v in scene.train if v.name == name)
-        place = _Place(e.dataset, e.scene, name, e.method, e.setting, e.options, TRAIN)
+        place = _PictureSubject(e.dataset, e.scene, name, e.method, e.setting, e.options, TRAIN)
         if _has_lower_seed(index.get(place), e.seed):
             continue
         photo = _jpeg(view.image_path)
-        written += _write(board, _Place(e.dataset, e.scene, name, kind=TRAIN), photo, "", math.nan, index)
+        written += _write(
+            board, _PictureSubject(e.dataset, e.scene, name, kind=TRAIN), photo, "", math.nan, index
+        )
         size = (view.camera.width, view.camera.height)
         exact = scene.root / "truth" / "distractor" / Path(name).with_suffix(".png")
         if exact.is_file():
             drawn = _overlay(read_gray(exact) >= 128, size, EXACT_RGBA)
-            written += _write(board, _Place(e.dataset, e.scene, name, kind=EXACT), drawn, "", math.nan, index)
+            written += _write(
+                board, _PictureSubject(e.dataset, e.scene, name, kind=EXACT), drawn, "", math.nan, index
+            )
         drawn = _overlay(read_gray(masks[name]) < 128, size, PREDICTED_RGBA)
         written += _write(board, place, drawn, str(e.seed), math.nan, index)
     return written
 
 
-def _write(board: Path, place: _Place, data: bytes, seed: str, psnr: float, index: dict[_Place, Row]) -> int:
+def _write(
+    board: Path,
+    place: _PictureSubject,
+    data: bytes,
+    seed: str,
+    psnr: float,
+    index: dict[_PictureSubject, Row],
+) -> int:
     path = folder_of(board) / place.file
     fresh = not path.is_file() or path.read_bytes() != data
     if fresh:
@@ -229,9 +240,9 @@ def _write(board: Path, place: _Place, data: bytes, seed: str, psnr: float, inde
     return int(fresh)
 
 
-def _place(row: Row) -> _Place:
+def _place(row: Row) -> _PictureSubject:
     dataset, scene, image, method, setting, options = (row[k] for k in COLUMNS[:6])
-    return _Place(dataset, scene, image, method, setting, options, row["kind"])
+    return _PictureSubject(dataset, scene, image, method, setting, options, row["kind"])
 
 
 def _overlay(

@@ -36,7 +36,7 @@ from ambiguous_wild.io.page_parts import fill_page
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.report import board_pictures
 from ambiguous_wild.report.audit import audit
-from ambiguous_wild.report.audit_numbers import REPORTED, Finding, Number, read_tables
+from ambiguous_wild.report.audit_numbers import REPORTED, AuditFinding, PrintedNumber, read_tables
 from ambiguous_wild.report.board import (
     ALONE,
     CsvValue,
@@ -169,8 +169,8 @@ REPORTED_COLUMNS = (
 class Reported:
     """Numbers that papers print, their sources, and the findings of `aw audit`."""
 
-    numbers: tuple[Number, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    numbers: tuple[PrintedNumber, ...] = ()
+    findings: tuple[AuditFinding, ...] = ()
     sources: dict[str, dict[str, str]] = field(default_factory=dict)  # table -> title, venue, url, caption
 
     def plain(self) -> Facts:
@@ -233,7 +233,7 @@ def _link(url: object) -> str:
     return text if re.fullmatch(r"https?://[^\s\"'<>]+", text) else ""
 
 
-def _plain(number: Number, column: str) -> CsvValue:
+def _plain(number: PrintedNumber, column: str) -> CsvValue:
     value: CsvValue = getattr(number, "text" if column == "printed" else column)
     return value
 
@@ -359,7 +359,9 @@ def _published(out: Path) -> set[str] | None:
     return {MANIFEST, *map(str, names)} if isinstance(names, list) else None
 
 
-def _write_data(board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[Number]) -> list[str]:
+def _write_data(
+    board: Path, folder: Path, entries: Sequence[Entry], printed: Sequence[PrintedNumber]
+) -> list[str]:
     folder.mkdir()
     files = {path.name: text for path, text in files_of(board, entries).items()}
     if printed:

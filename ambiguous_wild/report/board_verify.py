@@ -52,7 +52,7 @@ class Unfinished(AwError):
 
 
 @dataclass(frozen=True)
-class Verified:
+class VerifiedRun:
     """A run that passed all checks."""
 
     entry: Entry
@@ -62,7 +62,7 @@ class Verified:
     scene: Scene | None  # None: it is not on this machine
 
 
-def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
+def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
     """Check a run and make its row.
 
     Args:
@@ -117,7 +117,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> Verified:
         reproduce=reproduce,
     )
     psnr = {row["name"]: _or_nan(row.get("psnr")) for row in result["per_image"]}
-    return Verified(entry, run, tuple(sorted(renders)), psnr, scene)
+    return VerifiedRun(entry, run, tuple(sorted(renders)), psnr, scene)
 
 
 def _changed(run: Path, what: str) -> NoReturn:

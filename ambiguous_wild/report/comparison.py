@@ -24,7 +24,7 @@ from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.notes import incomparable, notes, untimed
 from ambiguous_wild.report.plain_formats import to_text
-from ambiguous_wild.report.table import Cell, Column, Row, State, Table, ranks
+from ambiguous_wild.report.table import Column, Row, State, Table, TableCell, ranks
 from ambiguous_wild.report.typeset import to_html
 
 MASK_COLUMNS = ("mask_iou", "mask_precision")
@@ -121,7 +121,11 @@ def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
     rows = []
     for row in table.rows:
         names = " or ".join(dict.fromkeys(shown[shown["method"] == row.name]["effects"]))
-        rows.append(replace(row, cells=(*row.cells, Cell(printed=names) if names else Cell(state="missing"))))
+        rows.append(
+            replace(
+                row, cells=(*row.cells, TableCell(printed=names) if names else TableCell(state="missing"))
+            )
+        )
     column = Column("", EFFECTS, table.columns[0].scene, words=True)
     return replace(table, columns=(*table.columns, column), rows=tuple(rows))
 
@@ -210,17 +214,17 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
     state = index.state(method, scene)
     if state != "ok":
         count = 0 if state == "absent" else int((index.runs[method, scene]["status"] == "ok").sum())
-        return Row(method, tuple(Cell(state=state) for _ in columns), runs=count)
+        return Row(method, tuple(TableCell(state=state) for _ in columns), runs=count)
     cells = []
     for column in columns:
         values = index.seeds(method, scene, column).to_numpy()
         value = stats.mean(values)
         if math.isnan(value):
-            cells.append(Cell(state="missing"))
+            cells.append(TableCell(state="missing"))
             continue
         low = high = math.nan
         if column.timed and (method, scene) in index.untimed:
-            cells.append(Cell(value, math.nan, float(values.min()), float(values.max()), ranged=True))
+            cells.append(TableCell(value, math.nan, float(values.min()), float(values.max()), ranged=True))
             continue
         if column.per_image:
             images = index.images[method, scene, column.key].pivot_table(
@@ -231,7 +235,7 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
                 means[np.isfinite(means)] if np.isfinite(means).any() else means
             )
             low, high = interval.low, interval.high
-        cells.append(Cell(value, stats.spread(values), low, high))
+        cells.append(TableCell(value, stats.spread(values), low, high))
     ranked = (method, scene) not in index.unfinished and not knows_truth(method)
     return Row(method, tuple(cells), runs=len(index.runs[method, scene]), ranked=ranked)
 
@@ -252,17 +256,17 @@ def _mean_row(
         over = defined[column.key]
         value = stats.mean([row.cells[i].value for row, s in zip(rows, scenes) if s in over])
         if "failed" in states:
-            cells.append(Cell(state="failed"))
+            cells.append(TableCell(state="failed"))
         elif math.isnan(value):
-            cells.append(Cell(state="missing"))
+            cells.append(TableCell(state="missing"))
         elif any(row.cells[i].ranged for row in rows):
             own = [(c.low, c.high) if c.ranged else (c.value, c.value) for c in (r.cells[i] for r in rows)]
             low, high = (float(np.mean(ends)) for ends in zip(*own))
-            cells.append(Cell(value, math.nan, low, high, ranged=True))
+            cells.append(TableCell(value, math.nan, low, high, ranged=True))
         else:
             # means over scenes for each seed, whose spread is shown; they need the same seeds on all scenes
             by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
-            cells.append(Cell(value, stats.spread(by_seed.mean(axis=1))))
+            cells.append(TableCell(value, stats.spread(by_seed.mean(axis=1))))
     return Row(
         method, tuple(cells), runs=sum(row.runs for row in rows), ranked=all(row.ranked for row in rows)
     )

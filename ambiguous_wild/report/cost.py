@@ -14,9 +14,17 @@ from ambiguous_wild.harness.result_file import encoded
 from ambiguous_wild.harness.timing import seconds_range
 from ambiguous_wild.io.files import is_record, refuse_files_there, write_json, write_text
 from ambiguous_wild.report import plain_formats
-from ambiguous_wild.report.cost_curves import Change, Curve, Point, Summary, changes, curves_of, points
+from ambiguous_wild.report.cost_curves import (
+    Change,
+    Curve,
+    MeanAndDeviation,
+    Point,
+    changes,
+    curves_of,
+    points,
+)
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
-from ambiguous_wild.report.cost_targets import Answer, Reach, answers, times_to_reach
+from ambiguous_wild.report.cost_targets import Reach, TargetRow, answers, times_to_reach
 from ambiguous_wild.report.plain_formats import to_csv
 from ambiguous_wild.report.table import Table, text_table
 
@@ -35,7 +43,7 @@ class CostReport:
     reach: tuple[Reach, ...]
     changes: tuple[Change, ...]
     notes: tuple[str, ...]
-    answers: tuple[Answer, ...]  # one for each scene
+    answers: tuple[TargetRow, ...]  # one for each scene
     reference: bool  # times are seconds of the reference machine; else wall seconds
     setup: bool  # times include the set-up before the first step
     made_by: str  # the command
@@ -184,7 +192,7 @@ def _timeline_rows(curves: Iterable[Curve]) -> Iterable[Facts]:
                        "train_s": at, "psnr": psnr}  # fmt: skip
 
 
-def _both(name: str, value: Summary) -> dict[str, float]:
+def _both(name: str, value: MeanAndDeviation) -> dict[str, float]:
     return {name: value.mean, f"{name}_std": value.spread}
 
 
@@ -209,26 +217,26 @@ def to_text(report: CostReport) -> str:
 
 
 @dataclass(frozen=True)
-class Unit:
+class TimeUnit:
     """The unit of times that are shown; files hold minutes."""
 
     name: str
     per_minute: float
     digits: int
 
-    def of(self, minutes: Summary) -> Summary:
-        return Summary(minutes.mean * self.per_minute, minutes.spread * self.per_minute)
+    def of(self, minutes: MeanAndDeviation) -> MeanAndDeviation:
+        return MeanAndDeviation(minutes.mean * self.per_minute, minutes.spread * self.per_minute)
 
 
-def time_unit(report: CostReport) -> Unit:
+def time_unit(report: CostReport) -> TimeUnit:
     """Return seconds if every training is short, else minutes."""
     minutes = [
         run.train_s / 60.0 for curve in report.curves for run in curve.runs if not math.isnan(run.train_s)
     ]
     kind = "ref " if report.reference else ""
     if max(minutes, default=0.0) < SHORT_MIN:
-        return Unit(f"{kind}s", 60.0, 1)
-    return Unit(f"{kind}min", 1.0, 2)
+        return TimeUnit(f"{kind}s", 60.0, 1)
+    return TimeUnit(f"{kind}min", 1.0, 2)
 
 
 def tables_of(report: CostReport) -> list[Table]:
@@ -288,7 +296,7 @@ def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Ta
     return text_table(f"{counted} to reach a test PSNR ({where})", ("method", *head), lines)
 
 
-def _when(row: Reach, unit: Unit, several: bool) -> str:
+def _when(row: Reach, unit: TimeUnit, several: bool) -> str:
     if not row.runs:
         return "no run"
     if row.missing:  # the reason is in the notes below the tables
@@ -301,14 +309,14 @@ def _when(row: Reach, unit: Unit, several: bool) -> str:
     return f"{text} (in {row.length})" if several else text
 
 
-def _time(minutes: Summary, row: Point | Reach, unit: Unit) -> str:
+def _time(minutes: MeanAndDeviation, row: Point | Reach, unit: TimeUnit) -> str:
     """Return a mean with its deviation or, if it is not ranked, the range over the runs."""
     if not row.unranked or math.isnan(minutes.mean):
         return number(unit.of(minutes), unit.digits)
     return seconds_range([row.low * unit.per_minute, row.high * unit.per_minute], unit.digits)
 
 
-def _changed(title: str, rows: Sequence[Change], unit: Unit) -> Table:
+def _changed(title: str, rows: Sequence[Change], unit: TimeUnit) -> Table:
     head = ("change", "method", "trained for", "pairs", "dB gained", "95 % interval", f"extra {unit.name}",
             "extra ms/iter", f"dB per extra {'ref ' if unit.name.startswith('ref') else ''}min")  # fmt: skip
     lines = []
@@ -332,7 +340,7 @@ def per_minute(change: Change) -> str:
     return f"{change.per_minute:+.2f}" if change.minutes.mean > 0.0 else "takes less"
 
 
-def number(value: Summary, digits: int, *, sign: bool = False, spread: bool = True) -> str:
+def number(value: MeanAndDeviation, digits: int, *, sign: bool = False, spread: bool = True) -> str:
     """Return a mean and its deviation over seeds as text; a dash if it is missing."""
     if math.isnan(value.mean):
         return MISSING

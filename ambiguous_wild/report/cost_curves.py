@@ -43,11 +43,11 @@ class Change:
     length: str
     scenes: tuple[str, ...]
     pairs: int
-    db: Summary  # gain in PSNR, over pairs
+    db: MeanAndDeviation  # gain in PSNR, over pairs
     low: float  # 95 % bootstrap interval of the gain, over the test images of all pairs
     high: float
-    minutes: Summary  # extra minutes of training, over pairs
-    ms: Summary  # extra ms per iteration
+    minutes: MeanAndDeviation  # extra minutes of training, over pairs
+    ms: MeanAndDeviation  # extra ms per iteration
     share: float  # extra minutes, as a share of the training without the change
     unranked: str = ""  # why the minutes cannot be trusted; empty if they can
 
@@ -199,8 +199,8 @@ def _value(run: CostRun, option: str) -> str:
     return str(dict(run.options).get(option, _ABSENT))
 
 
-def _summary(values: Sequence[float]) -> Summary:
-    return Summary(stats.mean(values), stats.spread(values))
+def _summary(values: Sequence[float]) -> MeanAndDeviation:
+    return MeanAndDeviation(stats.mean(values), stats.spread(values))
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Summary:
+class MeanAndDeviation:
     """A mean and the sample deviation over seeds; NaN = missing, or one seed."""
 
     mean: float = math.nan
@@ -255,7 +255,7 @@ def longest(curves: Sequence[Curve]) -> list[Curve]:
     return list(best.values())
 
 
-def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], float]) -> Summary:
+def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], float]) -> MeanAndDeviation:
     """Return the mean over seeds, then scenes; the spread is over seeds of the mean over scenes.
 
     Args:
@@ -265,12 +265,14 @@ def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], floa
     """
     by_scene = [{run.seed: value(run) for run in curve.on(scene)} for scene in scenes]
     if not all(by_scene):
-        return Summary()
+        return MeanAndDeviation()
     mean = stats.mean([stats.mean(list(values.values())) for values in by_scene])
     seeds = by_scene[0].keys()
     if any(values.keys() != seeds for values in by_scene):
-        return Summary(mean)  # scenes have different seeds: no seed has a mean over all scenes
-    return Summary(mean, stats.spread([stats.mean([v[seed] for v in by_scene]) for seed in sorted(seeds)]))
+        return MeanAndDeviation(mean)  # scenes have different seeds: no seed has a mean over all scenes
+    return MeanAndDeviation(
+        mean, stats.spread([stats.mean([v[seed] for v in by_scene]) for seed in sorted(seeds)])
+    )
 
 
 def psnr_at(run: CostRun, seconds: np.ndarray) -> np.ndarray:
@@ -327,10 +329,12 @@ class Point:
     method: str
     length: str
     runs: int
-    psnr: Summary  # dB
-    minutes: Summary  # of training; with the set-up if `setup` was asked for
-    setup_s: Summary
-    numbers: dict[str, Summary]  # ms per iteration, Gaussians, MB, frames per second, the user's metrics
+    psnr: MeanAndDeviation  # dB
+    minutes: MeanAndDeviation  # of training; with the set-up if `setup` was asked for
+    setup_s: MeanAndDeviation
+    numbers: dict[
+        str, MeanAndDeviation
+    ]  # ms per iteration, Gaussians, MB, frames per second, the user's metrics
     unranked: str = ""  # why its time is not ranked
     low: float = math.nan  # minutes of the fastest run; shown if the time is not ranked
     high: float = math.nan  # minutes of the slowest run
@@ -368,7 +372,7 @@ def _point(curve: Curve, scenes: Sequence[str], setup: bool, names: Iterable[str
     def minutes(run: CostRun) -> float:
         return (run.train_s + (run.setup_s if setup else 0.0)) / 60.0
 
-    def number(name: str) -> Summary:
+    def number(name: str) -> MeanAndDeviation:
         return summary(curve, scenes, lambda run: run.numbers.get(name, math.nan))
 
     runs = [run for run in curve.runs if run.scene in scenes]

@@ -13,9 +13,17 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
 from ambiguous_wild.methods.registry import knows_truth
-from ambiguous_wild.report.cost import PLOTS, CostReport, Unit, per_minute, time_unit
+from ambiguous_wild.report.cost import PLOTS, CostReport, TimeUnit, per_minute, time_unit
 from ambiguous_wild.report.cost_curves import KINDS as CHANGES
-from ambiguous_wild.report.cost_curves import Change, Curve, Point, Summary, longest, summary, timeline
+from ambiguous_wild.report.cost_curves import (
+    Change,
+    Curve,
+    MeanAndDeviation,
+    Point,
+    longest,
+    summary,
+    timeline,
+)
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))  # when colours run out
 GREY = "0.45"
@@ -176,7 +184,9 @@ def draw_timelines(report: CostReport) -> Any | None:
     return figure
 
 
-def _timeline(axes: Any, curve: Curve, scenes: tuple[str, ...], style: LineStyle, unit: Unit) -> Any | None:
+def _timeline(
+    axes: Any, curve: Curve, scenes: tuple[str, ...], style: LineStyle, unit: TimeUnit
+) -> Any | None:
     scale = unit.per_minute / 60.0
     if len(scenes) == 1:
         for run in curve.on(scenes[0]):
@@ -195,7 +205,7 @@ def _timeline(axes: Any, curve: Curve, scenes: tuple[str, ...], style: LineStyle
     return curve.name, x.mean, y.mean, style["color"]
 
 
-def _dot(axes: Any, x: Summary, y: Summary, colour: Any, *, hollow: bool = False) -> None:
+def _dot(axes: Any, x: MeanAndDeviation, y: MeanAndDeviation, colour: Any, *, hollow: bool = False) -> None:
     xerr, yerr = (e if finite(e) else None for e in (x.spread, y.spread))
     axes.errorbar(x.mean, y.mean, xerr=xerr, yerr=yerr, fmt="o", color=colour, markersize=5.5, elinewidth=1.2,
                   capsize=2.5, zorder=3, markerfacecolor="white" if hollow else colour)  # fmt: skip
@@ -224,7 +234,7 @@ def draw_budgets(report: CostReport) -> Any | None:
 
 
 def _joined(
-    axes: Any, curves: Sequence[Curve], scenes: tuple[str, ...], style: LineStyle, unit: Unit
+    axes: Any, curves: Sequence[Curve], scenes: tuple[str, ...], style: LineStyle, unit: TimeUnit
 ) -> list[tuple[float, float]]:
     ends = []
     for curve in curves:
@@ -232,7 +242,7 @@ def _joined(
         y = summary(curve, scenes, lambda run: run.psnr)
         if finite(x.mean, y.mean):
             ends.append((x.mean, y.mean))
-            _dot(axes, Summary(x.mean), y, style["color"])
+            _dot(axes, MeanAndDeviation(x.mean), y, style["color"])
     ends.sort()
     axes.plot([x for x, _ in ends], [y for _, y in ends], **style, linewidth=2.0)
     return ends
@@ -286,7 +296,7 @@ def draw_front(report: CostReport) -> Any | None:
     return figure
 
 
-def _x(point: Point, key: str, unit: Unit) -> Summary:
+def _x(point: Point, key: str, unit: TimeUnit) -> MeanAndDeviation:
     return unit.of(point.minutes) if key == "minutes" else point.numbers[key]
 
 
@@ -328,7 +338,7 @@ def _what(change: Change) -> str:
     return f"{change.method}: {plus}{change.what}, {change.length}"
 
 
-def _price(change: Change, unit: Unit) -> str:
+def _price(change: Change, unit: TimeUnit) -> str:
     if not finite(change.minutes.mean):
         return "time unknown"
     if change.same_time:

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.methods.registry import knows_truth
-from ambiguous_wild.report.cost_curves import Curve, Summary, scenes_of, summary
+from ambiguous_wild.report.cost_curves import Curve, MeanAndDeviation, scenes_of, summary
 from ambiguous_wild.report.cost_runs import CostRun, why_unranked
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
 
 
 @dataclass(frozen=True)
-class Target:
+class PsnrTarget:
     """A PSNR to reach, relative to the best curve of each scene, or the same everywhere."""
 
     db: float  # below the best, or absolute
@@ -39,7 +39,7 @@ class Reach:
     length: str
     target: str
     psnr: float  # dB of the target; NaN: it differs between scenes, or there is no best curve
-    minutes: Summary  # of training; missing unless every run reaches the target
+    minutes: MeanAndDeviation  # of training; missing unless every run reaches the target
     reached: int  # number of runs that reach it
     runs: int
     bound: bool  # some runs had reached it by their first probe: the time is an upper bound
@@ -62,7 +62,9 @@ def times_to_reach(
         targets: in dB; empty = `BELOW_BEST` below the best curve of each scene that is no reference.
         setup: add the set-up before the first step to the time.
     """
-    wanted = [Target(t, False) for t in dict.fromkeys(targets)] or [Target(t, True) for t in BELOW_BEST]
+    wanted = [PsnrTarget(t, False) for t in dict.fromkeys(targets)] or [
+        PsnrTarget(t, True) for t in BELOW_BEST
+    ]
     scenes = scenes_of(curves)
     lengths: dict[str, list[Curve]] = {}
     for curve in curves:
@@ -110,7 +112,7 @@ def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
     return math.nan, False
 
 
-def _level(target: Target, curves: Sequence[Curve], scene: str) -> float:
+def _level(target: PsnrTarget, curves: Sequence[Curve], scene: str) -> float:
     if not target.relative:
         return target.db
     # a reference sets no target for the other methods
@@ -119,18 +121,20 @@ def _level(target: Target, curves: Sequence[Curve], scene: str) -> float:
     return max((end for end in ends if math.isfinite(end)), default=math.nan) - target.db
 
 
-def _reach(curve: Curve, target: Target, scene: str | None, level: dict[str, float], setup: bool) -> Reach:
+def _reach(
+    curve: Curve, target: PsnrTarget, scene: str | None, level: dict[str, float], setup: bool
+) -> Reach:
     runs = [run for name in level for run in curve.on(name)]
     times = {id(run): first_time(run, level[run.scene]) for run in runs}
 
     def minutes(run: CostRun) -> float:
         return (times[id(run)][0] + (run.setup_s if setup else 0.0)) / 60.0
 
-    missing, mean = _missing(curve, level, runs), Summary()
+    missing, mean = _missing(curve, level, runs), MeanAndDeviation()
     if not missing:
         mean = summary(curve, tuple(level), minutes)
         if any(run.unprobed for run in runs):
-            mean = Summary(mean.mean)  # the spread of upper bounds has no meaning
+            mean = MeanAndDeviation(mean.mean)  # the spread of upper bounds has no meaning
     return Reach(
         scene,
         curve.name,
@@ -163,7 +167,7 @@ LAST_DB = 1.0
 
 
 @dataclass(frozen=True)
-class Answer:
+class TargetRow:
     """The numbers in the line of one scene."""
 
     scene: str
@@ -193,7 +197,7 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.3g} min"
 
 
-def answers(curves: Sequence[Curve], *, setup: bool = False) -> list[Answer]:
+def answers(curves: Sequence[Curve], *, setup: bool = False) -> list[TargetRow]:
     """Compute the answer for each scene with a finished run.
 
     Args:
@@ -206,7 +210,7 @@ def answers(curves: Sequence[Curve], *, setup: bool = False) -> list[Answer]:
     return [answer for answer in by_scene if answer is not None]
 
 
-def _answer(scene: str, curves: Sequence[Curve], setup: bool) -> Answer | None:
+def _answer(scene: str, curves: Sequence[Curve], setup: bool) -> TargetRow | None:
     ends = {id(c): summary(c, (scene,), lambda run: run.psnr).mean for c in curves}
     finished = [c for c in curves if math.isfinite(ends[id(c)])]
     if not finished:
@@ -219,7 +223,7 @@ def _answer(scene: str, curves: Sequence[Curve], setup: bool) -> Answer | None:
     most = _first(on_scene, MOST * best, setup)
     own = [c for c in on_scene if c.name == best_curve.name and c.length == best_curve.length]
     before = _first(own, best - LAST_DB, setup)
-    return Answer(
+    return TargetRow(
         scene,
         best,
         best_curve.name,

@@ -18,7 +18,7 @@ from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import FORMATS, Exported, export, space_of
+from ambiguous_wild.viewing.model import FORMATS, ExportedModel, export, space_of
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -49,7 +49,7 @@ def export_runs(
     overwrite: bool = False,
     up: str | None = None,
     say: Callable[[str], None] = lambda text: None,
-) -> list[tuple[str, list[Exported]]]:
+) -> list[tuple[str, list[ExportedModel]]]:
     """Write the models of runs, and splat files, in other formats.
 
     Args:

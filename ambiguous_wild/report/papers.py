@@ -12,9 +12,9 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.store import Runs, check_names
-from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, Number, read_tables
+from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, PrintedNumber, read_tables
 from ambiguous_wild.report.comparison import comparison
-from ambiguous_wild.report.table import BLANK, Cell, Column, Row, Table
+from ambiguous_wild.report.table import BLANK, Column, Row, Table, TableCell
 
 PER_TABLE = 6  # scenes side by side, as in the papers
 LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
@@ -159,8 +159,8 @@ def quality_columns(runs: Runs) -> tuple[str, ...]:
     return ("psnr", "ssim", *([lpips] if lpips else []))
 
 
-def _cells(part: Table, method: str) -> tuple[Cell, ...]:
-    absent = tuple(Cell(state="absent") for _ in part.columns)
+def _cells(part: Table, method: str) -> tuple[TableCell, ...]:
+    absent = tuple(TableCell(state="absent") for _ in part.columns)
     return next((row.cells for row in part.rows if row.name == method), absent)
 
 
@@ -256,7 +256,7 @@ FAMILIES = ("psnr", "ssim", "lpips")
 NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
 
-def read_reported(folder: Path | None = None) -> list[Number]:
+def read_reported(folder: Path | None = None) -> list[PrintedNumber]:
     """Read the numbers transcribed from papers.
 
     Raises:
@@ -268,7 +268,7 @@ def read_reported(folder: Path | None = None) -> list[Number]:
     return read_tables([folder])
 
 
-def datasets_of(numbers: Sequence[Number], scenes: Sequence[str]) -> dict[str, list[str]]:
+def datasets_of(numbers: Sequence[PrintedNumber], scenes: Sequence[str]) -> dict[str, list[str]]:
     """Group our scenes by the dataset in which a reported table has a scene of the same name."""
     dataset_of = {_normalised(n.scene): n.dataset for n in numbers if n.known}
     datasets: dict[str, list[str]] = {}
@@ -278,7 +278,7 @@ def datasets_of(numbers: Sequence[Number], scenes: Sequence[str]) -> dict[str, l
     return datasets
 
 
-def with_reported(table: Table, numbers: Sequence[Number]) -> Table:
+def with_reported(table: Table, numbers: Sequence[PrintedNumber]) -> Table:
     """Add a row for every method that a paper reports on the table's scenes and metrics.
 
     Only methods as published are added, no rows of ablations. Where papers contradict each other, all values
@@ -303,7 +303,9 @@ def with_reported(table: Table, numbers: Sequence[Number]) -> Table:
     return replace(table, rows=(*table.rows, *rows))
 
 
-def _cell(texts: Mapping[tuple[str, str, str], Mapping[str, list[str]]], method: str, column: Column) -> Cell:
+def _cell(
+    texts: Mapping[tuple[str, str, str], Mapping[str, list[str]]], method: str, column: Column
+) -> TableCell:
     family = column.measure.key.partition("_")[0]
     metric = NAMES.get(column.measure.key, family if family in FAMILIES else "")
     by_dataset = texts.get((method, _normalised(column.scene or MEAN), metric), {})
@@ -311,7 +313,7 @@ def _cell(texts: Mapping[tuple[str, str, str], Mapping[str, list[str]]], method:
         values = by_dataset.get(column.dataset, [])
     else:  # the name identifies a scene without its dataset, but not a mean
         values = [text for of in by_dataset.values() for text in of] if column.scene else []
-    return Cell(printed=" / ".join(dict.fromkeys(values))) if values else BLANK
+    return TableCell(printed=" / ".join(dict.fromkeys(values))) if values else BLANK
 
 
 def _normalised(name: str) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES, Measure
-from ambiguous_wild.report.table import ARROWS, TIE, Cell, Column, Row, Table
+from ambiguous_wild.report.table import ARROWS, TIE, Column, Row, Table, TableCell
 
 RANKS = "(1) (2) (3): first, second and third in the column"
 COLORS = {1: "green", 2: "cyan", 3: "yellow"}  # of the terminal
@@ -31,7 +31,7 @@ def display_width(text: str) -> int:
     return len(text) + wide - sum(unicodedata.combining(c) > 0 for c in text)
 
 
-def marked(cell: Cell, measure: Measure) -> str:
+def marked(cell: TableCell, measure: Measure) -> str:
     """Return the cell's text with its rank and the mark of a tie with the best."""
     text = plain(cell.text(measure))
     return text + (f" ({cell.rank})" if cell.rank else "") + (f" {TIE}" if cell.tie else "")
@@ -134,7 +134,7 @@ def _markdown_row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _markdown(cell: Cell, column: Column) -> str:
+def _markdown(cell: TableCell, column: Column) -> str:
     if cell.markdown:
         return cell.markdown.replace("|", "\\|")
     text = marked(cell, column.measure)

@@ -36,7 +36,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """One number of a table, or a text."""
 
     value: float = math.nan
@@ -63,7 +63,7 @@ class Cell:
         return f"{text} ± {self.spread:.{measure.digits}f}" if spread else text
 
 
-BLANK = Cell(state="blank")
+BLANK = TableCell(state="blank")
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Row:
     """A row: a method, a variant, or a method that a paper reports."""
 
     name: str
-    cells: tuple[Cell, ...]  # one a column
+    cells: tuple[TableCell, ...]  # one a column
     kind: Kind = "measured"
     note: str = ""  # the meaning of the row, if its name does not say it
     runs: int = 0  # finished runs behind it
@@ -100,7 +100,7 @@ class Table:
         return replace(self, columns=tuple(self.columns[i] for i in indices), rows=rows)
 
     @property
-    def cells(self) -> list[Cell]:
+    def cells(self) -> list[TableCell]:
         return [cell for row in self.rows for cell in row.cells]
 
     @property
@@ -143,7 +143,7 @@ class Table:
 
 
 def text_table(
-    title: str, head: Sequence[str], rows: Iterable[Sequence[str | Cell]], *, words: Sequence[str] = ()
+    title: str, head: Sequence[str], rows: Iterable[Sequence[str | TableCell]], *, words: Sequence[str] = ()
 ) -> Table:
     """Make a table of texts.
 
@@ -155,7 +155,10 @@ def text_table(
     """
     columns = tuple(Column("", Measure(text, text, None, 0), words=text in words) for text in head[1:])
     text_rows = tuple(
-        Row(str(first), tuple(c if isinstance(c, Cell) else Cell(printed=c) if c else BLANK for c in rest))
+        Row(
+            str(first),
+            tuple(c if isinstance(c, TableCell) else TableCell(printed=c) if c else BLANK for c in rest),
+        )
         for first, *rest in rows
     )
     return Table(title, columns, text_rows, head=head[0])

@@ -80,7 +80,7 @@ class Likeness:
 
 
 @dataclass(frozen=True)
-class Twin:
+class FittedSpec:
     """The spec, the factor to build it with, and a line for each property: measured, taken."""
 
     spec: CaptureSpec
@@ -127,7 +127,7 @@ def measure_likeness(scene: Scene) -> Likeness:
     )
 
 
-def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int | None = None) -> Twin:
+def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int | None = None) -> FittedSpec:
     """Return the spec of a capture that calls for the effects of `of`.
 
     Args:
@@ -171,7 +171,7 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int 
         designed=Designed(),
     )
     spec = resized(check_spec(spec), views)
-    return Twin(spec, factor, tuple(_lines(of, spec, factor)))
+    return FittedSpec(spec, factor, tuple(_lines(of, spec, factor)))
 
 
 def _effects(of: Likeness, factor: int, seed: int, views: int) -> Effects:

@@ -9,7 +9,7 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.report.plain_formats import UNEQUAL
-from ambiguous_wild.report.table import TIE, Cell, Row, Table
+from ambiguous_wild.report.table import TIE, Row, Table, TableCell
 
 NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}"
 COLORS = (("awfirst", "1,0.75,0.75"), ("awsecond", "1,0.87,0.72"), ("awthird", "1,0.98,0.72"))
@@ -122,7 +122,7 @@ def _latex_head(table: Table) -> list[str]:
     return [" & ".join(top) + r" \\", " ".join(rules), labels]
 
 
-def _latex_cell(cell: Cell, measure: Measure) -> str:
+def _latex_cell(cell: TableCell, measure: Measure) -> str:
     if cell.state == "missing":
         return "--"
     text = latex_text(cell.text(measure)).replace("±", r"$\pm$").replace("inf", r"$\infty$")
@@ -207,7 +207,7 @@ def _row(table: Table, row: Row, begins: Sequence[str]) -> str:
     return f'<tr{_class([row.kind])}><th class="name" scope="row"{title}>{_text(row.name)}</th>{cells}</tr>'
 
 
-def _cell(cell: Cell, measure: Measure, begins: str) -> str:
+def _cell(cell: TableCell, measure: Measure, begins: str) -> str:
     value, sign, spread = cell.text(measure).partition(" ± ")
     text = _text(value) + (f' <span class="spread">{_text(sign + spread).strip()}</span>' if sign else "")
     if cell.tie:

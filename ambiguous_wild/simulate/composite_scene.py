@@ -98,7 +98,7 @@ ViewProgress = Callable[[Sequence[View]], Iterable[View]]
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _PastePlan:
     cutouts: list[Cutout]
     heights: np.ndarray  # [K] scene units
     placements: list[tuple[CutoutPlacement, ...]]  # for each train photo
@@ -179,7 +179,7 @@ def _plan(
     config: CompositeConfig,
     place_rng: np.random.Generator,
     patch_rng: np.random.Generator,
-) -> _Plan:
+) -> _PastePlan:
     sites = visible_points(scene)
     if config.patches:
         largest = _folders(scene.root)[0]  # images, or the smallest factor there is
@@ -191,7 +191,7 @@ def _plan(
     natural = natural_heights(shown, place_rng)
     placements = place(sites, scene_spread(scene), config, place_rng, len(shown), **chosen)  # type: ignore[arg-type]
     heights = solve_heights(shown, natural, sites, placements, config)
-    return _Plan(shown, heights, placements)
+    return _PastePlan(shown, heights, placements)
 
 
 def _folders(root: Path) -> list[str]:
@@ -202,7 +202,7 @@ def _folders(root: Path) -> list[str]:
 
 
 def _write_photos(
-    scene: Scene, plan: _Plan, config: CompositeConfig, folder: Path, progress: ViewProgress
+    scene: Scene, plan: _PastePlan, config: CompositeConfig, folder: Path, progress: ViewProgress
 ) -> dict[str, CompositePhoto]:
     """Write the photos of all sizes, and the truth at the size of training."""
     kinds = [(f, _pictures(scene, f)) for f in _folders(scene.root)]
@@ -240,7 +240,9 @@ def _pictures(scene: Scene, folder: str) -> dict[str, Path]:
     return {v.name: v.image_path for v in load_scene(scene.root, factor=factor, verify=False).views}
 
 
-def _photo_facts(plan: _Plan, placements: tuple[CutoutPlacement, ...], mask: np.ndarray) -> CompositePhoto:
+def _photo_facts(
+    plan: _PastePlan, placements: tuple[CutoutPlacement, ...], mask: np.ndarray
+) -> CompositePhoto:
     placed = [cast(PlacedCutout, {"cutout": plan.cutouts[p.which].name, **asdict(p)}) for p in placements]
     return {"occlusion": round(float((mask > 0).mean()), 6), "distractors": placed}
 
@@ -264,7 +266,7 @@ def _copy_rest(scene: Scene, folder: Path) -> None:
 
 
 def _facts(
-    scene: Scene, plan: _Plan, config: CompositeConfig, photos: dict[str, CompositePhoto]
+    scene: Scene, plan: _PastePlan, config: CompositeConfig, photos: dict[str, CompositePhoto]
 ) -> CompositeRecord:
     shares = [p["occlusion"] for p in photos.values()]
     record = scene.root / "scene.json"

@@ -27,7 +27,7 @@ _PREVIEW_PX = 96
 
 
 @dataclass(frozen=True)
-class Placement:
+class DistractorPose:
     """One distractor in one photo."""
 
     which: int  # index into the spec's distractors
@@ -37,7 +37,7 @@ class Placement:
     pose: float  # stride and arm of a figure, 0 to 1
 
 
-def shapes_of(distractor: Distractor, placement: Placement, plan: GroundPlan) -> list[Shape]:
+def shapes_of(distractor: Distractor, placement: DistractorPose, plan: GroundPlan) -> list[Shape]:
     """Make the distractor's shapes in the world, owned by ``placement.which + 1``."""
     at = (placement.x_m, placement.y_m, distractor.lift_m * placement.pose)
     parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose, plan)]
@@ -81,7 +81,7 @@ def _tinted(shape: Shape, distractor: Distractor) -> Shape:
     return replace(shape, tint=(r, g, b))
 
 
-def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -> ShapeTable:
+def movers(spec: CaptureSpec, placements: tuple[DistractorPose, ...], world: World) -> ShapeTable:
     """Return all distractors of one photo as a table for the ray caster."""
     shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p, world.plan)]
     gloss = spec.effects.specular
@@ -92,7 +92,7 @@ def movers(spec: CaptureSpec, placements: tuple[Placement, ...], world: World) -
 
 def lay_out(
     spec: CaptureSpec, cameras: list[Camera], world: World, rng: np.random.Generator
-) -> list[tuple[Placement, ...]]:
+) -> list[tuple[DistractorPose, ...]]:
     """Place the distractors of every train photo.
 
     Layouts are drawn until the occlusion, measured in a small preview, lies in ``spec.occlusion``; if none
@@ -100,7 +100,7 @@ def lay_out(
     starts at 0. No distractor is at one place in more than 15 % of the photos, as it would be part of the
     scene.
     """
-    chosen: list[tuple[Placement, ...]] = []
+    chosen: list[tuple[DistractorPose, ...]] = []
     static = world.table()
     light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
     low, high = spec.occlusion
@@ -111,7 +111,7 @@ def lay_out(
             chosen.append(())
             continue
         small = camera.resized(_PREVIEW_PX, max(1, round(_PREVIEW_PX * camera.height / camera.width)))
-        best: tuple[Placement, ...] = ()
+        best: tuple[DistractorPose, ...] = ()
         best_gap = np.inf
         aim = rng.uniform(low, high)  # so that the shares spread over the whole range
         present = [rng.random() <= d.presence for d in spec.distractors] if low == 0 and tries > 1 else None
@@ -136,11 +136,11 @@ def _draw(
     spec: CaptureSpec,
     camera: Camera,
     world: World,
-    earlier: list[tuple[Placement, ...]],
+    earlier: list[tuple[DistractorPose, ...]],
     rng: np.random.Generator,
     present: list[bool] | None = None,  # which distractors are present; None: draw that too
-) -> tuple[Placement, ...]:
-    layout: list[Placement] = []
+) -> tuple[DistractorPose, ...]:
+    layout: list[DistractorPose] = []
     for which, distractor in enumerate(spec.distractors):
         if not present[which] if present is not None else rng.random() > distractor.presence:
             continue
@@ -160,16 +160,16 @@ def _draw(
 
 def _random_placement(
     which: int, distractor: Distractor, camera: Camera, rng: np.random.Generator
-) -> Placement:
+) -> DistractorPose:
     """Draw a random point on the ground within the picture, at the distractor's distance."""
     column = rng.uniform(0.06, 0.94) * camera.width
     direction = camera.cam_from_world[:3, :3].T @ np.array([(column - camera.cx) / camera.fx, 0.0, 1.0])
     flat = direction[:2] / np.linalg.norm(direction[:2])
     x, y = camera.center[:2] + rng.uniform(*distractor.distance_m) * flat
-    return Placement(which, float(x), float(y), float(rng.uniform(-180, 180)), float(rng.random()))
+    return DistractorPose(which, float(x), float(y), float(rng.uniform(-180, 180)), float(rng.random()))
 
 
-def _walker_placement(which: int, distractor: Distractor, progress: float) -> Placement:
+def _walker_placement(which: int, distractor: Distractor, progress: float) -> DistractorPose:
     """Place a walker at `progress` (0 to 1) of the capture: to and fro along its waypoints, facing ahead."""
     corners = np.array(distractor.waypoints)
     legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
@@ -182,10 +182,12 @@ def _walker_placement(which: int, distractor: Distractor, progress: float) -> Pl
     ahead = (corners[leg + 1] - corners[leg]) * (1 if there else -1)
     yaw = np.rad2deg(np.arctan2(ahead[1], ahead[0])) + 90.0  # figures face -y
     stride = 0.5 + 0.5 * np.sin(2 * np.pi * 0.35 * 2 * distractor.laps * progress * legs.sum())
-    return Placement(which, float(x), float(y), float(yaw), float(stride))
+    return DistractorPose(which, float(x), float(y), float(yaw), float(stride))
 
 
-def _is_free(place: Placement, world: World, others: list[Placement], distractor: Distractor) -> bool:
+def _is_free(
+    place: DistractorPose, world: World, others: list[DistractorPose], distractor: Distractor
+) -> bool:
     clearance = _CLEARANCE_M.get(distractor.kind, 0.3)
     if world.plan.gap(place.x_m, place.y_m) < 0.3 + clearance:
         return False
@@ -195,7 +197,7 @@ def _is_free(place: Placement, world: World, others: list[Placement], distractor
     return all(np.hypot(o.x_m - place.x_m, o.y_m - place.y_m) > _APART_M + clearance - 0.3 for o in others)
 
 
-def _is_fresh(place: Placement, earlier: list[tuple[Placement, ...]], photos: int) -> bool:
+def _is_fresh(place: DistractorPose, earlier: list[tuple[DistractorPose, ...]], photos: int) -> bool:
     same = [
         p
         for layout in earlier

@@ -12,7 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.scene import Points, Scene, View
+from ambiguous_wild.core.scene import Scene, SparsePoints, View
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.simulate.cutouts import (
     SMALLEST_PX,
@@ -85,7 +85,7 @@ def visible_points(scene: Scene) -> list[VisiblePoints]:
     return sites
 
 
-def _site(view: View, points: Points, tracked: np.ndarray) -> VisiblePoints:
+def _site(view: View, points: SparsePoints, tracked: np.ndarray) -> VisiblePoints:
     xyz = points.xyz[tracked] if len(tracked) >= 10 else points.xyz
     camera = view.camera
     local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]

@@ -19,7 +19,7 @@ import numpy as np
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import image_effects as fx
-from ambiguous_wild.simulate.distractors import Placement, movers
+from ambiguous_wild.simulate.distractors import DistractorPose, movers
 from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
@@ -41,7 +41,7 @@ class PlannedPhoto:
     name: str  # IMG_0001.jpg
     split: str  # train or test
     camera: Camera
-    placements: tuple[Placement, ...]
+    placements: tuple[DistractorPose, ...]
 
 
 @dataclass(frozen=True)

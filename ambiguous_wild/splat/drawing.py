@@ -10,20 +10,20 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import State
-from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.effects.chain import EffectPipeline
 from ambiguous_wild.splat.field import Field
 from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart, renders_of
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Gradients, Rendered, Shade, check_needs, with_visible
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 
 class SceneRenderer:
     """Draws the pictures of one run, and holds its fields beside the static one."""
 
-    def __init__(self, data: TrainData, parts: Parts, static: Field, effects: Chain) -> None:
+    def __init__(self, data: TrainData, parts: MethodHooks, static: Field, effects: EffectPipeline) -> None:
         """
         Args:
             data: the training side.
@@ -58,26 +58,26 @@ class SceneRenderer:
 
     # -- pictures ---------------------------------------------------------------------------------
 
-    def __call__(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
+    def __call__(self, gaussians: Gaussians, shot: ViewContext, without: Collection[str] = ()) -> Rendered:
         """Draw the model; effects have already changed the shot's camera."""
         return self.effects.render(gaussians, shot, self._compose, without)
 
-    def again(self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()) -> Rendered:
+    def again(self, gaussians: Gaussians, shot: ViewContext, without: Collection[str] = ()) -> Rendered:
         """Draw another picture of a step, see `Step.draw`."""
         if gaussians is self.static.gaussians:
             return self(gaussians, shot, without)
         shot = replace(shot, other_gaussians=True)
         return self.effects.render(gaussians, shot, self._draw, without)
 
-    def fit(self, gaussians: Gaussians, shot: Shot, photo: Tensor, keep: Tensor) -> Tensor:
-        """Draw a picture in the colours of its photo, see `Chain.fit_view`."""
+    def fit(self, gaussians: Gaussians, shot: ViewContext, photo: Tensor, keep: Tensor) -> Tensor:
+        """Draw a picture in the colours of its photo, see `EffectPipeline.fit_view`."""
         return self.effects.fit_view(gaussians, shot, photo, keep, self._draw)
 
     def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
         """Return the Gaussians as they are drawn when the picture belongs to no photo."""
         return self.effects.neutral_model(gaussians, iteration)
 
-    def _draw(self, gaussians: Gaussians, shot: Shot, shade: Shade | None) -> Rendered:
+    def _draw(self, gaussians: Gaussians, shot: ViewContext, shade: Shade | None) -> Rendered:
         parts = self.parts
         return render(
             gaussians,
@@ -89,7 +89,7 @@ class SceneRenderer:
             shade=shade,
         )
 
-    def _compose(self, gaussians: Gaussians, shot: Shot, shade: Shade | None) -> Rendered:
+    def _compose(self, gaussians: Gaussians, shot: ViewContext, shade: Shade | None) -> Rendered:
         rendered = self._draw(gaussians, shot, shade)
         fields = self.parts.fields
         if fields is None or shot.view is None:

@@ -29,7 +29,7 @@ from ambiguous_wild.splat.rendered import (
     frame_of,
     sum_own,
 )
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 STATIC = "static"  # name of the first field, the one that is the result
 # from dL/d(composed pictures) to dL/d(pictures of every field), by field
@@ -63,19 +63,19 @@ class Fields(ABC):
         """Return the effect that the fields need to work; a graft without it is refused."""
         return None
 
-    def drawn(self, shot: Shot) -> Sequence[str]:
+    def drawn(self, shot: ViewContext) -> Sequence[str]:
         """Return the names of the other fields in this picture; only called for train photos."""
         return ()
 
-    def deform(self, name: str, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+    def deform(self, name: str, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
         """Return a field's Gaussians as they are drawn for this picture, and the pull to its parameters."""
         return gaussians, lambda gradients: gradients
 
-    def compose(self, frames: Mapping[str, Frame], shot: Shot) -> tuple[Frame, ComposePull]:
+    def compose(self, frames: Mapping[str, Frame], shot: ViewContext) -> tuple[Frame, ComposePull]:
         """Compose the frames of `STATIC` and of the fields in `drawn` to one; also returns the pull."""
         return frames[STATIC], lambda cotangents: {STATIC: cotangents}
 
-    def regularise(self, frames: Mapping[str, Frame], shot: Shot) -> Mapping[str, Cotangents]:
+    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
         """Return gradients of losses on the fields' own pictures, for example on their coverage, by field."""
         return {}
 
@@ -96,7 +96,7 @@ class Composite:
         fields: Fields,
         drawn: Mapping[str, Rendered],
         needs: Mapping[str, frozenset[str]],
-        shot: Shot,
+        shot: ViewContext,
         pulls: Mapping[str, Pull],
     ) -> None:
         """

@@ -54,7 +54,7 @@ class RenderedCuda:
     def __init__(
         self,
         leaves: dict[str, Tensor],
-        splats: seam.Splats,
+        splats: seam.ProjectedGaussians,
         colours: Tensor,
         tiles: seam.Tiles,
         background: Tensor,
@@ -234,7 +234,9 @@ def _check_gpu() -> None:
     readiness.require(readiness.look())
 
 
-def _base_colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor, degree: int) -> Tensor:
+def _base_colours(
+    leaves: dict[str, Tensor], splats: seam.ProjectedGaussians, centre: Tensor, degree: int
+) -> Tensor:
     """Return SH + 0.5 [N, 3], not clamped; rows that are not visible may hold any value."""
     if degree == 0:
         return leaves["sh0"] * SH_C0 + 0.5
@@ -244,7 +246,7 @@ def _base_colours(leaves: dict[str, Tensor], splats: seam.Splats, centre: Tensor
     return seam.shade(degree, leaves["means"], centre, coefficients, drawn) + 0.5
 
 
-def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Splats) -> Shaded:
+def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.ProjectedGaussians) -> Shaded:
     """Call the shading function.
 
     Raises:

@@ -23,7 +23,7 @@ TILE = 16  # px
 
 
 @dataclass(frozen=True)
-class Splats:
+class ProjectedGaussians:
     """N Gaussians projected for one camera, before blending. All but `radii` have gradients."""
 
     radii: Tensor  # [N, 2] int32 px along x and y; 0 where culled
@@ -88,11 +88,11 @@ def project(
     *,
     antialias: bool,
     blur: float = BLUR,  # px^2 added to both variances
-) -> Splats:
+) -> ProjectedGaussians:
     """Project by EWA and cull; differentiable."""
     if not len(means):  # gsplat's C++ code divides by their number, which would end the process
         none = means.new_zeros((0, 2), dtype=torch.int32)
-        return Splats(none, means[:, :2], means[:, 2], scales, opacities)
+        return ProjectedGaussians(none, means[:, :2], means[:, 2], scales, opacities)
     if antialias:
         size = size_on(width, height, means.device)
         opacities = opacities * compensation(means, quats, scales, viewmat, intrinsics, size, blur)
@@ -111,7 +111,7 @@ def project(
         calc_compensations=False,
         opacities=opacities.detach(),
     )
-    return Splats(radii[0], means2d[0], depths[0], conics[0], opacities)
+    return ProjectedGaussians(radii[0], means2d[0], depths[0], conics[0], opacities)
 
 
 @functools.cache
@@ -132,7 +132,7 @@ def shade(
     return colours
 
 
-def sort(splats: Splats, width: int, height: int) -> Tiles:
+def sort(splats: ProjectedGaussians, width: int, height: int) -> Tiles:
     """List the splats of every tile by depth. The host waits for their number, to allocate memory."""
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
     _, ids, flatten_ids = gsplat().isect_tiles(

@@ -134,7 +134,7 @@ class Schedule:
 
 
 @dataclass(frozen=True)
-class Parts:
+class MethodHooks:
     """A method, ready to train: what fills each place of the loop."""
 
     mask: MaskPolicy = field(default_factory=MaskPolicy)
@@ -159,7 +159,7 @@ class Parts:
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # see effects/; of those that are not listed no code is reached
 
-    def suited_to(self, effect: Effect) -> Parts:
+    def suited_to(self, effect: Effect) -> MethodHooks:
         """Return the method changed as an added effect needs: with its start points and 2D filter."""
         more = (effect.first_points,) if effect.acts("first_points") else ()
         return replace(

@@ -24,7 +24,7 @@ from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.records import ROWS, Clock, Timeline, clock_for
 from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.splat.watchdog import NonFinite, Sentinel, Watchdog
+from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, NonFinite, Watchdog
 
 LOG = logging.getLogger(__name__)
 Probe = Callable[[Callable[[Camera], Tensor]], float]
@@ -60,7 +60,7 @@ def deferred() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-class Meter(Protocol):
+class RunObserver(Protocol):
     """Watches the machine while a run trains; it is called with the run's clock stopped."""
 
     def begin(self, trained_s: float) -> None: ...
@@ -80,7 +80,7 @@ class Run(ABC):
     """What a trainer does around its steps; stops and resumes at any iteration with the same bits."""
 
     pace: Pace
-    sentinel: Sentinel | None
+    sentinel: DeviceFiniteCheck | None
 
     def __init__(self, data: TrainData, config: TrainConfig, folder: Path, probe: Probe | None) -> None:
         """
@@ -94,7 +94,7 @@ class Run(ABC):
         names = [view.name for view in data.scene.train]
         self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
         self.clock: Clock = clock_for(data.device)
-        self.meter: Meter | None = None
+        self.meter: RunObserver | None = None
         self._marks: tuple[int, int] | None = None  # probes and timeline rows due after the last step
         self.setup_s = 0.0  # seconds before the first step, in the process that began the run
         # "hash" of the run's configuration and "about", its name; empty = unknown

@@ -52,7 +52,7 @@ class TrainData:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shot:
+class ViewContext:
     """View, camera, photo and time of one picture; every hook gets a shot."""
 
     iteration: int  # counts from 1; 0 while a test photo is fitted
@@ -80,11 +80,11 @@ class Shot:
 
 
 # draws Gaussians for a shot, without the effects that the last argument names
-Drawer = Callable[[Gaussians, Shot, Collection[str]], Rendered]
+Drawer = Callable[[Gaussians, ViewContext, Collection[str]], Rendered]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step(Shot):
+class Step(ViewContext):
     """One training step, after the render and before the loss."""
 
     view: int

@@ -15,13 +15,13 @@ from ambiguous_wild.splat.calibration import warm_backward
 from ambiguous_wild.splat.data import Pyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import SceneRenderer
-from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.effects.chain import EffectPipeline
 from ambiguous_wild.splat.field import Field, rates_with
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import (
     Cotangents,
     Gradients,
@@ -31,8 +31,8 @@ from ambiguous_wild.splat.rendered import (
     with_visible,
 )
 from ambiguous_wild.splat.run import Probe, Run
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
-from ambiguous_wild.splat.watchdog import Sentinel
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
+from ambiguous_wild.splat.watchdog import DeviceFiniteCheck
 
 
 class Trainer(Run):
@@ -41,7 +41,7 @@ class Trainer(Run):
     def __init__(
         self,
         data: TrainData,
-        parts: Parts,
+        parts: MethodHooks,
         config: TrainConfig,
         *,
         folder: Path,
@@ -66,7 +66,7 @@ class Trainer(Run):
         self._divisors: dict[int, int] = {}  # divisors of the steps since the sentinel was last read
         # where reading a value makes the host wait, checks stay on the device and are read later
         views = len(data.photos)
-        self.sentinel = None if data.backend.reads_at_once else Sentinel(data.device, views)
+        self.sentinel = None if data.backend.reads_at_once else DeviceFiniteCheck(data.device, views)
         check_needs(parts.density.needs, data.backend.statistics)
         most = parts.density_config.max_gaussians
         room = Pace(config, parts.schedule, data, start=0, most=most).most
@@ -74,7 +74,7 @@ class Trainer(Run):
         self.pace = Pace(config, parts.schedule, data, start=len(gaussians), most=most)
         sizes = self.pyramid.sizes(self.pace.divisors)
         data.backend.prepare_loss(data.device, sizes, parts.lambda_dssim, parts.weighting)
-        self.effects = Chain(parts.effects, data)
+        self.effects = EffectPipeline(parts.effects, data)
         attributes = self.effects.rows(gaussians)
         if attributes:
             gaussians = gaussians.carrying({name: a.values for name, a in attributes.items()})
@@ -117,11 +117,11 @@ class Trainer(Run):
         self.effects.load_state_dict(state.get("effects", {}))
         super().load_state(state)
 
-    def shot(self, camera: Camera, *, fitting: bool = False) -> Shot:
+    def shot(self, camera: Camera, *, fitting: bool = False) -> ViewContext:
         """Return the shot of a camera that belongs to no train photo, at the present time of the run."""
         progress = self.progress(self.iteration)
         nominal = progress * NOMINAL_ITERATIONS
-        return Shot(
+        return ViewContext(
             iteration=0 if fitting else self.iteration,
             nominal=nominal,
             progress=progress,
@@ -154,7 +154,7 @@ class Trainer(Run):
         """Draw a train view as the loop does; also used to predict masks after the training."""
         progress = self.progress(iteration)
         divisor = self.pace.divisor(progress) if divisor is None else divisor
-        shot = Shot(
+        shot = ViewContext(
             iteration=iteration,
             nominal=progress * NOMINAL_ITERATIONS,
             progress=progress,
@@ -166,7 +166,7 @@ class Trainer(Run):
         shot = replace(shot, camera=self.effects.camera(shot))
         with self.clock.part("render"):
             rendered = self.drawing(self.gaussians, shot)
-        of_shot = {f.name: getattr(shot, f.name) for f in fields(Shot)}
+        of_shot = {f.name: getattr(shot, f.name) for f in fields(ViewContext)}
         return Step(
             **of_shot,
             ceiling=self.pace.ceiling(divisor, progress),

@@ -8,8 +8,8 @@ checkpoint, so no checkpoint holds a value that is not finite.
 
 On an accelerator the host does not know the result of a step until it waits for it. So the device keeps a
 flag that stays set, the number of finite steps before it, and the keep map and cotangents of the broken step
-(`Sentinel`). While the flag is set the optimiser changes nothing: when the host reads it, the parameters are
-still those of the broken step, which can be computed again.
+(`DeviceFiniteCheck`). While the flag is set the optimiser changes nothing: when the host reads it, the
+parameters are still those of the broken step, which can be computed again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _LOOKED_AT = ("means", "quats", "log_scales", "opacity_logits", "sh0")  # gradie
 
 
 @dataclass(frozen=True)
-class Finding:
+class NonFiniteFinding:
     """The first value that is not finite, and where it occurred."""
 
     what: Kind
@@ -68,7 +68,7 @@ class Finding:
 class NonFinite(AwError):
     """Training met a value that is not a finite number; `seen` holds what the step saw."""
 
-    def __init__(self, finding: Finding, view: int, seen: State, message: str = "") -> None:
+    def __init__(self, finding: NonFiniteFinding, view: int, seen: State, message: str = "") -> None:
         super().__init__(message or str(finding))
         self.finding, self.view, self.seen = finding, view, seen
 
@@ -136,7 +136,9 @@ class Watchdog:
     ) -> NonFinite:
         rows = torch.stack(list(bad.values())).any(0).nonzero()[:, 0].tolist() if bad else []
         since = iteration - (iteration - 1) % self.every if what == "parameter" else iteration
-        finding = Finding(what, tuple(bad), tuple(rows[:10]), len(rows), iteration, since, self.photos[view])
+        finding = NonFiniteFinding(
+            what, tuple(bad), tuple(rows[:10]), len(rows), iteration, since, self.photos[view]
+        )
         return NonFinite(finding, view, seen)
 
     # -- what is done about it --------------------------------------------------------------------
@@ -246,7 +248,7 @@ def _seen(step: Step, keep: Tensor | None, loss: PhotometricLoss) -> State:
 
 
 @dataclass(frozen=True)
-class Broken:
+class NonFiniteStep:
     """A step with values that are not finite, and what its loss used."""
 
     iteration: int
@@ -254,7 +256,7 @@ class Broken:
     method_cotangents: Cotangents | None  # cotangents of the method's own losses on the render
 
 
-class Sentinel:
+class DeviceFiniteCheck:
     """The checks of a training run on an accelerator, which do not make the host wait."""
 
     def __init__(self, device: torch.device, views: int) -> None:
@@ -322,7 +324,7 @@ class Sentinel:
                 kept = self._kept[name] = F.pad(kept, (0, len(flat) - len(kept)))
             kept[: len(flat)] = torch.where(before > 0, kept[: len(flat)], flat)
 
-    def first_broken(self) -> Broken | None:
+    def first_broken(self) -> NonFiniteStep | None:
         """Return the first step since the last look with a value that was not finite. The host waits."""
         broken, sound = torch.cat([self._broken, self._sound]).tolist()
         watched, self._watched = self._watched, []
@@ -332,7 +334,7 @@ class Sentinel:
         iteration, shapes = watched[int(sound)]
         inputs = {name: self._kept[name][: shape.numel()].reshape(shape) for name, shape in shapes.items()}
         keep = inputs.pop("keep", None)
-        return Broken(iteration, keep, Cotangents(**inputs, own={}) if inputs else None)
+        return NonFiniteStep(iteration, keep, Cotangents(**inputs, own={}) if inputs else None)
 
     def empty_views(self) -> set[int]:
         """Return the photos that were fully masked at some step. The host waits."""
@@ -346,7 +348,7 @@ class Sentinel:
 
 
 def _named(keep: Tensor | None, method_cotangents: Cotangents | Tensor | None) -> dict[str, Tensor]:
-    """Return those that are not None, by the names of `Broken` and `Cotangents`."""
+    """Return those that are not None, by the names of `NonFiniteStep` and `Cotangents`."""
     if isinstance(method_cotangents, Tensor):
         method_cotangents = Cotangents(extra=method_cotangents)
     c = method_cotangents or Cotangents()

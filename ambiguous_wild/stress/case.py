@@ -36,7 +36,7 @@ UNIT = 2.0**-24  # relative rounding error of one float32 operation (Higham's u)
 
 
 @dataclass(frozen=True)
-class Measured:
+class CaseResult:
     """The result of one case."""
 
     error: float  # worst relative error against float64, or the number of failed checks
@@ -52,7 +52,7 @@ class Case:
 
     row: int  # number of a group of cases and tests
     name: str
-    measure: Callable[[str], Measured]  # argument: the device
+    measure: Callable[[str], CaseResult]  # argument: the device
     devices: tuple[str, ...]  # devices that the case applies to
 
     @property
@@ -64,7 +64,7 @@ REGISTERED: list[Case] = []  # in the order of the files
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StressLine:
     """One line of `aw stress`."""
 
     key: str
@@ -85,38 +85,38 @@ class Outcome:
 
 def case(
     row: int, name: str, *, devices: tuple[str, ...] = ("cpu",)
-) -> Callable[[Callable[[str], Measured]], Case]:
+) -> Callable[[Callable[[str], CaseResult]], Case]:
     """Decorate a measuring function: makes a case of it and registers it."""
 
-    def register(measure: Callable[[str], Measured]) -> Case:
+    def register(measure: Callable[[str], CaseResult]) -> Case:
         REGISTERED.append(Case(row, name, measure, devices))
         return REGISTERED[-1]
 
     return register
 
 
-def run(chosen: Case, device: str) -> Outcome:
+def run(chosen: Case, device: str) -> StressLine:
     """Measure a case; an exception counts as its failure."""
     try:
         m = chosen.measure(device)
     except Exception as error:
         text = str(error) if isinstance(error, AwError) else traceback.format_exc(limit=-2)
-        return Outcome(chosen.key, device, float("nan"), 0.0, "", "", None, False, text)
+        return StressLine(chosen.key, device, float("nan"), 0.0, "", "", None, False, text)
     passed = m.error <= m.tolerance  # false for NaN
-    return Outcome(chosen.key, device, m.error, m.tolerance, m.why, m.comes_out, m.condition, bool(passed))
+    return StressLine(chosen.key, device, m.error, m.tolerance, m.why, m.comes_out, m.condition, bool(passed))
 
 
-def failed_checks(checks: dict[str, bool], comes_out: str) -> Measured:
+def failed_checks(checks: dict[str, bool], comes_out: str) -> CaseResult:
     """A case of exact checks: the error is the number of checks that fail; the tolerance is 0."""
     bad = [name for name, holds in checks.items() if not holds]
     why = "exact" + (f"; wrong: {', '.join(bad)}" if bad else f", {len(checks)} checks")
-    return Measured(float(len(bad)), 0.0, why, comes_out)
+    return CaseResult(float(len(bad)), 0.0, why, comes_out)
 
 
-def worst(parts: Iterable[Measured]) -> Measured:
+def worst(parts: Iterable[CaseResult]) -> CaseResult:
     """The result with the largest ratio of error to tolerance."""
 
-    def share(m: Measured) -> float:
+    def share(m: CaseResult) -> float:
         if m.error != m.error:
             return float("inf")
         return m.error / m.tolerance if m.tolerance > 0 else float("inf") if m.error > 0 else 0.0
@@ -182,7 +182,7 @@ def agree(
     *,
     layers: int | None = None,  # most Gaussians over one pixel; None = all
     **options: Any,  # passed to `render`
-) -> Measured:
+) -> CaseResult:
     """Return the worst error of images and gradients, relative to their largest values, and its bound."""
     rng = np.random.default_rng(0)
     shapes = [(camera.height, camera.width, 3), (camera.height, camera.width), (camera.height, camera.width)]
@@ -206,7 +206,7 @@ def agree(
     if not backend_of(device).kernels:
         lost = _lost_by_determinants(parameters, camera, **options)
         bound, why = bound * FAST_MATH * lost, f"{why} x {FAST_MATH} x determinant {lost:.1e}"
-    return Measured(error, bound, why, comes_out, condition)
+    return CaseResult(error, bound, why, comes_out, condition)
 
 
 def _lost_by_determinants(parameters: dict[str, Tensor], camera: Camera, **options: Any) -> float:

@@ -28,7 +28,7 @@ from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.masks import confusion, psnr_valid
 from ambiguous_wild.metrics.stats import bootstrap_interval, mean
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.stress.case import UNIT, Measured, case, cloud, failed_checks, worst
+from ambiguous_wild.stress.case import UNIT, CaseResult, case, cloud, failed_checks, worst
 
 
 def _logits(n: int, channels: int, scale: float, seed: int = 0) -> torch.Tensor:
@@ -41,7 +41,7 @@ def _flagged(values: np.ndarray, *settings: Any, **more: Any) -> np.ndarray:
 
 
 @case(11, "entropy at logits of 1e4 either way, for 1, 2 and 255 identities")
-def entropy_saturated(device: str) -> Measured:
+def entropy_saturated(device: str) -> CaseResult:
     parts = []
     variants: tuple[Variant, ...] = ("sigmoid", "softmax")
     for variant in variants:
@@ -55,13 +55,13 @@ def entropy_saturated(device: str) -> Measured:
             sound = bool(torch.isfinite(gradient).all()) and float(value.detach().min()) >= 0
             # x e^x changes by (1 + |x|) u if x = log p changes by u, and |x| e^x <= 1 / e
             tolerance = (8 + channels) * UNIT
-            parts.append(Measured(error if sound else math.inf, tolerance, "8 + P roundings", ""))
+            parts.append(CaseResult(error if sound else math.inf, tolerance, "8 + P roundings", ""))
     m = worst(parts)
-    return Measured(m.error, m.tolerance, m.why, "0 where saturated, gradient finite", 1.0)
+    return CaseResult(m.error, m.tolerance, m.why, "0 where saturated, gradient finite", 1.0)
 
 
 @case(12, "0, 1 and 2 instances, equal values, gaps and negative labels")
-def few_instances(device: str) -> Measured:
+def few_instances(device: str) -> CaseResult:
     none = torch.zeros(8, 8, dtype=torch.int32)
     labels = torch.tensor([[-2, 1, 1, 0], [3, 3, -1, 1], [0, 3, 3, 3], [1, 1, 1, 1]])  # no label 2
     grid = torch.arange(16.0).reshape(4, 4).double()
@@ -82,7 +82,7 @@ def few_instances(device: str) -> Measured:
 
 
 @case(13, "1 of 50 far away, 49 of 50, heavy tails")
-def skewed(device: str) -> Measured:
+def skewed(device: str) -> CaseResult:
     rng = np.random.default_rng(0)
     checks = {}
     for high in (1, 3, 20):
@@ -98,7 +98,7 @@ def skewed(device: str) -> Measured:
 
 
 @case(14, "a photo without distractors")
-def nothing_to_mask(device: str) -> Measured:
+def nothing_to_mask(device: str) -> CaseResult:
     rng = np.random.default_rng(1)
     shares = []
     for _ in range(10):
@@ -107,11 +107,11 @@ def nothing_to_mask(device: str) -> Measured:
         mask = global_mask(r, spread="std", gate=6.0)
         local = _flagged(rng.normal(0.3, 0.03, 40), gate=5.0)
         shares += [float(mask.double().mean()), float(local.mean())]
-    return Measured(max(shares), 0.02, "share of masked pixels and instances, from the list", "below 2 %")
+    return CaseResult(max(shares), 0.02, "share of masked pixels and instances, from the list", "below 2 %")
 
 
 @case(15, "H of 0 over half the photo, cosines of -1, 1 and none")
-def planted_region(device: str) -> Measured:
+def planted_region(device: str) -> CaseResult:
     rng = np.random.default_rng(0)
     h, cosine = rng.uniform(0.3, 0.6, (34, 60)), rng.uniform(0.85, 1.0, (34, 60))
     h[:, :30] = 0.0
@@ -132,7 +132,7 @@ def planted_region(device: str) -> Measured:
 
 
 @case(16, "printed formulas where they degenerate")
-def literal(device: str) -> Measured:
+def literal(device: str) -> CaseResult:
     values = np.r_[np.full(20, 0.05), 0.25, 0.3] + np.arange(22) * 1e-4
     scores = objective(pool_of(torch.from_numpy(values)), 0.5, "literal")[0].numpy()
     unit, zero = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
@@ -168,19 +168,19 @@ def _double_loop(logits: torch.Tensor) -> float:
 
 
 @case(17, "consistency in closed form against the double loop, 1, 2 and 500 cells")
-def consistency(device: str) -> Measured:
+def consistency(device: str) -> CaseResult:
     parts = []
     for n in (1, 2, 500):
         logits = _logits(n, 6, 3.0, n)
         exact = _double_loop(logits.double())
         loss = float(consistency_loss(logits.double(), torch.ones(1, n, dtype=torch.float64)))
-        parts.append(Measured(abs(loss - exact) / max(exact, 1e-3), 1e-6, "the list's own", ""))
+        parts.append(CaseResult(abs(loss - exact) / max(exact, 1e-3), 1e-6, "the list's own", ""))
         # float32: sums of terms of size |s log s| cancel down to the loss
         size = float((torch.sigmoid(logits) * F.logsigmoid(logits)).abs().sum(1).mean()) * 2
         condition = max(size / max(exact, 1e-3), 1.0)
         loss = float(consistency_loss(logits, torch.ones(1, n)))
         parts.append(
-            Measured(
+            CaseResult(
                 abs(loss - exact) / max(exact, 1e-3),
                 32 * condition * UNIT,
                 "32 roundings x condition",
@@ -189,11 +189,11 @@ def consistency(device: str) -> Measured:
             )
         )
     m = worst(parts)
-    return Measured(m.error, m.tolerance, m.why, "the double loop's value", m.condition)
+    return CaseResult(m.error, m.tolerance, m.why, "the double loop's value", m.condition)
 
 
 @case(17, "consistency of saturated logits")
-def consistency_saturated(device: str) -> Measured:
+def consistency_saturated(device: str) -> CaseResult:
     checks = {}
     for variant in ("sigmoid", "softmax"):
         logits = torch.tensor([[1e4, -1e4], [-1e4, 1e4], [1e30, 0.0]], requires_grad=True)
@@ -205,7 +205,7 @@ def consistency_saturated(device: str) -> Measured:
 
 
 @case(18, "w2 driven to 0 and to 1")
-def learnt_weight(device: str) -> Measured:
+def learnt_weight(device: str) -> CaseResult:
     checks = {}
     for name, residual in (("down", 1e6), ("up", 0.0)):
         rng, theta = np.random.default_rng(0), torch.zeros((), dtype=torch.float64)
@@ -234,7 +234,7 @@ def _pairs(g: Gaussians, **config: float) -> set[tuple[int, int]]:
 
 
 @case(19, "identical Gaussians, a chain, a thousand, far apart, orthogonal needles")
-def merging(device: str) -> Measured:
+def merging(device: str) -> CaseResult:
     chain = _line([0.0, 2.0, 4.0])
     pairs = merge_pairs(chain, torch.ones(3).bool(), MergeConfig())
     thousand = _line([0.0] * 1000)
@@ -265,7 +265,7 @@ def _own_overlap(g: Gaussians) -> float:
 
 
 @case(20, "moments of the merged Gaussian")
-def moments(device: str) -> Measured:
+def moments(device: str) -> CaseResult:
     """Against the moments of the mixture, summed in another order; with needles of aspect 1000."""
     g = cloud(9, 5)
     g.log_scales[::3] = torch.log(torch.tensor([1.0, 1e-3, 1e-3]))
@@ -285,13 +285,13 @@ def moments(device: str) -> Measured:
             worst = math.inf
     # rounding: |log s| u for log-scales, twice that for variances; u for quaternions, used twice in R S R^T
     bound = 2 * float(merged.log_scales.abs().max()) + 16
-    return Measured(
+    return CaseResult(
         worst, bound * UNIT, "2 abs(log s) + 16 roundings", "positive definite, the mixture's moments"
     )
 
 
 @case(21, "the scene in units a thousand times larger and smaller")
-def units(device: str) -> Measured:
+def units(device: str) -> CaseResult:
     g = cloud(300, 3, rest=0)
     pairs, checks = _pairs(g, colour=1.0), {}
     for factor in (1e-3, 1e3):
@@ -312,7 +312,7 @@ def _raises_aw_error(call: Callable[[], object]) -> bool:
 
 
 @case(22, "identical and constant pictures, empty masks, below the SSIM window")
-def metrics(device: str) -> Measured:
+def metrics(device: str) -> CaseResult:
     rng = np.random.default_rng(0)
     photo, flat = rng.random((16, 17, 3)), np.full((16, 17, 3), 0.7)
     nothing, pixel = np.zeros((16, 17), bool), np.zeros((16, 17), bool)
@@ -332,7 +332,7 @@ def metrics(device: str) -> Measured:
 
 
 @case(23, "ambiguity without, with only, and with unknown backgrounds")
-def ambiguous(device: str) -> Measured:
+def ambiguous(device: str) -> CaseResult:
     rng = np.random.default_rng(0)
     photo = rng.random((7, 9, 3)).astype(np.float32)
     everything, nothing = np.ones((7, 9), bool), np.zeros((7, 9), bool)
@@ -351,7 +351,7 @@ def ambiguous(device: str) -> Measured:
 
 
 @case(24, "bootstrap of one, of equal values, of a missing cell")
-def bootstrap(device: str) -> Measured:
+def bootstrap(device: str) -> CaseResult:
     one, equal = bootstrap_interval([3.0]), bootstrap_interval([0.25] * 8)
     gone, endless = bootstrap_interval([1.0, math.nan]), bootstrap_interval([1.0, 2.0, math.inf])
     checks = {
@@ -365,10 +365,10 @@ def bootstrap(device: str) -> Measured:
 
 
 @case(24, "a mean of values of size 1e12 that differ by 1e-3")
-def large_means(device: str) -> Measured:
+def large_means(device: str) -> CaseResult:
     values = 1e12 + 1e-3 * np.arange(1000)
     interval = bootstrap_interval(values, resamples=100)
     # pairwise sums of n values: log2(n) roundings of float64
     error = abs(interval.mean - math.fsum(values) / 1000) / 1e12
     error = error if interval.low <= interval.mean <= interval.high else math.inf
-    return Measured(error, 12 * 2.0**-53, "log2(n) + 2 roundings of float64", "the exact mean", 1.0)
+    return CaseResult(error, 12 * 2.0**-53, "log2(n) + 2 roundings of float64", "the exact mean", 1.0)

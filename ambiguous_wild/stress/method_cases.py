@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.config import State
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.methods.entry import MethodEntry
@@ -26,7 +26,7 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.trainer import Trainer
-from ambiguous_wild.stress.case import Case, Measured
+from ambiguous_wild.stress.case import Case, CaseResult
 
 ITERATIONS = 120  # density control acts before and after the middle
 _WIDTH, _HEIGHT, _FOCAL, _WALL_M = 64, 48, 60.0, 4.0
@@ -48,7 +48,7 @@ def case_of(entry: MethodEntry) -> Case:
         )
     entry.options()
 
-    def measure(device: str) -> Measured:
+    def measure(device: str) -> CaseResult:
         try:
             with tempfile.TemporaryDirectory(prefix="aw-stress-") as folder:
                 wrong = _faults(entry, Path(folder), torch.device(device))
@@ -57,7 +57,7 @@ def case_of(entry: MethodEntry) -> Case:
                 raise
             why = " ".join(f"{type(error).__name__}: {error}".split())
             raise AwError(why + place_of(error)) from error
-        return Measured(
+        return CaseResult(
             float(len(wrong)), 0.0, "; ".join(wrong) or "exact", "same bits when repeated, resumed"
         )
 
@@ -178,7 +178,7 @@ def _data(folder: Path, device: torch.device) -> TrainData:
     xy = _FOCAL / _WALL_M * (xyz[:, None, :2] - np.stack([across, 0 * across], axis=1))
     xy += (_WIDTH / 2, _HEIGHT / 2)  # [points, views, 2]
     seen = ((xy >= 0) & (xy < (_WIDTH, _HEIGHT))).all(axis=2)
-    points = Points(
+    points = SparsePoints(
         xyz=xyz,
         rgb=(255 * _wall(xyz[:, 0], xyz[:, 1])).astype(np.uint8),
         error_px=np.full(len(xyz), 0.5),

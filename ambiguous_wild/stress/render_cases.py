@@ -17,7 +17,7 @@ from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.stress.case import (
     FAST_MATH,
     UNIT,
-    Measured,
+    CaseResult,
     agree,
     camera,
     case,
@@ -32,7 +32,7 @@ from ambiguous_wild.stress.case import (
 BOTH = ("cpu", "cuda")
 
 
-def _others_unchanged(bad: Gaussians, device: str) -> Measured:
+def _others_unchanged(bad: Gaussians, device: str) -> CaseResult:
     """Check that 20 valid Gaussians have the same image and gradients with and without the invalid ones.
 
     They must agree bit for bit; on a GPU up to rounding, since its sums have no fixed order.
@@ -58,7 +58,7 @@ def _same(a: torch.Tensor, b: torch.Tensor, device: str) -> bool:
 
 
 @case(1, "at or behind the near plane, at the camera, at 1e6", devices=BOTH)
-def near_plane(device: str) -> Measured:
+def near_plane(device: str) -> CaseResult:
     bad = stacked_gaussians(4)
     bad.means[0] = torch.tensor([0.0, 0.0, 0.0099])
     bad.means[1] = torch.tensor([0.0, 0.0, -3.0])
@@ -68,7 +68,7 @@ def near_plane(device: str) -> Measured:
 
 
 @case(1, "just in front of the near plane", devices=BOTH)
-def in_front_of_near_plane(device: str) -> Measured:
+def in_front_of_near_plane(device: str) -> CaseResult:
     g = stacked_gaussians(1, depth=0.0101)
     g.means[0, :2] = torch.tensor([1e-4, -1e-4])
     g.log_scales[:] = torch.log(torch.tensor([1e-3, 7e-4, 5e-4]))
@@ -76,7 +76,7 @@ def in_front_of_near_plane(device: str) -> Measured:
 
 
 @case(1, "parameters that are no numbers")
-def not_finite(device: str) -> Measured:
+def not_finite(device: str) -> CaseResult:
     bad = stacked_gaussians(9)
     bad.means[0, 0], bad.means[1, 1] = math.nan, math.inf
     bad.quats[2], bad.quats[3, 2] = 0.0, math.nan
@@ -85,7 +85,7 @@ def not_finite(device: str) -> Measured:
     return _others_unchanged(bad, device)
 
 
-def _each_alone(device: str, comes_out: str, *changes: dict[str, object]) -> Measured:
+def _each_alone(device: str, comes_out: str, *changes: dict[str, object]) -> CaseResult:
     """Apply each change to a single Gaussian, so that no other Gaussian hides its error."""
     parts = []
     for change in changes:
@@ -97,7 +97,7 @@ def _each_alone(device: str, comes_out: str, *changes: dict[str, object]) -> Mea
 
 
 @case(2, "scales of 1e-8 and 1e4", devices=BOTH)
-def scales(device: str) -> Measured:
+def scales(device: str) -> CaseResult:
     small, large = [math.log(1e-8)] * 3, [math.log(1e4)] * 3
     faint = -4.0  # at scale 1e4 it covers every pixel
     return _each_alone(
@@ -109,7 +109,7 @@ def scales(device: str) -> Measured:
 
 
 @case(2, "needle and pancake of aspect 1e6")
-def aspect(device: str) -> Measured:
+def aspect(device: str) -> CaseResult:
     needle = np.log([1.0, 1e-6, 1e-6])
     pancake = np.log([1.0, 1.0, 1e-6])
     return _each_alone(
@@ -122,7 +122,7 @@ def aspect(device: str) -> Measured:
 
 
 @case(3, "quaternions of norm 1e-12 and 1e6", devices=BOTH)
-def quaternions(device: str) -> Measured:
+def quaternions(device: str) -> CaseResult:
     q = np.array([0.8, 0.3, -0.4, 0.2])
     long = {"log_scales": np.log([0.5, 0.05, 0.2])}
     return _each_alone(
@@ -134,7 +134,7 @@ def quaternions(device: str) -> Measured:
 
 
 @case(3, "a quaternion so short that its gradient would overflow")
-def quaternion_denormal(device: str) -> Measured:
+def quaternion_denormal(device: str) -> CaseResult:
     bad = stacked_gaussians(2)
     bad.quats[0] *= 1e-31
     bad.quats[1] *= 1e-42  # denormal
@@ -142,7 +142,7 @@ def quaternion_denormal(device: str) -> Measured:
 
 
 @case(3, "logits of 40 either way, colours far outside 0 to 1", devices=BOTH)
-def logits_and_colours(device: str) -> Measured:
+def logits_and_colours(device: str) -> CaseResult:
     return _each_alone(
         device,
         "as in float64; colours below 0 become 0, with gradient 0",
@@ -153,13 +153,13 @@ def logits_and_colours(device: str) -> Measured:
 
 
 @case(3, "a logit of 40 meets the alpha clamp", devices=BOTH)
-def logit_clamped(device: str) -> Measured:
+def logit_clamped(device: str) -> CaseResult:
     clamp = backend_of(device).max_alpha(device)
     return _each_alone(device, f"alpha {clamp}, no gradient where clamped", {"opacity_logits": 40.0})
 
 
 @case(4, "10 000 on one pixel", devices=BOTH)
-def stack(device: str) -> Measured:
+def stack(device: str) -> CaseResult:
     n = 10_000
     g = stacked_gaussians(n)
     g.means[:, 2] = 3.0 + torch.linspace(0, 1, n)
@@ -180,7 +180,7 @@ def stack(device: str) -> Measured:
 
 
 @case(4, "opacity 0.99 stacked 1000 deep", devices=BOTH)
-def opaque_stack(device: str) -> Measured:
+def opaque_stack(device: str) -> CaseResult:
     g = stacked_gaussians(1000)
     g.means[:, 2] = 3.0 + 0.001 * torch.arange(1000)
     g.opacity_logits[:] = math.log(0.99 / 0.01) - 1e-3  # just below the clamp
@@ -191,7 +191,7 @@ def opaque_stack(device: str) -> Measured:
 
 
 @case(5, "pictures of 1x1, 1xN, no multiple of the tile", devices=BOTH)
-def sizes(device: str) -> Measured:
+def sizes(device: str) -> CaseResult:
     shapes = ((1, 1), (1, 40), (40, 1), (16, 16), (17, 33))
     parts = [
         agree(cloud(12, 4), camera(*shape), device, "as in float64", sh_degree=1, background=(0.1, 0.5, 0.9))
@@ -201,7 +201,7 @@ def sizes(device: str) -> Measured:
 
 
 @case(5, "nothing to draw, and one over all", devices=BOTH)
-def nothing(device: str) -> Measured:
+def nothing(device: str) -> CaseResult:
     cam, background = camera(), (0.1, 0.5, 0.9)
     plain = torch.tensor(background).expand(cam.height, cam.width, 3)
     behind = stacked_gaussians(3)
@@ -225,7 +225,7 @@ def nothing(device: str) -> Measured:
 
 
 @case(6, "principal point outside, focal lengths of 1 and 1e5 px, the frustum clamp", devices=BOTH)
-def cameras(device: str) -> Measured:
+def cameras(device: str) -> CaseResult:
     parts = []
     for cx, cy in ((-100.0, 5.0), (300.0, 300.0)):
         g = cloud(20, 4)
@@ -242,7 +242,7 @@ def cameras(device: str) -> Measured:
 
 
 @case(7, "gradients against finite differences, on both sides of clamp, cut and stop", devices=BOTH)
-def finite_differences(device: str) -> Measured:
+def finite_differences(device: str) -> CaseResult:
     """Central differences of the float64 image, so that no implemented derivative is trusted."""
     parts = []
     for opacity in (0.9899, 0.9901, 0.9989, 0.9991, 0.999 / 255, 1.001 / 255, 0.8999, 0.9003, 0.5):
@@ -254,7 +254,7 @@ def finite_differences(device: str) -> Measured:
     return worst(parts)
 
 
-def _against_differences(g: Gaussians, cam: Camera, device: str) -> Measured:
+def _against_differences(g: Gaussians, cam: Camera, device: str) -> CaseResult:
     rng, step = np.random.default_rng(0), 1e-6
     d_image = torch.from_numpy(rng.normal(size=(cam.height, cam.width, 3)).astype(np.float32))
     parameters = {name: tensor.double() for name, tensor in g.items()}
@@ -274,4 +274,4 @@ def _against_differences(g: Gaussians, cam: Camera, device: str) -> Measured:
     terms = sum(t.numel() for t in parameters.values())
     # 96 + 6 N roundings of float32, times the terms of a directional derivative; h^2 and 1e-16 / h vanish
     tolerance = (96 + 6 * len(g)) * terms * UNIT * FAST_MATH
-    return Measured(worst_error, tolerance, "roundings x terms of a derivative", "the same slope", None)
+    return CaseResult(worst_error, tolerance, "roundings x terms of a derivative", "the same slope", None)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.stress import mask_cases, render_cases, training_cases
-from ambiguous_wild.stress.case import REGISTERED, Case, Outcome, run
+from ambiguous_wild.stress.case import REGISTERED, Case, StressLine, run
 
 FILES = (render_cases, training_cases, mask_cases)  # each registers its cases when it is imported
 CASES: tuple[Case, ...] = tuple(sorted(REGISTERED, key=lambda c: c.row))
@@ -34,8 +34,8 @@ def chosen(only: Sequence[str]) -> list[Case]:
 
 
 def run_all(
-    cases: Iterable[Case], devices: Sequence[str], each: Callable[[Outcome], None] | None = None
-) -> list[Outcome]:
+    cases: Iterable[Case], devices: Sequence[str], each: Callable[[StressLine], None] | None = None
+) -> list[StressLine]:
     """Run every case on every device it applies to."""
     outcomes = []
     for one in cases:
@@ -51,7 +51,7 @@ HEAD = ("case", "device", "correct result", "worst error", "tolerance", "reason"
 WORDS = ("device", "correct result", "reason", "verdict")  # columns that hold text
 
 
-def row(o: Outcome) -> tuple[str, ...]:
+def row(o: StressLine) -> tuple[str, ...]:
     """Return the cells of the outcome, in the columns of `HEAD`."""
     condition = "" if o.condition is None else f"{o.condition:.1e}"
     verdict = "passed" if o.passed else "FAILED"
@@ -60,7 +60,7 @@ def row(o: Outcome) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def to_line(o: Outcome) -> str:
+def to_line(o: StressLine) -> str:
     """Return one line for a terminal."""
     condition = "" if o.condition is None else f"{o.condition:8.1e}"
     verdict = "passed" if o.passed else "FAILED"

@@ -14,7 +14,7 @@ from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.stress.case import UNIT, Measured, camera, case, cloud, failed_checks, stacked_gaussians
+from ambiguous_wild.stress.case import UNIT, CaseResult, camera, case, cloud, failed_checks, stacked_gaussians
 
 _RATES = {
     "means": 1e-3, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "sh_rest": 1e-4
@@ -43,7 +43,7 @@ def _digest(seed: int) -> str:
 
 
 @case(8, "same seed, same bits")
-def same_bits(device: str) -> Measured:
+def same_bits(device: str) -> CaseResult:
     import numba
 
     from ambiguous_wild.splat.cpu import set_threads
@@ -67,7 +67,7 @@ def same_bits(device: str) -> Measured:
 
 
 @case(9, "Adam: one step, then thousands of zero gradients")
-def adam_at_rest(device: str) -> Measured:
+def adam_at_rest(device: str) -> CaseResult:
     """Compare with Adam's formula in float64; includes harmonics, whose steps the optimiser defers."""
     g, steps, rate = cloud(3, 1), 3000, 1e-2
     start = g.sh_rest.double().numpy().copy()
@@ -85,7 +85,7 @@ def adam_at_rest(device: str) -> Measured:
     error = float(np.abs(g.sh_rest.double().numpy() - expected).max() / np.abs(expected).max())
     error = error if all(bool(torch.isfinite(t).all()) for _, t in g.items()) else float("inf")
     # the momentum is below rounding after ln(2^24) / ln(sqrt(0.999) / 0.9) = 159 steps of four roundings
-    return Measured(
+    return CaseResult(
         error,
         4 * 159 * UNIT,
         "159 steps above rounding, 4 roundings each",
@@ -115,7 +115,7 @@ def _one_round(g: Gaussians, screen: torch.Tensor, ceiling: int, **config: Any) 
 
 
 @case(9, "density control that would remove all, clones all, meets the cap, meets NaN")
-def density_rows(device: str) -> Measured:
+def density_rows(device: str) -> CaseResult:
     pull, still = torch.full((8, 2), 1.0), torch.zeros(8, 2)
     invisible = cloud(8)
     invisible.opacity_logits[:] = -9.0
@@ -139,7 +139,7 @@ def density_rows(device: str) -> Measured:
 
 
 @case(10, "a photo that is all masked", devices=("cpu", "cuda"))
-def all_masked(device: str) -> Measured:
+def all_masked(device: str) -> CaseResult:
     photo = torch.rand(17, 21, 3, generator=torch.Generator().manual_seed(0)).to(device)
     checks = {}
     for weighting in ("map", "images"):
@@ -152,7 +152,7 @@ def all_masked(device: str) -> Measured:
 
 
 @case(10, "a sky of one colour brighter than white", devices=("cpu", "cuda"))
-def saturated_sky(device: str) -> Measured:
+def saturated_sky(device: str) -> CaseResult:
     """D-SSIM subtracts E[x]^2 from E[x^2], which cancels on flat bright images."""
     from ambiguous_wild.splat.reference import photometric_reference
 
@@ -164,7 +164,7 @@ def saturated_sky(device: str) -> Measured:
     worst = float((loss.d_image.cpu() - d_image).abs().max() / d_image.abs().max())
     # the denominator is C2 = 9e-4: an error of 2 u E[x^2] in the variance is a relative error of 2 u / C2
     condition = 2.0 / 0.03**2
-    return Measured(
+    return CaseResult(
         worst,
         8 * condition * UNIT,
         "8 roundings x 2 / C2",
@@ -174,7 +174,7 @@ def saturated_sky(device: str) -> Measured:
 
 
 @case(9, "a Gaussian never seen")
-def never_seen(device: str) -> Measured:
+def never_seen(device: str) -> CaseResult:
     g = stacked_gaussians(2, rest=3)
     before, optimiser = g.clone(), SplatAdam(g, _RATES)
     visible = torch.tensor([True, False])

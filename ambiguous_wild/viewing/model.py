@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Camera, Place, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, SceneTransform, View
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.scene import together
 from ambiguous_wild.io import compressed_ply, gltf, sog, spz
@@ -18,7 +18,7 @@ from ambiguous_wild.io.files import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count, write_splat_ply
 from ambiguous_wild.io.splat_arrays import finite
-from ambiguous_wild.io.splat_files import Splats, read_splats
+from ambiguous_wild.io.splat_files import SplatFile, read_splats
 from ambiguous_wild.metrics.image import psnr
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class RenderSettings:
 
 
 @dataclass(frozen=True)
-class Model:
+class ViewedModel:
     """One method's model of a scene."""
 
     label: str  # unique among the models that are shown together
@@ -83,7 +83,7 @@ class Model:
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
     masks: Path | None = None  # folder of keep maps of train views, white = keep
     reference: bool = False  # trained with exact masks or clean photos, so it does not compete
-    splats: Splats | None = field(
+    splats: SplatFile | None = field(
         default=None, repr=False, compare=False
     )  # content of `ply` if it is a splat file and not a run's model
 
@@ -96,7 +96,7 @@ class Model:
         return read_splat_ply(self.ply) if self.splats is None else self.splats.gaussians
 
     @property
-    def place(self) -> Place:
+    def place(self) -> SceneTransform:
         """Place of the scene in whose coordinates `read` returns Gaussians."""
         return read_place(self.ply) if self.splats is None else self.splats.place
 
@@ -105,7 +105,7 @@ class Model:
         """Number of Gaussians."""
         return splat_count(self.ply) if self.splats is None else len(self.splats.gaussians["means"])
 
-    def within(self, place: Place) -> Model:
+    def within(self, place: SceneTransform) -> ViewedModel:
         """Move the model of a splat file to a scene's inner coordinates; a run's model has them already."""
         if self.splats is None:
             return self
@@ -113,7 +113,7 @@ class Model:
         return replace(self, splats=replace(self.splats, gaussians=dict(arrays), place=place))
 
 
-def file_model(path: Path) -> tuple[Model, str]:
+def file_model(path: Path) -> tuple[ViewedModel, str]:
     """Read the model of a splat file of any tool, to be drawn as plain 3DGS; also return a note, or "".
 
     Raises:
@@ -121,11 +121,11 @@ def file_model(path: Path) -> tuple[Model, str]:
     """
     splats = read_splats(path)
     left = f"{path}: {splats.left_out:,} Gaussians with values that are not finite left out"
-    model = Model(path.name, path, RenderSettings(antialias=splats.antialias), splats=splats)
+    model = ViewedModel(path.name, path, RenderSettings(antialias=splats.antialias), splats=splats)
     return model, left if splats.left_out else ""
 
 
-def moved(gaussians: Arrays, of: Place, to: Place) -> Arrays:
+def moved(gaussians: Arrays, of: SceneTransform, to: SceneTransform) -> Arrays:
     """Convert Gaussians from the coordinates of one place to those of another."""
     if of == to:
         return gaussians
@@ -216,7 +216,7 @@ AXES = {
 _FLOOR = 0.02  # share of the Gaussians around the middle that lie below the floor
 
 
-def upright(model: Model, space: Space, axis: str) -> Place:
+def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:
     """Return a place in which an axis of `AXES` points up and the floor below the scene's middle is at zero.
 
     Args:
@@ -235,7 +235,7 @@ def upright(model: Model, space: Space, axis: str) -> Place:
     x, y, z = (place.rotation.T @ foot / place.scale + place.centre).tolist()
     turn, _ = Rotation.align_vectors([AXES[axis]], [place.rotation.T @ space.up])
     a, b, c, d = turn.as_quat().tolist()
-    return Place((x, y, z), place.scale, (d, a, b, c))
+    return SceneTransform((x, y, z), place.scale, (d, a, b, c))
 
 
 FORMATS: Mapping[str, tuple[str, Callable[[Path], dict[str, np.ndarray]]]] = {
@@ -248,7 +248,7 @@ FORMATS: Mapping[str, tuple[str, Callable[[Path], dict[str, np.ndarray]]]] = {
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportedModel:
     """An exported file. dB are means over the views; None = there was no view to measure on."""
 
     format: str
@@ -259,12 +259,14 @@ class Exported:
     psnr_to_model: float | None  # of its renders against the model's, dB; inf = equal pictures
     psnr: float | None  # of its renders against the photos, dB
     lost_db: float | None  # PSNR of the model minus `psnr`
-    place: Place = UNMOVED  # of the file's coordinates; glTF that is not turned has the user's coordinates
+    place: SceneTransform = (
+        UNMOVED  # of the file's coordinates; glTF that is not turned has the user's coordinates
+    )
     source: str = "the PLY"  # file with whose size `share` compares
 
 
 def export(
-    model: Model,
+    model: ViewedModel,
     folder: Path,
     formats: Sequence[str],
     views: Sequence[View] = (),
@@ -272,11 +274,11 @@ def export(
     name: str = "point_cloud",
     space: Space | None = None,
     up: str | None = None,
-) -> list[Exported]:
+) -> list[ExportedModel]:
     """Write the formats into a folder, each atomically, read them back and measure them.
 
     Files have the units of the scene's files if the format can hold them: SPZ's sizes and, for large units,
-    SOG's positions cannot. Each file records how to reach the scene's coordinates (`Exported.place`).
+    SOG's positions cannot. Each file records how to reach the scene's coordinates (`ExportedModel.place`).
 
     Args:
         model: the model; its PLY is not changed.
@@ -319,7 +321,7 @@ def export(
         old, new = _mean(before, photos), _mean(after, photos)
         size = path.stat().st_size
         exported.append(
-            Exported(
+            ExportedModel(
                 format=wanted,
                 path=path,
                 bytes=size,
@@ -335,7 +337,9 @@ def export(
     return exported
 
 
-def _write(wanted: str, path: Path, gaussians: Arrays, render_settings: RenderSettings, place: Place) -> int:
+def _write(
+    wanted: str, path: Path, gaussians: Arrays, render_settings: RenderSettings, place: SceneTransform
+) -> int:
     if wanted == "spz":
         return spz.write_spz(path, gaussians, antialias=render_settings.antialias, place=place)
     if wanted == "ply":

@@ -19,7 +19,7 @@ from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrow
 from ambiguous_wild.io.splat_arrays import finite, sigmoid
 from ambiguous_wild.io.spz import spz_arrays, spz_bytes
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.viewing.model import Model, Renderer, space_of
+from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
 PAGE = "index.html"
 MAP = "map.png"  # in the scene's folder
@@ -59,7 +59,7 @@ def check_page_folder(folder: Path) -> None:
 
 def page_text(
     scene: Scene,
-    models: Sequence[Model],
+    models: Sequence[ViewedModel],
     *,
     title: str,
     most_gaussians: int = MOST_GAUSSIANS,
@@ -129,7 +129,9 @@ def page_text(
     return _fill(title, data, "\n".join(elements)), sum(map(len, elements))
 
 
-def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: bytes, camera: Camera) -> str:
+def _rounding_cost(
+    model: ViewedModel, gaussians: Mapping[str, np.ndarray], packed: bytes, camera: Camera
+) -> str:
     """Return a note on the loss of a model with sizes that the page's format cannot hold; else ""."""
     sizes = np.exp(gaussians["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
     stored = spz_arrays(packed, model.ply)
@@ -144,7 +146,7 @@ def _rounding_cost(model: Model, gaussians: Mapping[str, np.ndarray], packed: by
 
 
 def _model_facts(
-    model: Model, element: str, views: Sequence[View], train: Sequence[View], most_mask_bytes: int
+    model: ViewedModel, element: str, views: Sequence[View], train: Sequence[View], most_mask_bytes: int
 ) -> dict[str, object]:
     psnr = {v.name: model.psnr[v.name] for v in views if np.isfinite(model.psnr.get(v.name, np.nan))}
     return {

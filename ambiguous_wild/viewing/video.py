@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.core.scene import NO_PHOTO, centred, together
 from ambiguous_wild.io.files import atomic_path
-from ambiguous_wild.viewing.model import Model, Renderer, space_of
+from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
 _MOST_BYTES = 64 * 1024 * 1024
@@ -65,7 +65,7 @@ def _circle(
         yield middle + distance * (math.cos(tilt) * flat + math.sin(tilt) * up)
 
 
-def scene_around(model: Model) -> Scene:
+def scene_around(model: ViewedModel) -> Scene:
     """Make a scene without photos for the model of a splat file, whose cameras look at the model's median.
 
     Up is the axis of the file that is nearest to -y, which often is up in COLMAP's models.
@@ -84,8 +84,10 @@ def scene_around(model: Model) -> Scene:
         camera = replace(lens, cam_from_world=_looking(center, middle, up))
         views.append(View(f"render_{k}.png", NO_PHOTO, camera, "test" if k == 0 else "train"))
     nothing = np.zeros(0)
-    points = Points(xyz, np.zeros(xyz.shape, np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, np.int64),
-                    nothing.astype(np.int32), nothing.reshape(0, 2).astype(np.float32))  # fmt: skip
+    points = SparsePoints(
+        xyz, np.zeros(xyz.shape, np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, np.int64),
+        nothing.astype(np.int32), nothing.reshape(0, 2).astype(np.float32),
+    )  # fmt: skip
     return centred(Scene(model.ply.parent, model.label, tuple(views), points))
 
 
@@ -226,7 +228,7 @@ Tick = Callable[[int, int], None]
 
 
 def draw_frames(
-    models: Sequence[Model],
+    models: Sequence[ViewedModel],
     cameras: Sequence[Camera],
     *,
     columns: int | None = None,

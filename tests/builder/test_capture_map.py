@@ -23,7 +23,7 @@ from ambiguous_wild.builder.capture_map import (
 )
 from ambiguous_wild.builder.growth import GrowthForecast
 from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, with_labels, write_map
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import read_png_rgb
 
 
@@ -137,14 +137,16 @@ def test_a_walk_along_a_facade_is_seen_from_above(world: np.ndarray) -> None:
 NAMES = [f"IMG_{k}.jpg" for k in range(8)]
 
 
-def model_of(names: list[str]) -> Model:
+def model_of(names: list[str]) -> ColmapModel:
     rotations, centres = ring(8, np.eye(3))
     camera = ModelCamera(1, "PINHOLE", 40, 30, (30.0, 30.0, 20.0, 15.0))
     images = {}
     for k, name in enumerate(NAMES):
         if name in names:
             images[k + 1] = image_of(k + 1, name, rotations[k], centres[k])
-    return Model({1: camera}, images, points_without_tracks(np.random.default_rng(0).normal(size=(50, 3))))
+    return ColmapModel(
+        {1: camera}, images, points_without_tracks(np.random.default_rng(0).normal(size=(50, 3)))
+    )
 
 
 def image_of(number: int, name: str, rotation: np.ndarray, centre: np.ndarray) -> ModelImage:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.checks import Check, check_capture, noise, refuse_failed
+from ambiguous_wild.builder.checks import CaptureCheck, check_capture, noise, refuse_failed
 from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, confirmed, photo_features
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import image_size
@@ -23,7 +23,7 @@ def clean() -> list[np.ndarray]:
     return [render(eye, np.array([0.0, 0.0, 5.2])) for eye in eyes(COUNT)]
 
 
-def checks(folder: Path, photos: list[np.ndarray]) -> dict[str, Check]:
+def checks(folder: Path, photos: list[np.ndarray]) -> dict[str, CaptureCheck]:
     folder.mkdir()
     for i, photo in enumerate(photos):
         cv2.imwrite(str(folder / f"p{i:02d}.png"), photo[:, :, ::-1])
@@ -42,7 +42,7 @@ def lit(photo: np.ndarray, stops: np.ndarray | float) -> np.ndarray:
     return (255 * back.clip(0, 1) + 0.5).astype(np.uint8)
 
 
-def states(found: dict[str, Check]) -> dict[str, str]:
+def states(found: dict[str, CaptureCheck]) -> dict[str, str]:
     return {name: c.state for name, c in found.items()}
 
 
@@ -121,8 +121,8 @@ def test_exif_decides_where_it_speaks(tmp_path: Path) -> None:
     found = {c.name: c for c in check_capture(tmp_path / "raw").checks}
     # The photos are equally bright: the settings followed the light.
     said = "automatic: settings span 5.0 stops, the same surfaces differ by 0.0"
-    assert found["exposure"] == Check("exposure", "ok", "EXIF and pixels", said)
-    assert found["white balance"] == Check("white balance", "ok", "EXIF", "manual in every photo")
+    assert found["exposure"] == CaptureCheck("exposure", "ok", "EXIF and pixels", said)
+    assert found["white balance"] == CaptureCheck("white balance", "ok", "EXIF", "manual in every photo")
     assert found["ISO"].finding == "100 to 400" and found["ISO"].state == "warning"
     assert (
         found["focal length"].finding == "phone: 4.0 to 7.0 mm" and found["focal length"].state == "warning"

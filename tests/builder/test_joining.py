@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.builder.joining import Similarity, join
 from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.motions import Motion
-from ambiguous_wild.builder.placing import Place, Placement, _cells, centre_of
+from ambiguous_wild.builder.placing import Placement, PoseHypothesis, _cells, centre_of
 from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -241,10 +241,10 @@ def test_little_evidence_is_enough_only_where_nothing_speaks_against_it():
     part, _ = parts({})
     points = PointLookup(part.matched, [np.full(len(POINTS), -1)] * 6, np.zeros((0, 3)), np.zeros(0, int))
 
-    def place(partners: int, area: float, spread: float) -> Place:
-        return Place(pose(0), frozenset(range(partners)), area, spread)
+    def place(partners: int, area: float, spread: float) -> PoseHypothesis:
+        return PoseHypothesis(pose(0), frozenset(range(partners)), area, spread)
 
-    nobody = Place(None, frozenset(), 0.0)
+    nobody = PoseHypothesis(None, frozenset(), 0.0)
     assert part._unopposed(0, place(2, 0.1, 0.5), nobody, points)
     assert not part._unopposed(0, place(2, 0.1, 0.5), place(1, 0.1, 0.5), points)  # one other disagrees
     assert not part._unopposed(0, place(7, 0.1, 0.1), nobody, points)  # crowded, as those of a distractor

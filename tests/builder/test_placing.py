@@ -15,7 +15,7 @@ from ambiguous_wild.builder.adjustment import adjustment_options
 from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placing import Place, Placement, _reason
+from ambiguous_wild.builder.placing import Placement, PoseHypothesis, _reason
 from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
@@ -172,8 +172,8 @@ def test_focal_length_by_votes_of_pairs_among_wrong_ones(focal):
 
 
 def test_a_photo_without_a_clear_place_is_named_with_the_reason():
-    def place(partners: int, area: float) -> Place:
-        return Place(np.eye(4)[:3], frozenset(range(partners)), area)
+    def place(partners: int, area: float) -> PoseHypothesis:
+        return PoseHypothesis(np.eye(4)[:3], frozenset(range(partners)), area)
 
     nowhere = place(0, 0)
     assert _reason(place(9, 0.6), place(7, 0.15), 2) is None
@@ -181,7 +181,9 @@ def test_a_photo_without_a_clear_place_is_named_with_the_reason():
     assert "no placed photo" in str(_reason(nowhere, nowhere, 2))
     assert "only 2 placed photos" in str(_reason(place(2, 0.4), nowhere, 3))
     assert "small part" in str(_reason(place(5, 0.07), nowhere, 2))
-    crowded = Place(np.eye(4)[:3], frozenset(range(5)), 0.25, 0.2)  # as the matches of a distractor are
+    crowded = PoseHypothesis(
+        np.eye(4)[:3], frozenset(range(5)), 0.25, 0.2
+    )  # as the matches of a distractor are
     assert "small part" in str(_reason(crowded, nowhere, 2))
     assert _reason(place(5, 0.25), nowhere, 2) is None
 
@@ -267,8 +269,8 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
 
         def _best(self, photo, now, rays, points):
             pose = None if photo > len(self.poses) else np.eye(3, 4)
-            none = Place(None, frozenset(), 0.0)
-            return (none if pose is None else Place(pose, frozenset((1, 2, 3)), 1.0)), none
+            none = PoseHypothesis(None, frozenset(), 0.0)
+            return (none if pose is None else PoseHypothesis(pose, frozenset((1, 2, 3)), 1.0)), none
 
         def _same(self, first, second):
             return second is not None

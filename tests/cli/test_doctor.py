@@ -12,16 +12,25 @@ import pytest
 from click.testing import CliRunner
 
 from ambiguous_wild.cli import doctor
-from ambiguous_wild.cli.doctor import PROBES, Check, Probe, all_checks, command, other_versions, probe, unmet
+from ambiguous_wild.cli.doctor import (
+    PROBES,
+    Probe,
+    SystemCheck,
+    all_checks,
+    command,
+    other_versions,
+    probe,
+    unmet,
+)
 from ambiguous_wild.core import AwError
 
 
 @pytest.fixture(scope="module")
-def report() -> list[Check]:
+def report() -> list[SystemCheck]:
     return all_checks()
 
 
-def test_the_core_works_where_the_tests_run(report: list[Check]) -> None:
+def test_the_core_works_where_the_tests_run(report: list[SystemCheck]) -> None:
     core = {c.name: c for c in report if c.group == "core"}
     assert [c.name for c in core.values() if not c.ok] == []
     assert core["python"].detail == ".".join(map(str, sys.version_info[:3]))
@@ -29,7 +38,7 @@ def test_the_core_works_where_the_tests_run(report: list[Check]) -> None:
     assert {"cpu", "packages", "OpenImageIO", "pycolmap", "numba", "kernel cache", "disk"} <= core.keys()
 
 
-def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[Check]) -> None:
+def test_whatever_lacks_comes_with_a_way_to_get_it(report: list[SystemCheck]) -> None:
     for c in report:
         assert c.detail
         assert bool(c.fix) is not c.ok, c
@@ -66,7 +75,7 @@ def test_a_system_package_comes_with_the_command_of_the_machine(
 
 
 def test_what_one_command_needs_comes_with_its_extra(
-    monkeypatch: pytest.MonkeyPatch, report: list[Check]
+    monkeypatch: pytest.MonkeyPatch, report: list[SystemCheck]
 ) -> None:
     assert {"ray", "choix", "nltk", "nerfbaselines"} <= {c.name for c in report if c.group == "optional"}
     monkeypatch.setattr(doctor, "installed", lambda name: None)
@@ -78,7 +87,7 @@ def test_what_one_command_needs_comes_with_its_extra(
     assert fixes["nerfbaselines"].startswith("python3 -m venv")
 
 
-def test_weights_come_with_the_command_that_downloads_them(report: list[Check]) -> None:
+def test_weights_come_with_the_command_that_downloads_them(report: list[SystemCheck]) -> None:
     optional = {c.name: c for c in report if c.group == "optional"}
     assert optional["transformers"].ok
     for name in ("dinov2-small", "dino-vits16", "efficientnet-lite0"):
@@ -100,14 +109,14 @@ def test_lpips_comes_with_the_command_for_the_files_it_lacks(
     assert doctor._metrics()[0].ok
 
 
-def test_the_report_prints_every_check(monkeypatch: pytest.MonkeyPatch, report: list[Check]) -> None:
+def test_the_report_prints_every_check(monkeypatch: pytest.MonkeyPatch, report: list[SystemCheck]) -> None:
     monkeypatch.setattr(doctor, "all_checks", lambda: report)
     out = CliRunner().invoke(command, [], catch_exceptions=False).output
     for c in report:
         assert f"{'✓' if c.ok else '✗'} {c.name}" in out and c.detail in out and c.fix in out
     facts = json.loads(CliRunner().invoke(command, ["--json"], catch_exceptions=False).output)
     assert facts["ok"] is True
-    assert [Check(**c) for c in facts["checks"]] == report
+    assert [SystemCheck(**c) for c in facts["checks"]] == report
 
 
 @pytest.mark.parametrize("words", [[], ["--json"]])
@@ -115,8 +124,8 @@ def test_a_broken_core_is_an_error_with_what_to_run(
     words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = [
-        Check("core", "numba", False, "no threads", "pip install numba"),
-        Check("optional", "git", True, "2"),
+        SystemCheck("core", "numba", False, "no threads", "pip install numba"),
+        SystemCheck("optional", "git", True, "2"),
     ]
     monkeypatch.setattr(doctor, "all_checks", lambda: found)
     done = CliRunner().invoke(command, words)

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.main import cli
 from ambiguous_wild.core import AwError
 from ambiguous_wild.stress import table
-from ambiguous_wild.stress.case import Measured, case, run
+from ambiguous_wild.stress.case import CaseResult, case, run
 
 
 def aw(*words):
@@ -37,7 +37,7 @@ def test_json_holds_what_the_table_shows():
 
 @pytest.mark.parametrize("error", [2.0, float("nan")])
 def test_a_case_that_fails_is_said_and_exits_with_1(monkeypatch, error):
-    bad = case(1, "made to fail")(lambda device: Measured(error, 1.0, "by hand", "nothing"))
+    bad = case(1, "made to fail")(lambda device: CaseResult(error, 1.0, "by hand", "nothing"))
     monkeypatch.setattr(table, "CASES", (bad,))
     done = aw("--device", "cpu")
     assert done.exit_code == 1

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 
 
 def camera_at(x: float, width: int = 40, height: int = 30) -> Camera:
@@ -48,7 +48,7 @@ def scene_of(positions: list[tuple[float, str]], points: np.ndarray | None = Non
     )
     xyz = np.zeros((0, 3)) if points is None else points
     n = len(xyz)
-    empty = Points(
+    empty = SparsePoints(
         xyz,
         np.zeros((n, 3), np.uint8),
         np.zeros(n),

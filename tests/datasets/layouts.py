@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.io.colmap_model import write_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, ModelPoints
 from ambiguous_wild.io.images import write_png
 
 WIDTH, HEIGHT = 64, 36
@@ -28,7 +28,7 @@ def photo(index: int) -> np.ndarray:
     return np.round(127 + 110 * np.stack(waves, axis=-1)).astype(np.uint8)
 
 
-def make_model(names: list[str] = NAMES, *, points: int = 60, cameras: int = 1) -> Model:
+def make_model(names: list[str] = NAMES, *, points: int = 60, cameras: int = 1) -> ColmapModel:
     """Cameras that step sideways and turn; points with exact tracks, the last ones of test photos."""
     rng = np.random.default_rng(3)
     xyz = np.column_stack(
@@ -57,7 +57,7 @@ def make_model(names: list[str] = NAMES, *, points: int = 60, cameras: int = 1) 
     flat = np.array([pair for t in tracks for pair in t], np.int64).reshape(-1, 2)
     rgb = rng.integers(0, 256, (points, 3), dtype=np.uint8)
     ids = np.arange(1, points + 1)
-    return Model(
+    return ColmapModel(
         lenses, images, ModelPoints(ids, xyz, rgb, rng.random(points), offsets, flat[:, 0], flat[:, 1])
     )
 

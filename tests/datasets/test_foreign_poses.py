@@ -20,7 +20,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.readers import read_foreign, recognise
 from ambiguous_wild.datasets.write import import_scene
 from ambiguous_wild.io.colmap_model import write_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.images import pillow, read_gray
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
@@ -240,7 +240,7 @@ def feed_forward(root: Path, model: str = "PINHOLE", share: float = 1.0) -> list
         none = np.zeros((0, 2)), np.zeros(0, np.int64)
         images[i] = ModelImage(i, q, -shot.rotation @ shot.centre, i, shot.name, *none)
     points = points_without_tracks(POINTS, np.full(POINTS.shape, 99, np.uint8))
-    write_model(root / "sparse", Model(cameras, images, points))
+    write_model(root / "sparse", ColmapModel(cameras, images, points))
     reconstruction = pycolmap.Reconstruction(str(root / "sparse"))  # with rigs and frames, as the demos write
     reconstruction.write(str(root / "sparse"))
     reconstruction.write_text(str(root / "sparse"))

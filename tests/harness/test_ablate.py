@@ -19,7 +19,7 @@ from ambiguous_wild.methods.ablation import Group, Variant, check_groups, choose
 from ambiguous_wild.report.ablation import markdown_of, report, write_report
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from tests.command_line import aw
 from tests.harness.fake_runs import fake_result
 
@@ -48,7 +48,7 @@ def _methods(monkeypatch):
         MethodEntry(
             "mine",
             "3dgs whose density can be set",
-            lambda options: Parts(density_config=options),
+            lambda options: MethodHooks(density_config=options),
             config=DensityConfig,
             ablations=GROUPS,
         )

@@ -14,14 +14,14 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.table import audit_command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.report.audit import audit
-from ambiguous_wild.report.audit_numbers import Finding, read_tables
+from ambiguous_wild.report.audit_numbers import AuditFinding, read_tables
 from tests.harness.clean_tables import COLUMNS, Row, clean_tables, write
 
 ROOT = Path(__file__).resolve().parents[2]
 REPORTED = ROOT / "ambiguous_wild/report/reported"
 
 
-def findings(rows: list[Row], folder: Path) -> list[Finding]:
+def findings(rows: list[Row], folder: Path) -> list[AuditFinding]:
     return audit(read_tables([write(rows, folder / "tables.csv")]))
 
 
@@ -155,7 +155,7 @@ def test_what_is_planted_is_found(plant: Callable[[list[Row]], str], tmp_path: P
     assert tried and missed == []
 
 
-def reported() -> list[Finding]:
+def reported() -> list[AuditFinding]:
     return audit(read_tables([REPORTED]))
 
 

@@ -17,8 +17,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.report.cost import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_curves import (
     Curve,
+    MeanAndDeviation,
     Point,
-    Summary,
     changes,
     curves_of,
     pareto,
@@ -75,7 +75,7 @@ def test_a_time_is_missing_where_one_run_never_gets_there(tmp_path: Path) -> Non
         cost_run(tmp_path, "a", seed=seed, psnr=(end,), train_s=40.0, probes=[*RISING[:2], (40.0, end)])
     curves = curves_of(read(tmp_path).runs)
     (low,) = times_to_reach(curves, [14.0])
-    assert low.minutes == Summary(0.25, 0.0) and (low.reached, low.runs) == (2, 2)
+    assert low.minutes == MeanAndDeviation(0.25, 0.0) and (low.reached, low.runs) == (2, 2)
     (high,) = times_to_reach(curves, [19.0])
     assert math.isnan(high.minutes.mean) and (high.reached, high.runs) == (1, 2)
     with_setup = times_to_reach(curves, [14.0], setup=True)[0]
@@ -193,12 +193,23 @@ def test_under_a_budget_both_take_as_long_and_no_rate_is_given(tmp_path: Path) -
 @given(st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12))
 def test_the_front_is_what_no_other_dominates(at: list[tuple[int, int]]) -> None:
     made = [
-        Point(str(i), "m", "", 1, Summary(float(psnr)), Summary(float(minutes)), Summary(), {})
+        Point(
+            str(i),
+            "m",
+            "",
+            1,
+            MeanAndDeviation(float(psnr)),
+            MeanAndDeviation(float(minutes)),
+            MeanAndDeviation(),
+            {},
+        )
         for i, (minutes, psnr) in enumerate(at)
     ]
     front = {
         (p.minutes.mean, p.psnr.mean)
-        for p in pareto([*made, Point("x", "m", "", 0, Summary(), Summary(1.0), Summary(), {})])
+        for p in pareto(
+            [*made, Point("x", "m", "", 0, MeanAndDeviation(), MeanAndDeviation(1.0), MeanAndDeviation(), {})]
+        )
     }
     expected = {
         (m, d) for m, d in at

@@ -131,7 +131,9 @@ def job_of(cell, method, folder):
 
 def test_a_cell_that_kills_every_process_is_a_failure(cell, tmp_path):
     cell, job = cell
-    killer = jobs.Source("killer.py", "plugin", "/nowhere/killer.py", b"import os; os.kill(os.getpid(), 9)")
+    killer = jobs.CodeSource(
+        "killer.py", "plugin", "/nowhere/killer.py", b"import os; os.kill(os.getpid(), 9)"
+    )
     folder = Path(job.folder)
     folder.mkdir(parents=True)
     (report,) = run_in_processes(

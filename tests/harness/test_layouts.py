@@ -31,7 +31,7 @@ from ambiguous_wild.report.papers import (
     with_reported,
 )
 from ambiguous_wild.report.plain_formats import divided
-from ambiguous_wild.report.table import Cell, Column, Table
+from ambiguous_wild.report.table import Column, Table, TableCell
 from ambiguous_wild.report.typeset import latex_text, to_html, to_latex
 from tests.harness.fake_runs import failed, fake_result, save
 
@@ -50,7 +50,7 @@ def runs_of(root: Path, *results: dict) -> Runs:  # type: ignore[type-arg]
     return read_runs(save(root, *results))
 
 
-def entry(layout: Table, method: str, group: str, key: str = "psnr", kind: str = "measured") -> Cell:
+def entry(layout: Table, method: str, group: str, key: str = "psnr", kind: str = "measured") -> TableCell:
     row = next(row for row in layout.rows if row.name == method and row.kind == kind)
     at = [(c.group, c.measure.key) for c in layout.columns].index((group, key))
     return row.cells[at]

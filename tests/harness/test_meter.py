@@ -13,14 +13,14 @@ import torch
 
 from ambiguous_wild.harness import meter as machine
 from ambiguous_wild.harness.grid import plan_cells, run_cells
-from ambiguous_wild.harness.meter import Meter, Presence
+from ambiguous_wild.harness.meter import ActiveRuns, Meter
 from ambiguous_wild.harness.timing import in_reference_seconds
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import KERNELS, Calibration, Reading, Size
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
 
@@ -44,7 +44,7 @@ class Machine:
 
 def meter(tmp_path: Path, *, kernel: list[float] | None = None, threads: int = CORES) -> Meter:
     seconds = iter(kernel or [0.5] * 100)
-    presence = Presence("cpu", tmp_path)
+    presence = ActiveRuns("cpu", tmp_path)
     return Meter("cpu", threads, read=lambda: Reading(next(seconds)), presence=presence)
 
 
@@ -130,7 +130,7 @@ def test_load_slows_what_is_serial_less_and_cancels_out(tmp_path, monkeypatch, p
         here = Machine(monkeypatch)
         wall = (30.0 - parallel_s) / one + parallel_s * 2.0 / two
         reading = Reading(kernel.reference_s * 2.0 / two, two, kernel.serial_reference_s / one, one)
-        m = Meter("cpu", 2, read=lambda r=reading: r, presence=Presence("cpu", tmp_path))
+        m = Meter("cpu", 2, read=lambda r=reading: r, presence=ActiveRuns("cpu", tmp_path))
         m.begin(0.0)
         here.wall, here.own = here.wall + wall, here.own + 30.0 + parallel_s
         m.look(wall)
@@ -147,7 +147,7 @@ def test_a_run_of_one_thread_needs_no_second_kernel(tmp_path, monkeypatch):
     here = Machine(monkeypatch)
     kernel = KERNELS["cpu"]
     reading = Reading(kernel.reference_s, 1.0, 9.0, 1.0)
-    m = Meter("cpu", 1, read=lambda: reading, presence=Presence("cpu", tmp_path))
+    m = Meter("cpu", 1, read=lambda: reading, presence=ActiveRuns("cpu", tmp_path))
     measured(m, here.work, 40.0, threads=1)
     assert m.cost(40.0)["reference_s"] == pytest.approx(40.0)
 
@@ -207,8 +207,8 @@ def test_a_rollback_keeps_what_was_spent_and_seen(tmp_path, monkeypatch):
 
 
 def test_runs_count_each_other_and_forget_the_dead(tmp_path):
-    one, two = Presence("cpu", tmp_path), Presence("cpu", tmp_path)
-    other_gpu = Presence("GPU-1234", tmp_path)
+    one, two = ActiveRuns("cpu", tmp_path), ActiveRuns("cpu", tmp_path)
+    other_gpu = ActiveRuns("GPU-1234", tmp_path)
     with one.announced():
         assert one.count() == 1
         with two.announced(), other_gpu.announced():
@@ -230,7 +230,7 @@ def test_runs_count_each_other_and_forget_the_dead(tmp_path):
 
 def test_two_runs_at_once_are_contended(tmp_path, monkeypatch):
     here, m = Machine(monkeypatch), meter(tmp_path)
-    with Presence("cpu", tmp_path).announced():
+    with ActiveRuns("cpu", tmp_path).announced():
         assert measured(m, here.work) == ("contended", "2 runs shared the machine")
 
 
@@ -272,7 +272,7 @@ def test_a_meter_changes_no_bit_of_a_run(scene, tmp_path):
     found = []
     for name in ("with", "without"):
         data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
-        trainer = Trainer(data, Parts(), TrainConfig(iterations=60, probes=2), folder=tmp_path / name)
+        trainer = Trainer(data, MethodHooks(), TrainConfig(iterations=60, probes=2), folder=tmp_path / name)
         if name == "with":
             trainer.meter = meter(tmp_path, kernel=[1.0] * 100)
             monitored = trainer.meter

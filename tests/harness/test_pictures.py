@@ -26,7 +26,7 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH, write_tiny_scene
 
@@ -110,7 +110,7 @@ def test_looking_costs_no_training_time(watched):
 
 
 def test_pictures_grow_while_any_method_trains(scene, tmp_path):
-    trainer = trainer_for(scene, tmp_path, Parts())  # no masks, so no panels of a method
+    trainer = trainer_for(scene, tmp_path, MethodHooks())  # no masks, so no panels of a method
     recorder = Recorder(trainer, tmp_path)
     heights = []
     while trainer.iteration < 0.25 * trainer.config.iterations:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ambiguous_wild.core import AwError, Camera, Points, Scene, View
+from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.harness import effects_plan, mask_plan
 from ambiguous_wild.harness import effects_plan as decide_module
 from ambiguous_wild.harness.cell import RunOptions, scene_identity
@@ -17,7 +17,7 @@ from ambiguous_wild.harness.chosen_effects import check_wanted
 from ambiguous_wild.harness.effects_plan import (
     FEW_PHOTOS,
     OUTWARD,
-    Plan,
+    EffectsPlan,
     decide,
     measure,
     plan_effects,
@@ -73,7 +73,7 @@ def synthetic(*, exposure=0.0, place=0.0, zoom=1.0, shine=0.0, seed=0):
         seen.append(inside)
     seen, xy = np.stack(seen, 1), np.stack(xy, 1)  # [POINTS, VIEWS]
     offsets = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
-    points = Points(
+    points = SparsePoints(
         xyz, (rgb * 255).astype(np.uint8), np.zeros(POINTS), offsets,
         np.nonzero(seen)[1].astype(np.int32), xy[seen].astype(np.float32),
     )  # fmt: skip
@@ -149,7 +149,7 @@ def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
         views.append(dataclasses.replace(view, camera=camera))
         xyz.append(view.camera.center + 10.0 * camera.cam_from_world[2, :3] + np.eye(3)[[0, 1, 2, 0, 1]])
     count = len(views) * 5
-    points = Points(
+    points = SparsePoints(
         np.concatenate(xyz), np.zeros((count, 3), np.uint8), np.zeros(count), np.arange(count + 1),
         np.repeat(np.arange(len(views)), 5).astype(np.int32), np.zeros((count, 2), np.float32),
     )  # fmt: skip
@@ -303,7 +303,7 @@ SHORT = TrainConfig(iterations=40, probes=0)
 
 def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
     (none,) = plan_cells(["refinesplat"], [tiny], [0], SHORT)
-    (auto,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="auto", plan=Plan("scene", ()))
+    (auto,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="auto", plan=EffectsPlan("scene", ()))
     (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
     assert none.identity == auto.identity != listed.identity
     assert none.config == auto.config
@@ -311,7 +311,7 @@ def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
 
 def test_a_plan_of_another_state_of_the_scene_is_refused(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene")
-    plan = Plan("scene", (), scene_hash=scene_identity(load_scene(scene)))
+    plan = EffectsPlan("scene", (), scene_hash=scene_identity(load_scene(scene)))
     write_json(tmp_path / "plan.json", plan.plain())
     given = {"effects": "auto", "plan": read_plan(tmp_path / "plan.json")}
     assert plan_cells(["3dgs"], [scene], [0], SHORT, **given)
@@ -321,7 +321,7 @@ def test_a_plan_of_another_state_of_the_scene_is_refused(tmp_path):
 
 
 def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_path):
-    plan = Plan("scene", decide("scene", measured(zoom=3.0)).decisions)
+    plan = EffectsPlan("scene", decide("scene", measured(zoom=3.0)).decisions)
     cells = plan_cells(["3dgs"], [tiny], [0], SHORT, effects="auto", plan=plan, protocol="half")
     (report,) = run_cells(cells, tmp_path, RunOptions(tmp_path / ".cache", pictures=False))
     assert report.outcome == "trained", report.error

@@ -18,7 +18,7 @@ from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from tests.tiny_scene import write_tiny_scene
 
 
@@ -30,7 +30,7 @@ class Poison(MaskPolicy):
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "registered", {})
-    register(MethodEntry("poison", "a NaN at iteration 9", lambda options: Parts(mask=Poison())))
+    register(MethodEntry("poison", "a NaN at iteration 9", lambda options: MethodHooks(mask=Poison())))
     scene = write_tiny_scene(tmp_path / "scene")
 
     def go(action, method="poison"):
@@ -84,7 +84,7 @@ def test_a_parameter_found_before_saving_is_found_again(run):
                 gaussians.log_scales[3, 1] = math.nan  # no step comes after that would meet it
             return gaussians, events
 
-    register(MethodEntry("late", "a NaN in a parameter", lambda options: Parts(density=Late)))
+    register(MethodEntry("late", "a NaN in a parameter", lambda options: MethodHooks(density=Late)))
     folder, report = run("stop", "late")
     assert report.outcome == "failed"
     assert "parameter of log_scales" in report.error

@@ -22,7 +22,7 @@ from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.image import flip, psnr, psnr_affine
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 SHORT = TrainConfig(iterations=60, probes=2)
@@ -46,7 +46,7 @@ def explode(options):
 @pytest.fixture(autouse=True)
 def _methods(monkeypatch):
     monkeypatch.setattr(registry, "registered", {})
-    register(MethodEntry("truth", "exact masks", lambda options: Parts(mask=TruthMask())))
+    register(MethodEntry("truth", "exact masks", lambda options: MethodHooks(mask=TruthMask())))
     register(MethodEntry("broken", "fails", explode))
 
 
@@ -63,7 +63,7 @@ class NothingKept(MaskPolicy):
 
 
 def no_masks(root):
-    register(MethodEntry("nothing-kept", "masks all", lambda options: Parts(mask=NothingKept())))
+    register(MethodEntry("nothing-kept", "masks all", lambda options: MethodHooks(mask=NothingKept())))
     return "nothing-kept"
 
 
@@ -262,7 +262,7 @@ def test_a_changed_file_is_named_and_trained_again_alone(scene, tmp_path):
 
 def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_path, monkeypatch):
     bench(scene, tmp_path, "broken")
-    register(MethodEntry("broken", "mended", lambda options: Parts()))
+    register(MethodEntry("broken", "mended", lambda options: MethodHooks()))
     (cell,), (report,) = bench(scene, tmp_path, "broken")
     assert report.outcome == "trained"
     names = {p.name for p in cell_folder(tmp_path, cell).iterdir()}
@@ -271,7 +271,7 @@ def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_pa
 
 def test_a_failure_before_the_first_checkpoint_does_not_block_another_configuration(scene, tmp_path):
     bench(scene, tmp_path, "broken")
-    register(MethodEntry("broken", "mended", lambda options: Parts()))
+    register(MethodEntry("broken", "mended", lambda options: MethodHooks()))
     other = dataclasses.replace(SHORT, iterations=61)
     assert bench(scene, tmp_path, "broken", train=other)[1][0].outcome == "trained"
 

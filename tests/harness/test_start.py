@@ -22,7 +22,7 @@ from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.report.notes import unequal
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import START_SHARE, Parts
+from ambiguous_wild.splat.parts import START_SHARE, MethodHooks
 from ambiguous_wild.viewing.model import Renderer, RenderSettings
 from tests.io.test_place import UTM, moved
 from tests.viewing.wall_runs import wall_model
@@ -88,11 +88,11 @@ def test_a_start_is_in_the_coordinates_of_the_files(tmp_path, kind, shift, scale
     arrays = {**wall, "means": inner.astype(np.float32), "log_scales": sizes}
     if kind == "points":
         write_point_ply(path, true, np.zeros((2500, 3), np.uint8))
-        xyz, _ = started(Parts(), start_file(path), scene).given
+        xyz, _ = started(MethodHooks(), start_file(path), scene).given
         np.testing.assert_allclose(xyz, inner, atol=1e-3)
         return
     (write_splat_ply if kind == "ply" else write_spz)(path, arrays, place=scene.place)
-    parts = started(Parts(sh_degree=2), start_file(path), scene)
+    parts = started(MethodHooks(sh_degree=2), start_file(path), scene)
     found = parts.first_gaussians(type("Data", (), {"device": "cpu"})())
     assert isinstance(found, Gaussians) and found.sh_rest.shape == (2500, 8, 3)
     camera = scene.test[0].camera
@@ -111,7 +111,7 @@ def test_a_start_travels_with_its_cell_and_a_file_that_changed_is_refused(scene,
     assert f"--start {dense}" in reproduce(cell)
     wall_points(dense, 901)
     with pytest.raises(AwError, match="has changed since"):
-        started(Parts(), cell.start, cell.scene)
+        started(MethodHooks(), cell.start, cell.scene)
 
 
 def test_what_a_run_cannot_start_from_is_refused_before_anything_is_made(scene, tmp_path):

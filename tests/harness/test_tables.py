@@ -26,7 +26,7 @@ from ambiguous_wild.report.plain_formats import (
     to_text,
     to_wide_csv,
 )
-from ambiguous_wild.report.table import Cell, Table
+from ambiguous_wild.report.table import Table, TableCell
 from ambiguous_wild.report.typeset import to_html as html_of
 from ambiguous_wild.report.typeset import to_latex as latex_of
 from tests.harness.fake_runs import failed, fake_result, save, start
@@ -34,7 +34,7 @@ from tests.harness.fake_runs import failed, fake_result, save, start
 HOSTILE = '<script>|\\input{x}$&%#_^~"*`[a](http://b)\x1b[31m\u202e'
 
 
-def cell(tables: list[Table], method: str, key: str, which: int = 0) -> Cell:
+def cell(tables: list[Table], method: str, key: str, which: int = 0) -> TableCell:
     row = next(r for r in tables[which].rows if r.name == method)
     return row.cells[keys(tables).index(key)]
 

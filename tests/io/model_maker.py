@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.io.colmap_model import write_model
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, ModelPoints
 from ambiguous_wild.io.images import write_png
 
 WIDTH, HEIGHT, FX, FY = 64, 48, 60.0, 62.0
 
 
-def make_model(names: list[str], points: int = 20, seed: int = 0, camera: str = "PINHOLE") -> Model:
+def make_model(names: list[str], points: int = 20, seed: int = 0, camera: str = "PINHOLE") -> ColmapModel:
     rng = np.random.default_rng(seed)
     xyz = np.column_stack(
         [rng.uniform(-1, 1, points), rng.uniform(-0.5, 0.5, points), rng.uniform(4, 6, points)]
@@ -33,12 +33,12 @@ def make_model(names: list[str], points: int = 20, seed: int = 0, camera: str = 
     flat = np.array([pair for t in tracks for pair in t], dtype=np.int64).reshape(-1, 2)
     rgb = rng.integers(0, 256, (points, 3), dtype=np.uint8)
     ids = np.arange(points, dtype=np.int64) + 100
-    return Model(
+    return ColmapModel(
         cameras, images, ModelPoints(ids, xyz, rgb, rng.random(points), offsets, flat[:, 0], flat[:, 1])
     )
 
 
-def write_text(folder: Path, model: Model) -> None:
+def write_text(folder: Path, model: ColmapModel) -> None:
     folder.mkdir(parents=True)
 
     def line(*values) -> str:
@@ -59,7 +59,7 @@ def write_text(folder: Path, model: Model) -> None:
     (folder / "points3D.txt").write_text("".join(rows))
 
 
-def write_scene(root: Path, names: list[str], factor: int = 2, **kwargs) -> Model:
+def write_scene(root: Path, names: list[str], factor: int = 2, **kwargs) -> ColmapModel:
     """A plain COLMAP scene: images/, images_<factor>/, sparse/0; no lists, no scene.json."""
     model = make_model(names, **kwargs)
     write_model(root / "sparse" / "0", model)

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambiguous_wild.core import Camera, Place
+from ambiguous_wild.core import Camera, SceneTransform
 from ambiguous_wild.core.scene import unlikely
 from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.datasets.points import random_points
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.ply import read_place, read_point_ply, read_splat_ply, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.viewing.model import FORMATS, Model, Renderer, export, space_of
+from ambiguous_wild.viewing.model import FORMATS, Renderer, ViewedModel, export, space_of
 from ambiguous_wild.viewing.page_file import page_text
 from ambiguous_wild.viewing.video import from_file, orbit, through_views
 from tests.tiny_scene import write_tiny_scene
@@ -44,13 +44,13 @@ def moved(root: Path, shift: np.ndarray, scale: float) -> Path:
     return root
 
 
-def world(gaussians: dict[str, np.ndarray], place: Place) -> np.ndarray:
+def world(gaussians: dict[str, np.ndarray], place: SceneTransform) -> np.ndarray:
     return gaussians["means"].astype(np.float64) / place.scale + place.centre
 
 
 def test_an_ordinary_scene_is_not_touched(tmp_path: Path) -> None:
     scene = load_scene(write_tiny_scene(tmp_path / "s"))
-    assert scene.place == Place() and np.array_equal(scene.train[1].camera.center, [0.25, 0, 0])
+    assert scene.place == SceneTransform() and np.array_equal(scene.train[1].camera.center, [0.25, 0, 0])
     write_splat_ply(tmp_path / "m.ply", wall_model(3), scene.place)
     assert b"comment" not in (tmp_path / "m.ply").read_bytes()
 
@@ -76,7 +76,7 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
     ply = tmp_path / "m.ply"
     write_splat_ply(ply, inner, scene.place)
     assert read_place(ply) == scene.place
-    model = Model("m", ply)
+    model = ViewedModel("m", ply)
     before = Renderer(wall, model.render_settings)(plain.test[0].camera).astype(int)
     after = Renderer(model.read(), model.render_settings)(scene.test[0].camera).astype(int)
     assert before.std() > 10 and np.abs(before - after).mean() < 0.5
@@ -90,15 +90,15 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
             data = made.path.read_bytes()
             node = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["nodes"][0]
             x, y, z = node.get("translation", [0, 0, 0])
-            place = Place((-x, -y, z))
+            place = SceneTransform((-x, -y, z))
         elif made.format == "spz":
             data = made.path.read_bytes()
             told = json.loads(data[10 : data.index(b"\0", 10)])
-            place = Place(tuple(told["offset"]), told["scale"])
+            place = SceneTransform(tuple(told["offset"]), told["scale"])
             assert len(gzip.decompress(data)) > 1000
         elif made.format == "sog":
             told = json.loads(zipfile.ZipFile(made.path).read("meta.json"))["asset"]
-            place = Place(tuple(told.get("offset", (0, 0, 0))), told.get("scale", 1.0))
+            place = SceneTransform(tuple(told.get("offset", (0, 0, 0))), told.get("scale", 1.0))
         elif any(scene.place.centre):
             x, y, z = scene.place.centre
             assert f"comment offset {x!r} {y!r} {z!r}\n".encode() in made.path.read_bytes()
@@ -127,12 +127,12 @@ def test_the_page_says_what_sizes_cost_that_its_format_does_not_hold(tmp_path: P
     scene = load_scene(write_tiny_scene(tmp_path / "s"))
     wall = wall_model(500)
     write_splat_ply(tmp_path / "held.ply", wall)
-    assert "dB to the model" not in page_text(scene, [Model("m", tmp_path / "held.ply")], title="t")[0]
+    assert "dB to the model" not in page_text(scene, [ViewedModel("m", tmp_path / "held.ply")], title="t")[0]
     wall["means"] = np.float32(1e4) * wall["means"]
     wall["log_scales"] = wall["log_scales"] + np.float32(np.log(1e4))
     write_splat_ply(tmp_path / "large.ply", wall)
     (note,) = re.findall(
-        r'"notes": ?\["([^"]*)"\]', page_text(scene, [Model("m", tmp_path / "large.ply")], title="t")[0]
+        r'"notes": ?\["([^"]*)"\]', page_text(scene, [ViewedModel("m", tmp_path / "large.ply")], title="t")[0]
     )
     assert "dB to the model" in note and "gltf" in note
 
@@ -167,7 +167,7 @@ def test_one_camera_far_away_is_named_and_changes_no_size(tmp_path: Path, side: 
     scene = load_scene(tmp_path / "far")
     named = [w for w in scene.info["warnings"] if "far from all others" in w]
     assert len(named) == (side == "train") and all(name in w for w in named)
-    assert scene.place == Place() and scene.extent == pytest.approx(usual.extent, rel=0.3)
+    assert scene.place == SceneTransform() and scene.extent == pytest.approx(usual.extent, rel=0.3)
     assert space_of(scene).distance == pytest.approx(space_of(usual).distance, rel=0.2)
     model_there = read_model(tmp_path / "far" / "sparse" / "0")
     random = random_points(model_there, {v.name: v.split for v in scene.views}, blender=False)
@@ -179,7 +179,7 @@ def test_one_camera_far_away_is_named_and_changes_no_size(tmp_path: Path, side: 
 
 
 def test_damaged_places_are_refused(tmp_path: Path) -> None:
-    write_splat_ply(tmp_path / "m.ply", wall_model(3), Place((1.0, 2.0, 3.0), 2.0))
+    write_splat_ply(tmp_path / "m.ply", wall_model(3), SceneTransform((1.0, 2.0, 3.0), 2.0))
     data = (tmp_path / "m.ply").read_bytes()
     for bad in (b"training_scale nan", b"training_scale 0.0", b"training_scale x"):
         (tmp_path / "b.ply").write_bytes(data.replace(b"training_scale 2.0", bad))
@@ -191,4 +191,4 @@ def test_a_camera_moves_with_its_scene() -> None:
     pose = np.eye(4)
     pose[:3, 3] = [-10.0, 0, 0]
     camera = Camera(10, 10, 5, 5, 5, 5, pose)
-    np.testing.assert_allclose(Place((8.0, 0, 0), 4.0).inside(camera).center, [8.0, 0, 0])
+    np.testing.assert_allclose(SceneTransform((8.0, 0, 0), 4.0).inside(camera).center, [8.0, 0, 0])

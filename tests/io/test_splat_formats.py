@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambiguous_wild.core import AwError, Place
+from ambiguous_wild.core import AwError, SceneTransform
 from ambiguous_wild.io import compressed_ply, gltf, sog, spz
 from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
 from ambiguous_wild.io.splat_arrays import SH_C0, finite
@@ -132,7 +132,7 @@ def test_other_versions_of_spz_are_read(tmp_path: Path, version: int, rest: int)
     limits = list(OURS["spz"])
     limits[1] = 6e-3 if version == 2 else limits[1]  # w follows from 8 bits of x, y, z
     check_near(splats.gaussians, given, tuple(limits))
-    assert splats.antialias and splats.place == Place()
+    assert splats.antialias and splats.place == SceneTransform()
     for cut in (20, 40, path.stat().st_size // 2):
         (tmp_path / "cut.spz").write_bytes(path.read_bytes()[:cut])
         with pytest.raises(AwError, match="cut"):
@@ -157,7 +157,7 @@ def test_a_compressed_ply_without_bounds_of_colours_is_read(tmp_path: Path) -> N
 def test_any_format_is_told_by_its_bytes_and_has_its_place(tmp_path: Path, ending: str) -> None:
     given, path = model(90), tmp_path / "renamed.bin"
     given["means"][3] = np.nan
-    place = Place((5e5, -4e6, 3.0), 0.25, (0.5, 0.5, -0.5, 0.5))
+    place = SceneTransform((5e5, -4e6, 3.0), 0.25, (0.5, 0.5, -0.5, 0.5))
     write = {"ply": lambda *a, **k: write_splat_ply(*a, **k)} | WRITE
     write[ending](path, given, place=place)
     splats = read_splats(path)

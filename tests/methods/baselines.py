@@ -13,7 +13,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import TRAIN
@@ -23,18 +23,20 @@ def data_of(scene: Path, cache: Path, seed: int = 0) -> TrainData:
     return load_train_data(load_scene(scene), device=torch.device("cpu"), seed=seed, cache_dir=cache)
 
 
-def parts_of(method: str, **options: str) -> Parts:
+def parts_of(method: str, **options: str) -> MethodHooks:
     entry = get_method(method)
     return entry.build(with_options(entry.options(), options))
 
 
-def trainer_of(scene: Path, folder: Path, parts: Parts, iterations: int = 120, seed: int = 0) -> Trainer:
+def trainer_of(
+    scene: Path, folder: Path, parts: MethodHooks, iterations: int = 120, seed: int = 0
+) -> Trainer:
     data = data_of(scene, folder.parent / "cache", seed)
     config = TrainConfig(iterations=iterations, seed=seed, probes=0, checkpoint_every_s=1e9, torch_threads=1)
     return Trainer(data, parts, config, folder=folder)
 
 
-def trained(scene: Path, folder: Path, parts: Parts, iterations: int = 120, seed: int = 0) -> Trainer:
+def trained(scene: Path, folder: Path, parts: MethodHooks, iterations: int = 120, seed: int = 0) -> Trainer:
     trainer = trainer_of(scene, folder, parts, iterations, seed)
     trainer.train()
     return trainer

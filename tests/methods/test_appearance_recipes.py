@@ -24,7 +24,7 @@ from ambiguous_wild.splat.effects.placing import (
     with_penalty,
 )
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.step import Shot
+from ambiguous_wild.splat.step import ViewContext
 from tests.methods.baselines import data_of, parts_of, step_of, trainer_of
 from tests.splat.scenes import camera, gaussians
 
@@ -122,7 +122,7 @@ def test_a_map_is_sampled_between_its_cells():
 
 def shot_of(data, view=0, **changes):
     known = {"iteration": 1, "nominal": 10.0, "view": view, "camera": data.cameras[view or 0]}
-    return Shot(**{**known, "photo": data.photos[view or 0], **changes})
+    return ViewContext(**{**known, "photo": data.photos[view or 0], **changes})
 
 
 def visible_of(effect, n=5):
@@ -225,7 +225,7 @@ def test_a_test_photo_shows_its_left_half_and_nothing_is_fitted(gsw):
     photo = data.photos[0]
     seen = effect._seen(shot_of(data, view=0, fitting=True))
     assert torch.equal(seen, photo[:, :32])
-    assert effect._seen(Shot(iteration=1, nominal=1, view=None, camera=data.cameras[0])) is None
+    assert effect._seen(ViewContext(iteration=1, nominal=1, view=None, camera=data.cameras[0])) is None
 
 
 def test_masks_settle_where_residual_and_prior_balance(gsw):

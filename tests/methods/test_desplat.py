@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.methods.desplat import DeSplatConfig, Layers
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.rendered import Cotangents, Frame
-from ambiguous_wild.splat.step import Shot
+from ambiguous_wild.splat.step import ViewContext
 from tests.methods.baselines import data_of, parts_of, trained, trainer_of
 
 
@@ -22,7 +22,7 @@ def starts(scene, tmp_path_factory):
 
 
 def shot(view=0, iteration=300):
-    return Shot(iteration=iteration, nominal=1.0, view=view, camera=SimpleNamespace())
+    return ViewContext(iteration=iteration, nominal=1.0, view=view, camera=SimpleNamespace())
 
 
 def frame(value, alpha):

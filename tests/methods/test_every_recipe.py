@@ -8,7 +8,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.uad import UncertaintyAware
 from ambiguous_wild.splat.effects import chain
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from tests.host_reads import moved, no_transfers
 from tests.methods.baselines import parts_of, same, trained, trainer_of
@@ -185,7 +185,7 @@ def test_masks_that_read_an_effect_are_not_grafted_without_it(scene, tmp_path, m
         parts_of(f"3dgs@mask={method}")
     # and where parts are put together by hand
     with pytest.raises(AwError, match=f"masks of {method} need its effects"):
-        trainer_of(scene, tmp_path, Parts(mask=parts_of(method).mask))
+        trainer_of(scene, tmp_path, MethodHooks(mask=parts_of(method).mask))
 
 
 @pytest.mark.parametrize("method", sorted(entry.name for entry in BUILTIN))

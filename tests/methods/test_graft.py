@@ -23,7 +23,7 @@ from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.colour import AffineExposure
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from tests.methods.baselines import bits, parts_of, trained
 
 TRUE_3DGS = "3dgs@mask=truth"
@@ -138,7 +138,7 @@ def toned(monkeypatch):
             return None
 
     def build(options):
-        return Parts(mask=Toned(RobustSplatConfig()), effects=(AffineExposure(),))
+        return MethodHooks(mask=Toned(RobustSplatConfig()), effects=(AffineExposure(),))
 
     return register(MethodEntry("toned", "", build))
 
@@ -179,7 +179,7 @@ def test_the_effects_of_a_donor_are_taken_where_they_are_asked_for(toned, recwar
 
 def test_effects_that_are_taken_change_what_they_need_of_the_renderer(monkeypatch):
     monkeypatch.setattr(registry, "registered", {})
-    register(MethodEntry("filtered", "", lambda options: with_effects(Parts(), ["antialias"])))
+    register(MethodEntry("filtered", "", lambda options: with_effects(MethodHooks(), ["antialias"])))
     assert not parts_of("3dgs").antialias
     parts = parts_of("3dgs@effects=filtered")
     assert parts.antialias and [effect.name for effect in parts.effects] == ["antialias"]
@@ -188,7 +188,7 @@ def test_effects_that_are_taken_change_what_they_need_of_the_renderer(monkeypatc
 def test_a_graft_trains_with_the_effects_it_takes(toned, scene, tmp_path):
     trainer = trained(scene, tmp_path / "run", parts_of("3dgs@effects=toned"), 8)
     assert "exposure" in trainer.effects.facts()
-    assert bits(trainer) != bits(trained(scene, tmp_path / "plain", Parts(), 8))
+    assert bits(trainer) != bits(trained(scene, tmp_path / "plain", MethodHooks(), 8))
 
 
 # -- runs ---------------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ def test_a_methods_own_mask_changes_no_bit(scene, tmp_path):
     assert bits(trained(scene, tmp_path / "density", parts_of(name, **both), 60)) == bits(own)
     # and where it is a second instance of its own, which knows nothing of the host's
     parts = parts_of("robustsplat", **options)
-    second = Parts(**{**vars(parts), "mask": GraftedPolicy(RobustSplatMask(parts.mask.config), None)})
+    second = MethodHooks(**{**vars(parts), "mask": GraftedPolicy(RobustSplatMask(parts.mask.config), None)})
     assert bits(trained(scene, tmp_path / "second", second, 60)) == bits(own)
 
 

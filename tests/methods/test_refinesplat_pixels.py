@@ -10,7 +10,7 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps
 from ambiguous_wild.methods.refinesplat.maps import Ranks, agree, agreement_weight, common_offset
-from ambiguous_wild.methods.refinesplat.masks import Labels, Masks, make_masks
+from ambiguous_wild.methods.refinesplat.masks import Labels, PhotoMasks, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import (
     MultiViewConfig,
     MultiViewEvidence,
@@ -61,7 +61,7 @@ def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
     )
 
 
-def masks_of(values, labels, config, ceiling=None, unseen=None) -> Masks:
+def masks_of(values, labels, config, ceiling=None, unseen=None) -> PhotoMasks:
     """Of one photo whose evidence is `values`, judged alone."""
     count = int(labels.max())
     known = Labels([labels], [np.zeros(count, bool)], [unseen], "cpu")

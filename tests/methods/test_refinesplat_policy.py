@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.core import Camera, Points, Scene, View
+from ambiguous_wild.core import Camera, Scene, SparsePoints, View
 from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
@@ -74,7 +74,7 @@ def make_data(tmp_path: Path, photos: list[np.ndarray], truths: list[np.ndarray]
                 xy.append((x - 12 * view + 0.5, y + 0.5))
             offsets.append(len(rows))
     n = len(offsets) - 1
-    points = Points(
+    points = SparsePoints(
         xyz=np.random.default_rng(0).random((n, 3)),
         rgb=np.zeros((n, 3), np.uint8),
         error_px=np.zeros(n),
@@ -180,7 +180,7 @@ def sparse_wall(scene) -> TrainData:
         pose[0, 3] = -0.48 * view  # 12 px at a depth of 4
     cameras = [dataclasses.replace(c, cam_from_world=p) for c, p in zip(data.cameras, poses)]
     x, y = np.meshgrid(np.linspace(-4, 6, 40), np.linspace(-2, 2, 16))
-    points = Points(
+    points = SparsePoints(
         xyz=np.stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)], 1),
         rgb=np.zeros((x.size, 3), np.uint8),
         error_px=np.zeros(x.size),

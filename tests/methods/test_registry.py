@@ -6,7 +6,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods import MethodEntry, all_methods, get_method, load_plugin, register, registry
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 
 
 @pytest.fixture(autouse=True)
@@ -71,10 +71,10 @@ def test_a_plugin_that_does_not_load_is_one_line_that_names_the_place(tmp_path, 
 
 
 def test_a_recipe_without_options_may_take_nothing():
-    for recipe in (lambda: Parts(sh_degree=2), lambda *any: Parts(sh_degree=2 + len(any))):
+    for recipe in (lambda: MethodHooks(sh_degree=2), lambda *any: MethodHooks(sh_degree=2 + len(any))):
         assert MethodEntry("none", "", recipe).build(NoOptions()).sh_degree == 2
     with pytest.raises(AwError, match="the recipe of two takes a, b: it must take nothing, or one"):
-        MethodEntry("two", "", lambda a, b: Parts()).build(None)
+        MethodEntry("two", "", lambda a, b: MethodHooks()).build(None)
 
 
 def test_a_changed_plugin_is_another_configuration(tmp_path):

@@ -11,7 +11,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.forestsplats import fill
 from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
 from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary, kept
-from ambiguous_wild.methods.t3dgs import Head, divergence, inverse_depth, likelihood_loss, variation
+from ambiguous_wild.methods.t3dgs import TwoErrorHead, divergence, inverse_depth, likelihood_loss, variation
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.losses import photometric
@@ -246,13 +246,13 @@ def test_the_divergence_by_hand():
 
 
 def test_the_head_gives_deviations_and_a_correlation():
-    head = Head(27, 1, seed=0)
+    head = TwoErrorHead(27, 1, seed=0)
     widths = [27, 9, 4, 2]
     assert [c.out_channels for c in head.convs] == [27, 9, 9, 4, 4, 2] and head.last.in_channels == widths[3]
     found = head(torch.randn(2, 12, 16, 27, generator=torch.Generator().manual_seed(0)), 47, 63)
     assert found.shape == (2, 3, 47, 63)
     assert found[:, :2].min() > 0 and found[:, 2].abs().max() < 1
-    again = Head(27, 1, seed=0)
+    again = TwoErrorHead(27, 1, seed=0)
     assert all(torch.equal(a, b) for a, b in zip(head.parameters(), again.parameters()))
 
 

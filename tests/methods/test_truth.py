@@ -13,7 +13,7 @@ from scipy import ndimage
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.truth import TruthConfig, TruthMask, clean_data, keep_outside
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from tests.methods.baselines import bits, data_of, parts_of, step_of, trained
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
@@ -53,8 +53,8 @@ def test_dilation_grows_every_side(dilation):
 def test_clean_photos_give_what_the_clean_scene_gives(scenes, tmp_path):
     dirty, clean = scenes
     reference = trained(dirty, tmp_path / "a" / "run", parts_of("3dgs-clean"), 60)
-    assert bits(reference) == bits(trained(clean, tmp_path / "b" / "run", Parts(), 60))
-    assert bits(reference) != bits(trained(dirty, tmp_path / "c" / "run", Parts(), 60))
+    assert bits(reference) == bits(trained(clean, tmp_path / "b" / "run", MethodHooks(), 60))
+    assert bits(reference) != bits(trained(dirty, tmp_path / "c" / "run", MethodHooks(), 60))
 
 
 def test_a_users_masks_are_not_laid_over_clean_photos(scenes, tmp_path):

@@ -9,7 +9,7 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.wildgaussians import (
     GAUSSIAN,
     PHOTO,
-    Head,
+    UncertaintyHead,
     WildAppearance,
     WildGaussiansConfig,
     fourier,
@@ -18,7 +18,7 @@ from ambiguous_wild.methods.wildgaussians import (
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects.learnt import Visible
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.step import Shot
+from ambiguous_wild.splat.step import ViewContext
 from ambiguous_wild.splat.trainer import Trainer
 from tests.methods.baselines import masked_more_inside, parts_of, trainer_of
 from tests.splat.scenes import camera
@@ -48,7 +48,7 @@ def test_the_formula_by_hand():
         "net_weight2": torch.tensor([[1.0, 0.0, 0.0, 0.0, 1.0, 0.0]]), "net_bias2": torch.zeros(6),
     }  # fmt: skip
     hidden = 2.0 * (1.2 + 24 * 0.1 + 32 * 0.2 + 0.5) - 1.0  # both layers are positive
-    shot = Shot(iteration=1, nominal=0, view=0, camera=camera())
+    shot = ViewContext(iteration=1, nominal=0, view=0, camera=camera())
     found = effect.forward(Visible(base, torch.zeros(1, 3), {"wild_embedding": code}), leaf, shot)
     # offset on red, gain on green, blue as it was
     expected = torch.tensor([[0.2 + 0.5 * hidden, (1 + 0.5 * hidden) * 0.4, 0.6]])
@@ -81,7 +81,7 @@ def test_the_uncertainty_is_least_lossy_where_its_square_is_twice_the_distance()
 
 def test_the_head_starts_near_one_and_is_never_below_a_tenth():
     features = torch.randn(6, 8, 20, generator=torch.Generator().manual_seed(0)) * 3.0 + 5.0
-    head = Head([features], seed=0)
+    head = UncertaintyHead([features], seed=0)
     sigma = head(features, 12, 16).detach()
     assert sigma.shape == (12, 16) and (sigma - 1.0).abs().max() < 0.15
     with torch.no_grad():

@@ -11,9 +11,9 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.metrics import semantic as sem
 
 
-def regions(*means: list[float], pixels: int = 10) -> sem.Regions:
-    return sem.Regions(np.arange(1, len(means) + 1), np.array(means, float) if means else np.zeros((0, 2)),
-                       np.full(len(means), float(pixels)))  # fmt: skip
+def regions(*means: list[float], pixels: int = 10) -> sem.RegionFeatures:
+    table = np.array(means, float) if means else np.zeros((0, 2))
+    return sem.RegionFeatures(np.arange(1, len(means) + 1), table, np.full(len(means), float(pixels)))
 
 
 def test_region_means_equal_a_loop() -> None:
@@ -73,7 +73,7 @@ def test_anchors_are_the_means_over_other_photos() -> None:
     got = sem.anchors(statics)
     assert got.same == pytest.approx(np.mean(best)) and got.different == pytest.approx(np.mean(every))
     assert got.calibrated(got.same) == pytest.approx(1) and got.calibrated(got.different) == pytest.approx(0)
-    few = [sem.Regions(s.labels[:1], s.means[:1], s.pixels[:1]) for s in statics]
+    few = [sem.RegionFeatures(s.labels[:1], s.means[:1], s.pixels[:1]) for s in statics]
     named = sem.anchors(few, statics)
     units = [[m / np.linalg.norm(m) for m in s.means] for s in statics]
     assert named.same == sem.anchors(few).same

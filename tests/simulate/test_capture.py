@@ -17,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate import world as world_module
-from ambiguous_wild.simulate.distractors import Placement, shapes_of
+from ambiguous_wild.simulate.distractors import DistractorPose, shapes_of
 from ambiguous_wild.simulate.presets import PRESETS, preset, resized
 from ambiguous_wild.simulate.spec import PLANS
 
@@ -237,7 +237,7 @@ def test_a_preset_is_found_by_name_and_resized_within_limits() -> None:
 
 def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
     red = next(d for d in PRESETS["courtyard-plain"].distractors if d.kind == "visitor")
-    shapes = shapes_of(red, Placement(0, 0.0, 0.0, 0.0, 0.5), PLANS["courtyard"])
+    shapes = shapes_of(red, DistractorPose(0, 0.0, 0.0, 0.0, 0.5), PLANS["courtyard"])
     assert all(s.tint[1] < 0.1 * s.tint[0] for s in shapes if s.texture == red.texture)
     heads = [s.tint for s in shapes if s.texture == "skin"]
     assert heads and all(t == (1.0, 1.0, 1.0) for t in heads)
@@ -245,7 +245,7 @@ def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
 
 def test_size_and_lift_move_a_ball_off_the_ground() -> None:
     ball = replace(PRESETS["courtyard-plain"].distractors[1], size=0.25, lift_m=2.0)
-    (shape,) = shapes_of(ball, Placement(1, 0.5, -1.0, 0.0, 0.5), PLANS["courtyard"])
+    (shape,) = shapes_of(ball, DistractorPose(1, 0.5, -1.0, 0.0, 0.5), PLANS["courtyard"])
     assert shape.center == pytest.approx((0.5, -1.0, 1.0 + 0.1)) and shape.half == pytest.approx((0.1,) * 3)
     assert shape.owner == 2
 

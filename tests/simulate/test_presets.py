@@ -12,7 +12,7 @@ from scipy import ndimage
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture
 from ambiguous_wild.simulate.capture import look_at
-from ambiguous_wild.simulate.distractors import Placement, movers
+from ambiguous_wild.simulate.distractors import DistractorPose, movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import CaptureSpec, Distractor
 from ambiguous_wild.simulate.tracer import trace
@@ -73,7 +73,7 @@ def only(distractor: Distractor) -> tuple[np.ndarray, float]:
     spec = replace(spec, distractors=(distractor,))
     eye, f = np.array([0.0, -4.5, 1.2]), 400.0
     camera = Camera(560, 560, f, f, 280.0, 280.0, look_at(eye, np.array([0.0, -2.0, 1.2]), 0.0))
-    here = movers(spec, (Placement(0, 0.0, -2.0, 0.0, 0.4),), world)
+    here = movers(spec, (DistractorPose(0, 0.0, -2.0, 0.0, 0.4),), world)
     return trace(camera, world.table(), here, world.atlas, world.light).owner > 0, f / 2.5
 
 

@@ -8,7 +8,7 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.trainer import Trainer
 
@@ -70,7 +70,7 @@ def trainer_for(scene, folder, *, parts=None, probe=None, change=None, **config)
     data = load_train_data(scene, device=torch.device("cpu"), seed=config.get("seed", 0), cache_dir=folder)
     data = data if change is None else change(data)
     config = TrainConfig(**{"iterations": 60, "probes": 0} | config)
-    return Trainer(data, parts or Parts(), config, folder=folder, probe=probe)
+    return Trainer(data, parts or MethodHooks(), config, folder=folder, probe=probe)
 
 
 def trained(scene, folder, **kw) -> Trainer:

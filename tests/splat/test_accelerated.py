@@ -11,11 +11,11 @@ import torch
 from ambiguous_wild.splat import gpu_kernels
 from ambiguous_wild.splat.gpu_kernels import compiled
 from ambiguous_wild.splat.losses import photometric, ssim_map
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.records import SAMPLED, Clock, GpuClock, clock_for
 from ambiguous_wild.splat.reference import photometric_reference, ssim_map_reference
 from ambiguous_wild.splat.rendered import Cotangents
-from ambiguous_wild.splat.watchdog import NonFinite, Sentinel
+from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, NonFinite
 from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import with_points
 
@@ -57,7 +57,7 @@ def test_densification_and_reset_run_there_too(scene, tmp_path, fake):
     from ambiguous_wild.splat.density import DensityConfig
 
     config = DensityConfig(start=0.0, min_every=8, resets=(15_000.0,), min_reset_spacing=1, min_reset_rest=1)
-    parts = Parts(density_config=replace(config, grow_grad=1e-6, max_gaussians=500))
+    parts = MethodHooks(density_config=replace(config, grow_grad=1e-6, max_gaussians=500))
     trainer = trained(scene, tmp_path / "run", parts=parts, iterations=24, probes=0)
     assert len(trainer.gaussians) > 150
     assert trainer.density.last_reset > 0
@@ -102,7 +102,7 @@ class Fickle(MaskPolicy):
 def test_the_step_that_broke_is_made_again_with_its_own_keep_map(scene, tmp_path, fake, where):
     """Whatever the policy would say now: it has learnt since."""
     mask = Fickle(7, where)
-    trainer = trainer_for(scene, tmp_path / "run", parts=Parts(mask=mask), iterations=60, probes=0)
+    trainer = trainer_for(scene, tmp_path / "run", parts=MethodHooks(mask=mask), iterations=60, probes=0)
     trainer.watchdog.every = 12
     said = "loss is" if where == "keep" else "gradient of .*means.*"
     with pytest.raises(NonFinite, match=rf"{said} .* iteration 7, view") as info:
@@ -117,7 +117,7 @@ def test_the_step_that_broke_is_made_again_with_its_own_keep_map(scene, tmp_path
 
 
 def test_what_weighed_the_broken_step_is_kept_whatever_the_sizes_after_it():
-    sentinel, loss = Sentinel(torch.device("cpu"), 3), torch.tensor(0.5)
+    sentinel, loss = DeviceFiniteCheck(torch.device("cpu"), 3), torch.tensor(0.5)
     sound, broken = [torch.ones(2)], [torch.tensor([1.0, math.inf])]
     sentinel.watch(1, 0, loss, sound, torch.full((4, 5), 0.1))
     weights = torch.rand(2, 3), Cotangents(image=torch.rand(2, 3, 3), depth=torch.rand(2, 3))
@@ -137,7 +137,9 @@ def test_what_weighed_the_broken_step_is_kept_whatever_the_sizes_after_it():
 def test_no_host_read_in_the_loop_but_where_it_looks(scene, tmp_path, monkeypatch, mask):
     """On torch's `meta` device reading a value raises, and so does mixing with the host's tensors."""
     with fake_gsplat.installed(monkeypatch):
-        trainer = moved(trainer_for(scene, tmp_path, parts=Parts(mask=mask()), iterations=1000, probes=0))
+        trainer = moved(
+            trainer_for(scene, tmp_path, parts=MethodHooks(mask=mask()), iterations=1000, probes=0)
+        )
         for _ in range(12):  # two epochs: what is copied once, the cameras, is
             trainer.timeline.loss(trainer.step())
         assert trainer.iteration == 12
@@ -150,7 +152,7 @@ def test_no_host_read_in_the_loop_but_where_it_looks(scene, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("bad", [7, 12])
 def test_what_breaks_is_found_later_and_named_as_if_at_once(scene, tmp_path, fake, bad):
-    parts = Parts(mask=Poison([bad]))
+    parts = MethodHooks(mask=Poison([bad]))
     trainer = trainer_for(scene, tmp_path / "run", parts=parts, iterations=60, probes=0)
     trainer.watchdog.every = 15
     view = scene.train[trainer.pace.view(bad)].name
@@ -168,7 +170,7 @@ def test_what_breaks_is_found_later_and_named_as_if_at_once(scene, tmp_path, fak
 
 def test_a_rollback_leaves_the_photo_out_and_goes_on(scene, tmp_path, fake):
     trainer = trainer_for(
-        scene, tmp_path / "run", parts=Parts(mask=Poison([9])), iterations=24, probes=0,
+        scene, tmp_path / "run", parts=MethodHooks(mask=Poison([9])), iterations=24, probes=0,
         on_nonfinite="rollback",
     )  # fmt: skip
     trainer.watchdog.every = 10
@@ -188,7 +190,7 @@ class Nothing(MaskPolicy):
 
 def test_a_photo_that_is_all_masked_moves_nothing_and_is_said(scene, tmp_path, fake):
     mask = Nothing()
-    trainer = trainer_for(scene, tmp_path / "run", parts=Parts(mask=mask), iterations=60, probes=0)
+    trainer = trainer_for(scene, tmp_path / "run", parts=MethodHooks(mask=mask), iterations=60, probes=0)
     moved = {}
     for iteration in range(1, 13):
         before = trainer.gaussians.clone()
@@ -202,7 +204,7 @@ def test_a_photo_that_is_all_masked_moves_nothing_and_is_said(scene, tmp_path, f
     assert moved == {view: view != 2 for view in range(6)}
     assert trainer.skipped_views == [scene.train[2].name]
     trainer.save()
-    again = trainer_for(scene, tmp_path / "run", parts=Parts(mask=Nothing()), iterations=60, probes=0)
+    again = trainer_for(scene, tmp_path / "run", parts=MethodHooks(mask=Nothing()), iterations=60, probes=0)
     again.resume()
     assert again.skipped_views == [scene.train[2].name]
 
@@ -282,7 +284,7 @@ def test_without_a_compiler_the_loss_runs_as_it_stands_and_says_so(monkeypatch):
 
 
 def test_the_sentinel_stays_up_and_counts_what_was_sound():
-    sentinel = Sentinel(torch.device("cpu"), 3)
+    sentinel = DeviceFiniteCheck(torch.device("cpu"), 3)
     sound, broken = [torch.ones(4, 3)], [torch.tensor([1.0, math.inf])]
     loss = torch.tensor(0.5)
     assert sentinel.first_broken() is None

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.splat.cpu.buffers import Pool
+from ambiguous_wild.splat.cpu.buffers import BufferPool
 
-Take = Callable[[Pool], np.ndarray]
+Take = Callable[[BufferPool], np.ndarray]
 TAKES: dict[str, Take] = {
     "take": lambda pool: pool.take("a", (6, 4)),
     "take_rows": lambda pool: pool.take_rows("a", (6, 4))[0],
@@ -40,7 +40,7 @@ def place(array: np.ndarray) -> int:
 @pytest.mark.parametrize("take", TAKES.values(), ids=TAKES)
 @pytest.mark.parametrize("keep", KEPT.values(), ids=KEPT)
 def test_what_is_held_is_not_handed_out_again(take: Take, keep: Callable[[np.ndarray], Any]) -> None:
-    pool = Pool()
+    pool = BufferPool()
     first = take(pool)
     first[:] = 1.0
     at = place(first)
@@ -60,13 +60,13 @@ def test_ownership_does_not_depend_on_reference_counts(take: Take, monkeypatch: 
     count = sys.getrefcount
     # one of the two is the parameter of this function
     monkeypatch.setattr(sys, "getrefcount", lambda thing: count(thing) - 2)
-    pool = Pool()
+    pool = BufferPool()
     first = take(pool)
     assert place(first) != place(take(pool))
 
 
 def test_the_same_memory_serves_needs_of_about_its_size() -> None:
-    pool = Pool()
+    pool = BufferPool()
     first = pool.take("a", (1000, 4), slack=0.25)
     at = place(first)
     assert at % 64 == 0
@@ -83,7 +83,7 @@ def test_the_same_memory_serves_needs_of_about_its_size() -> None:
 
 
 def test_rows_come_back_with_the_mask_of_what_was_written() -> None:
-    pool = Pool()
+    pool = BufferPool()
     rows, dirty = pool.take_rows("a", (5, 2))
     assert not rows.any() and not dirty.any()
     rows[3], dirty[3] = 7.0, True
@@ -94,7 +94,7 @@ def test_rows_come_back_with_the_mask_of_what_was_written() -> None:
 
 
 def test_only_so_many_are_remembered_and_nothing_that_is_held_is_lost() -> None:
-    pool = Pool(keep=2)
+    pool = BufferPool(keep=2)
     held = [pool.take("a", (50,)) for _ in range(5)]
     for number, array in enumerate(held):
         array[:] = number
@@ -107,6 +107,6 @@ def test_only_so_many_are_remembered_and_nothing_that_is_held_is_lost() -> None:
 
 
 def test_nothing_at_all_can_be_asked_for() -> None:
-    pool = Pool()
+    pool = BufferPool()
     assert pool.take("a", (0, 4)).shape == (0, 4)
     assert pool.take_rows("a", (0, 15, 3))[0].shape == (0, 15, 3)

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.core import AwError, Points, Scene, View
+from ambiguous_wild.core import AwError, Scene, SparsePoints, View
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import ALL, EFFECTS, check_effects, dense, with_effects
 from ambiguous_wild.splat.effects.base import Effect, RowAdam
-from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.effects.chain import EffectPipeline
 from ambiguous_wild.splat.effects.colour import AffineExposure, AppearanceEmbedding
 from ambiguous_wild.splat.effects.poses import PoseRefinement
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import START_SHARE, Parts
+from ambiguous_wild.splat.parts import START_SHARE, MethodHooks
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.step import TrainData, ViewContext
 from ambiguous_wild.splat.trainer import Trainer
 from tests.splat.scenes import bits, disturbed
 from tests.splat.scenes import camera as make_camera
@@ -27,7 +27,7 @@ from tests.splat.scenes import trainer_for as trainer_of
 
 
 def trainer_for(scene, folder, names=(), **config) -> Trainer:
-    return trainer_of(scene, folder, parts=with_effects(Parts(), names), **config)
+    return trainer_of(scene, folder, parts=with_effects(MethodHooks(), names), **config)
 
 
 # -- nothing where none is asked ------------------------------------------------------------------
@@ -46,14 +46,14 @@ def test_a_run_without_effects_never_calls_one_and_has_the_same_bits(scene, tmp_
     assert calls == []
     assert not asked.effects.effects and "effects" not in asked.clock.parts_s
     assert bits(asked) == bits(plain)
-    Chain((AffineExposure(),), plain.data)  # the counters do count
+    EffectPipeline((AffineExposure(),), plain.data)  # the counters do count
     assert calls
 
 
 def test_an_effect_that_does_nothing_leaves_the_bits_alone(scene, tmp_path):
     plain = trainer_for(scene, tmp_path / "plain")
     plain.train()
-    idle = trainer_of(scene, tmp_path / "idle", parts=Parts(effects=(Effect(),)))
+    idle = trainer_of(scene, tmp_path / "idle", parts=MethodHooks(effects=(Effect(),)))
     idle.train()
     assert bits(idle) == bits(plain)
 
@@ -67,7 +67,7 @@ def test_only_overridden_hooks_are_called(scene, tmp_path):
 
 
 def test_an_effect_that_the_method_brings_is_applied_once():
-    parts = Parts(effects=(AffineExposure(),))
+    parts = MethodHooks(effects=(AffineExposure(),))
     assert with_effects(parts, ("exposure",)).effects == parts.effects
     assert [e.name for e in with_effects(parts, ("exposure", "poses")).effects] == ["exposure", "poses"]
 
@@ -76,7 +76,7 @@ def test_two_effects_of_one_name_are_refused(scene, tmp_path):
     """A checkpoint holds effects by name: one would replace the other."""
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
     with pytest.raises(AwError, match="effect exposure is listed twice"):
-        Chain((AffineExposure(), AffineExposure()), data)
+        EffectPipeline((AffineExposure(), AffineExposure()), data)
 
 
 def test_names():
@@ -85,7 +85,7 @@ def test_names():
         check_effects(["exposur"])
     with pytest.raises(AwError, match="exclude each other"):
         check_effects(["sh0", "sh2"])
-    parts = Parts()
+    parts = MethodHooks()
     assert with_effects(parts, ()) is parts
     assert with_effects(parts, ("sh1",)).sh_degree == 1 and with_effects(parts, ("sh1",)).effects == ()
     assert with_effects(parts, ("antialias",)).antialias
@@ -110,7 +110,7 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
     # without a limit, the photos' pixels set it in a short run
     pixels = float(np.median([p.shape[0] * p.shape[1] for p in plain.data.photos]))
     free = trainer_for(scene, tmp_path / "free", ("dense",))
-    assert len(free.gaussians.means) <= START_SHARE * Parts().schedule.per_pixel_short * pixels
+    assert len(free.gaussians.means) <= START_SHARE * MethodHooks().schedule.per_pixel_short * pixels
     assert free.pace.most == plain.pace.most
     full = trainer_for(scene, tmp_path / "full", ("dense",), max_gaussians=sparse)
     assert len(full.gaussians.means) == sparse and len(asked) == 2  # no room
@@ -153,8 +153,10 @@ def test_a_checkpoint_of_other_effects_is_refused(scene, tmp_path):
 
 def tiny_data(cameras, points=None):
     xyz = np.random.default_rng(0).normal([0, 0, 3], 1.0, (40, 3)) if points is None else points
-    empty = Points(xyz, np.zeros((len(xyz), 3), np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, int),
-                   np.zeros(0, np.int32), np.zeros((0, 2), np.float32))  # fmt: skip
+    empty = SparsePoints(
+        xyz, np.zeros((len(xyz), 3), np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, int),
+        np.zeros(0, np.int32), np.zeros((0, 2), np.float32),
+    )  # fmt: skip
     views = tuple(View(f"{i}.png", None, c, "train") for i, c in enumerate(cameras))
     photos = [torch.zeros(c.height, c.width, 3) for c in cameras]
     return TrainData(
@@ -207,8 +209,10 @@ def test_exposure_gradients_and_closure():
     assert effect.adam.values[:3].sum(dim=0).abs().max() < 1e-12
 
 
-def shot_of(view, camera=None) -> Shot:
-    return Shot(iteration=0, nominal=0.0, view=view, camera=make_camera() if camera is None else camera)
+def shot_of(view, camera=None) -> ViewContext:
+    return ViewContext(
+        iteration=0, nominal=0.0, view=view, camera=make_camera() if camera is None else camera
+    )
 
 
 def as_gradients(g, weights) -> Gradients:

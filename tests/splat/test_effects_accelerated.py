@@ -8,18 +8,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ambiguous_wild.core import Points, Scene, View
+from ambiguous_wild.core import Scene, SparsePoints, View
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import RowAdam
-from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.effects.chain import EffectPipeline
 from ambiguous_wild.splat.effects.posed import PosedCamera
 from ambiguous_wild.splat.effects.poses import PoseRefinement, left_jacobian, turned
 from ambiguous_wild.splat.effects.smoothing import filter_sizes
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import NOTHING, Cotangents, Gradients, as_cotangents
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.step import TrainData, ViewContext
 from tests.host_reads import READ, moved, no_transfers
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import disturbed
@@ -35,7 +35,7 @@ def on_accelerator(monkeypatch, yes=True):
 def data_of(views=3):
     cameras = [make_camera(*SIZE, angle=0.1 * k, fx=20.0 + k, fy=21.0) for k in range(views)]
     xyz = np.random.default_rng(0).normal([0, 0, 3], 1.0, (40, 3))
-    points = Points(xyz, np.zeros((40, 3), np.uint8), np.zeros(40), np.zeros(41, int),
+    points = SparsePoints(xyz, np.zeros((40, 3), np.uint8), np.zeros(40), np.zeros(41, int),
                     np.zeros(0, np.int32), np.zeros((0, 2), np.float32))  # fmt: skip
     scene = Scene(None, "s", tuple(View(f"{i}.png", None, c, "train") for i, c in enumerate(cameras)), points)
     photos = [torch.full((c.height, c.width, 3), 0.5) for c in cameras]
@@ -43,7 +43,7 @@ def data_of(views=3):
 
 
 def chain_of(data, names=ALL):
-    return Chain(with_effects(Parts(), names).effects, data)
+    return EffectPipeline(with_effects(MethodHooks(), names).effects, data)
 
 
 class Painted:
@@ -81,7 +81,9 @@ def paint(gaussians, shot, shade):
 
 
 def shot_of(camera, view=None, iteration=0, progress=0.5):
-    return Shot(iteration=iteration, nominal=30_000 * progress, progress=progress, view=view, camera=camera)
+    return ViewContext(
+        iteration=iteration, nominal=30_000 * progress, progress=progress, view=view, camera=camera
+    )
 
 
 def visit(chain, data, gaussians, iteration, divisor=1, called_off=None, targets=None):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.core import Points, Scene, View
+from ambiguous_wild.core import Scene, SparsePoints, View
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.tracks import photo_gains
-from ambiguous_wild.splat.parts import Parts
-from ambiguous_wild.splat.step import Shot
+from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.step import ViewContext
 from tests.splat.scenes import bits, disturbed, trainer_for
 from tests.splat.scenes import camera as make_camera
 from tests.tiny_scene import write_tiny_scene
@@ -22,8 +22,10 @@ def scene(tmp_path_factory):
     return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene", distractors=False))
 
 
-def shot_of(view, camera=None) -> Shot:
-    return Shot(iteration=0, nominal=0.0, view=view, camera=make_camera() if camera is None else camera)
+def shot_of(view, camera=None) -> ViewContext:
+    return ViewContext(
+        iteration=0, nominal=0.0, view=view, camera=make_camera() if camera is None else camera
+    )
 
 
 def brightened(data, gains):
@@ -48,7 +50,7 @@ def test_colour_effects_explain_drifting_exposure(scene, tmp_path, name):
         n: trainer_for(
             scene,
             tmp_path / (n or "none"),
-            parts=with_effects(Parts(), [n] if n else []),
+            parts=with_effects(MethodHooks(), [n] if n else []),
             change=drift,
             iterations=200,
         )
@@ -88,7 +90,7 @@ def test_poses_return_when_they_were_disturbed(scene, tmp_path):
         return replace(data, cameras=cameras)
 
     trainer = trainer_for(
-        scene, tmp_path, parts=with_effects(Parts(), ("poses",)), change=disturb, iterations=400
+        scene, tmp_path, parts=with_effects(MethodHooks(), ("poses",)), change=disturb, iterations=400
     )
 
     def error(cameras):
@@ -112,7 +114,7 @@ def test_gains_from_tracks_are_those_put_in():
     photos = [base * g for g in gains]
     photos[2][:20, :20] = 0.9  # something stands before a tenth of the picture
     xy = rng.uniform([4, 4], [60, 44], (points, 2))
-    tracks = Points(
+    tracks = SparsePoints(
         rng.normal(size=(points, 3)), np.zeros((points, 3), np.uint8), np.zeros(points),
         np.arange(points + 1) * views, np.tile(np.arange(views), points).astype(np.int32),
         np.repeat(xy, views, axis=0).astype(np.float32),

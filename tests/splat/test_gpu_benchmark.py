@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ambiguous_wild.stress import table
-from ambiguous_wild.stress.case import Case, Measured
+from ambiguous_wild.stress.case import Case, CaseResult
 from tests.benchmark_scripts import benchmark
 from tests.tiny_scene import write_tiny_scene
 
@@ -20,7 +20,7 @@ def gpu(monkeypatch):
 
 
 def case(name, error):
-    return Case(1, name, lambda device: Measured(error, 1.0, "why", "what"), ("cpu", "cuda"))
+    return Case(1, name, lambda device: CaseResult(error, 1.0, "why", "what"), ("cpu", "cuda"))
 
 
 @pytest.mark.parametrize(("errors", "code"), [([0.5], 0), ([0.5, float("nan")], 1)])

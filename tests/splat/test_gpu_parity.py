@@ -8,7 +8,7 @@ import torch
 from ambiguous_wild.splat import gpu_kernels
 from ambiguous_wild.splat.cpu.render import render_cpu
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
 from tests.tiny_scene import with_points
@@ -77,7 +77,7 @@ class Nothing(MaskPolicy):
 
 def growing(scene, folder, bare):
     config = DensityConfig(start=0.0, every=1.0, min_every=6, resets=(), max_gaussians=300)
-    parts = Parts(density_config=replace(config, grow_grad=1e-9), mask=Nothing(bare))
+    parts = MethodHooks(density_config=replace(config, grow_grad=1e-9), mask=Nothing(bare))
     trainer = trainer_for(scene, folder, parts=parts, iterations=30, probes=0)
     counts = []
     for _ in range(9):

@@ -11,12 +11,12 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.base import rate_for_run_length
-from ambiguous_wild.splat.effects.chain import Chain
+from ambiguous_wild.splat.effects.chain import EffectPipeline
 from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.field import GaussianAttribute
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.render import render
-from ambiguous_wild.splat.step import Shot
+from ambiguous_wild.splat.step import ViewContext
 from tests.splat.scenes import camera, gaussians
 from tests.splat.scenes import trainer_for as trainer_of
 
@@ -38,7 +38,7 @@ class Everything(Learnt):
     def rows(self, gaussians):
         return {"code": GaussianAttribute(0.1 * torch.ones(len(gaussians), 3), rate=0.01)}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, torch.Tensor], shot: Shot):
+    def forward(self, visible: Visible, leaf: Mapping[str, torch.Tensor], shot: ViewContext):
         inputs = torch.cat([visible.base, visible.attributes["code"] * leaf["tint"]], dim=1)
         return visible.base * (1 + leaf["tint"]) + 0.1 * mlp(inputs, leaf, "net") + 0.01 * visible.means
 
@@ -51,7 +51,7 @@ class Everything(Learnt):
 
 def drawn_with(effect, g, values=None):
     """The picture of photo 1 with some leaves or rows replaced."""
-    chain = Chain.__new__(Chain)
+    chain = EffectPipeline.__new__(EffectPipeline)
     chain.effects, chain.views = (effect,), effect.photos
     kept = {name: adam.values.clone() for name, adam in effect._adam.items()}
     for name, value in (values or {}).items():
@@ -61,7 +61,7 @@ def drawn_with(effect, g, values=None):
             g = replace(g, attributes={**g.attributes, name: value})
         else:
             g = replace(g, **{name: value})
-    shot = Shot(iteration=1, nominal=1e4, view=1, camera=camera())
+    shot = ViewContext(iteration=1, nominal=1e4, view=1, camera=camera())
     rendered = chain.render(g, shot, lambda g, s, shade: render(g, s.camera, shade=shade))
     for name, value in kept.items():
         effect._adam[name].values.copy_(value)
@@ -85,7 +85,7 @@ def test_all_three_places_against_finite_differences(scene, tmp_path):
         return float((drawn_with(effect, g, {name: value}).image.double() * weight.double()).sum())
 
     rng = np.random.default_rng(3)
-    shot = Shot(iteration=1, nominal=0, view=1, camera=camera())
+    shot = ViewContext(iteration=1, nominal=0, view=1, camera=camera())
     starts = {name: (effect._row(name, shot), own[name]) for name in own}
     starts |= {"code": (g.attributes["code"], found.attributes["code"])}
     starts |= {name: (getattr(g, name), getattr(found, name)) for name in ("means", "opacity_logits", "sh0")}
@@ -100,7 +100,7 @@ def test_all_three_places_against_finite_differences(scene, tmp_path):
 
 def trainer_for(scene, folder, effect):
     growth = DensityConfig(start=0, every=1, min_every=20, grow_grad=1e-9, min_reset_spacing=10**9)
-    parts = Parts(effects=(effect,), density_config=growth)
+    parts = MethodHooks(effects=(effect,), density_config=growth)
     return trainer_of(scene, folder, parts=parts, max_gaussians=600)
 
 
@@ -109,7 +109,7 @@ def test_a_photo_that_was_not_trained_on(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, effect)
     trainer.train()
     seen = trainer.data.cameras[0]
-    neutral = Shot(iteration=0, nominal=0, view=None, camera=seen)
+    neutral = ViewContext(iteration=0, nominal=0, view=None, camera=seen)
     assert not effect._leaf(neutral)["tint"].any()
     effect.unseen = "mean"
     rows = effect._adam["tint"].values
@@ -144,8 +144,9 @@ def test_names_are_told_apart(scene, tmp_path):
 )
 def test_rates_rise_with_the_root_of_how_much_shorter_a_run_is(length, factor):
     for iteration in (1, length // 2, length):
-        shot = Shot(iteration=iteration, nominal=iteration / length * 30_000, view=0, camera=camera())
+        shot = ViewContext(iteration=iteration, nominal=iteration / length * 30_000, view=0, camera=camera())
         assert rate_for_run_length(0.002, 70_000, shot) == pytest.approx(0.002 * factor)
     assert (
-        rate_for_run_length(0.002, 70_000, Shot(iteration=1, nominal=0.0, view=0, camera=camera())) == 0.002
+        rate_for_run_length(0.002, 70_000, ViewContext(iteration=1, nominal=0.0, view=0, camera=camera()))
+        == 0.002
     )

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.core.scene import Points
+from ambiguous_wild.core.scene import SparsePoints
 from ambiguous_wild.splat.effects import skybox, with_effects
 from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from tests.splat.scenes import trainer_for
 
 
@@ -27,7 +27,7 @@ def data(seen_by=("a",)):
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(-3, 3, (40, 2)), np.full(40, 10.0)])
     count = 40 * len(rows)
-    points = Points(
+    points = SparsePoints(
         xyz, np.zeros((40, 3), np.uint8), np.zeros(40), np.arange(41) * len(rows),
         np.tile(np.array(rows, np.int32), 40), np.zeros((count, 2), np.float32),
     )  # fmt: skip
@@ -84,7 +84,7 @@ def started(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(skybox, "tracks_of", every)  # the tiny scene has no tracks
 
     def start(folder, effects=("near",), iterations=260):
-        parts = with_effects(Parts(), list(effects))
+        parts = with_effects(MethodHooks(), list(effects))
         return trainer_for(scene, tmp_path / folder, parts=parts, iterations=iterations)
 
     return start

@@ -14,7 +14,7 @@ from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.gpu_render import render_cuda
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients
 from tests.tiny_scene import with_points
 
@@ -128,7 +128,9 @@ class Beside(Fields):
 def test_pictures_drawn_before_any_is_pulled_have_the_gradients_of_each_alone(
     scene, tmp_path, back_end, beside
 ):
-    parts = with_effects(Parts(fields=Beside() if beside else None), ("exposure", "appearance", "antialias"))
+    parts = with_effects(
+        MethodHooks(fields=Beside() if beside else None), ("exposure", "appearance", "antialias")
+    )
     parts = replace(parts, effects=(*parts.effects, Tint()))
     trainer = trainer_for(scene, tmp_path, parts=parts, iterations=30, probes=0)
     for _ in range(3):  # effects and harmonics are no longer neutral
@@ -245,12 +247,14 @@ class Squares(DensityControl):
 
 class Counted(Beside):
     def setup(self, data, static, rates):
-        density = DensityControl(Parts().density_config, 1.0, 0)
+        density = DensityControl(MethodHooks().density_config, 1.0, 0)
         density.needs = frozenset({"count"})
         return {"other": FieldStart(static.clone(), rates, density)}
 
 
-@pytest.mark.parametrize("parts", [Parts(density=Squares), Parts(fields=Counted())], ids=["static", "other"])
+@pytest.mark.parametrize(
+    "parts", [MethodHooks(density=Squares), MethodHooks(fields=Counted())], ids=["static", "other"]
+)
 def test_statistics_that_gsplat_does_not_sum_are_refused_before_training(scene, tmp_path, monkeypatch, parts):
     trainer_for(scene, tmp_path, parts=parts)  # the CPU has them
     with fake_gsplat.installed(monkeypatch):

@@ -14,7 +14,7 @@ from ambiguous_wild.splat.effects.smoothing import SmoothingFilter
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients, with_visible
 from tests.splat.scenes import camera, cotangents, doubles, gaussians, given, trained, trainer_for
@@ -62,8 +62,8 @@ class OwnPicture(MaskPolicy):
 
 def test_a_policy_may_learn_from_pictures_of_its_own(scene, tmp_path):
     plain, more = (
-        trainer_for(scene, tmp_path / "a", parts=Parts()),
-        trainer_for(scene, tmp_path / "b", parts=Parts(mask=OwnPicture())),
+        trainer_for(scene, tmp_path / "a", parts=MethodHooks()),
+        trainer_for(scene, tmp_path / "b", parts=MethodHooks(mask=OwnPicture())),
     )
     plain.step()
     more.step()
@@ -90,7 +90,7 @@ EARLY = DensityConfig(start=0, every=1, min_every=20, grow_grad=1e-9, min_reset_
 
 
 def test_density_control_carries_what_a_gaussian_has(scene, tmp_path):
-    parts = Parts(effects=(Number(),), density_config=EARLY)
+    parts = MethodHooks(effects=(Number(),), density_config=EARLY)
     trainer = trainer_for(scene, tmp_path, parts=parts, max_gaussians=900)
     start = trainer.gaussians
     while trainer.iteration < 45:
@@ -106,7 +106,7 @@ def test_density_control_carries_what_a_gaussian_has(scene, tmp_path):
     assert near < 0.5 * far
     trainer.save()
     again = trainer_for(
-        scene, tmp_path, parts=Parts(effects=(Number(),), density_config=EARLY), max_gaussians=900
+        scene, tmp_path, parts=MethodHooks(effects=(Number(),), density_config=EARLY), max_gaussians=900
     )
     assert again.resume()
     assert torch.equal(again.gaussians.attributes["number"], after.attributes["number"])
@@ -130,7 +130,7 @@ class Carried(Effect):
 
 
 def test_a_learnt_row_learns(scene, tmp_path):
-    parts = Parts(effects=(Carried(),), density_config=EARLY)
+    parts = MethodHooks(effects=(Carried(),), density_config=EARLY)
     trainer = trained(scene, tmp_path, parts=parts, max_gaussians=700)
     assert trainer.gaussians.attributes["gain"].abs().max() > 0.01
 
@@ -236,7 +236,7 @@ class Wants(DensityControl):
 
 
 def test_density_control_gets_what_it_needs_and_may_change_gradients(scene, tmp_path):
-    trainer = trainer_for(scene, tmp_path, parts=Parts(density=Wants))
+    trainer = trainer_for(scene, tmp_path, parts=MethodHooks(density=Wants))
     before = trainer.gaussians.opacity_logits.clone()
     trainer.step()
     assert Wants.seen == [len(trainer.data.photos), (True, True, None)]
@@ -250,7 +250,7 @@ class Before(DensityControl):
 def test_density_control_may_come_before_the_optimiser(scene, tmp_path):
     config = replace(EARLY, min_every=3)
     trainer = trainer_for(
-        scene, tmp_path, parts=Parts(density=Before, density_config=config), max_gaussians=700
+        scene, tmp_path, parts=MethodHooks(density=Before, density_config=config), max_gaussians=700
     )
     while trainer.iteration < 2:
         trainer.step()
@@ -266,12 +266,12 @@ def test_a_start_of_ones_own(scene, tmp_path):
         xyz = data.scene.points.xyz[:9]
         return Gaussians.from_points(xyz, np.zeros((9, 3), np.uint8), opacity=0.5)
 
-    trainer = trainer_for(scene, tmp_path, parts=Parts(start=start))
+    trainer = trainer_for(scene, tmp_path, parts=MethodHooks(start=start))
     assert len(trainer.gaussians) == 9 and float(torch.sigmoid(trainer.gaussians.opacity_logits[0])) == 0.5
 
 
 def test_other_gaussians_may_be_drawn_under_the_smoothing_filter(scene, tmp_path):
-    parts = Parts(effects=(SmoothingFilter(),)).suited_to(SmoothingFilter())
+    parts = MethodHooks(effects=(SmoothingFilter(),)).suited_to(SmoothingFilter())
     trainer = trainer_for(scene, tmp_path, parts=parts)
     while trainer.iteration < 5:
         trainer.step()
@@ -291,6 +291,6 @@ class SecondField(Fields):
 
 
 def test_another_field_may_learn_at_the_static_ones_rates(scene, tmp_path):
-    trainer = trainer_for(scene, tmp_path, parts=Parts(effects=(Carried(),), fields=SecondField()))
+    trainer = trainer_for(scene, tmp_path, parts=MethodHooks(effects=(Carried(),), fields=SecondField()))
     trainer.step()
     assert set(trainer.drawing.others["second"].optimiser.rates) >= set(PARAMETERS)

@@ -16,7 +16,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, sphere_of, spread
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
@@ -138,7 +138,7 @@ def test_losses_on_size_and_opacity_leave_it_alone(data, tmp_path, method):
 
 
 def test_pruning_never_leaves_the_skybox_alone(data, tmp_path):
-    trainer = trainer_for(data, tmp_path, Parts(density_config=DensityConfig(**EAGER)))
+    trainer = trainer_for(data, tmp_path, MethodHooks(density_config=DensityConfig(**EAGER)))
     trainer.gaussians.opacity_logits.fill_(-8.0)
     trainer.density._match(trainer.gaussians)
     assert len(trainer.density._prune(trainer.gaussians, trainer.optimiser)) == len(trainer.gaussians)
@@ -157,17 +157,17 @@ def test_a_scene_without_points_is_refused_with_a_skybox_too(data, tmp_path):
         track_offsets=points.track_offsets[:4],
     )  # fmt: skip
     with pytest.raises(AwError, match="cannot start from 3 points"):
-        trainer_for(replace(data, scene=replace(data.scene, points=none)), tmp_path, Parts())
+        trainer_for(replace(data, scene=replace(data.scene, points=none)), tmp_path, MethodHooks())
 
 
 def test_without_room_nothing_is_spared(data, tmp_path):
-    trainer = trainer_for(data, tmp_path, Parts(density_config=DensityConfig(max_gaussians=100)))
+    trainer = trainer_for(data, tmp_path, MethodHooks(density_config=DensityConfig(max_gaussians=100)))
     assert trainer.effects.facts()["skybox"] == {"points": 0}
     assert not trainer.density.protected(torch.full((3, 3), 1e6)).any()
 
 
 def test_what_is_nowhere_is_removed_with_a_skybox_too(data, tmp_path):
-    trainer = trainer_for(data, tmp_path, Parts(density_config=DensityConfig(**EAGER)))
+    trainer = trainer_for(data, tmp_path, MethodHooks(density_config=DensityConfig(**EAGER)))
     trainer.gaussians.means[:2] = torch.tensor([[np.inf] * 3, [np.nan] * 3], dtype=torch.float32)
     trainer.density._match(trainer.gaussians)
     kept = trainer.density._prune(trainer.gaussians, trainer.optimiser)
@@ -178,7 +178,7 @@ EAGER = {"start": 0.0, "stop": 10_000.0, "every": 1.0, "min_every": 20, "grow_gr
 
 
 def test_density_control_neither_copies_nor_removes_it(data, tmp_path):
-    parts = Parts(density_config=DensityConfig(**EAGER, prune_opacity=0.2))
+    parts = MethodHooks(density_config=DensityConfig(**EAGER, prune_opacity=0.2))
     trainer = trainer_for(data, tmp_path, parts)
     first, near = far_rows(trainer), len(trainer.gaussians) - far_rows(trainer)
     assert first == trainer.effects.facts()["skybox"]["points"] > 0

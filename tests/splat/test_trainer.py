@@ -22,13 +22,13 @@ from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, divisor_at
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
 
 
-def parts_of(method: str) -> Parts:
+def parts_of(method: str) -> MethodHooks:
     """A method's parts; RefineSplat with a short warm-up, so that all of it runs in a short test."""
     entry = get_method(method)
     options = entry.options()
@@ -162,7 +162,9 @@ def test_under_a_budget_probes_take_no_iteration_from_the_run(scene, tmp_path, f
         return 12.5
 
     def run(name, **kw):  # effects learn: each run has its own
-        return trained(scene, tmp_path / name, parts=with_effects(Parts(), ("exposure",)), budget_s=1.0, **kw)
+        return trained(
+            scene, tmp_path / name, parts=with_effects(MethodHooks(), ("exposure",)), budget_s=1.0, **kw
+        )
 
     without, probed = run("a", probes=0), run("b", probes=8, probe=slow_probe)
     assert probed.iteration == without.iteration > 20
@@ -190,7 +192,7 @@ class _AllMasked(MaskPolicy):
 
 
 def test_photos_that_are_all_masked_teach_nothing_and_are_named(scene, tmp_path):
-    trainer = trainer_for(scene, tmp_path, parts=Parts(mask=_AllMasked()), iterations=12)
+    trainer = trainer_for(scene, tmp_path, parts=MethodHooks(mask=_AllMasked()), iterations=12)
     before = bits(trainer)
     trainer.train()
     assert bits(trainer) == before
@@ -204,7 +206,7 @@ def test_keep_maps_of_absurd_values_are_refused(scene, tmp_path, value):
             return torch.full(step.photo.shape[:2], value)
 
     with pytest.raises(AwError, match="gave values from"):
-        trainer_for(scene, tmp_path, parts=Parts(mask=Absurd())).step()
+        trainer_for(scene, tmp_path, parts=MethodHooks(mask=Absurd())).step()
 
 
 def _narrow(step):
@@ -240,7 +242,7 @@ def test_what_a_policy_must_not_do_is_refused(scene, tmp_path, place, fault, mes
     mask = MaskPolicy()
     setattr(mask, place, fault)
     with pytest.raises(AwError, match=message):
-        trainer_for(scene, tmp_path, parts=Parts(mask=mask)).step()
+        trainer_for(scene, tmp_path, parts=MethodHooks(mask=mask)).step()
 
 
 def test_a_method_gets_no_test_photo(scene, tmp_path):
@@ -250,7 +252,7 @@ def test_a_method_gets_no_test_photo(scene, tmp_path):
         def setup(self, data):
             given.append(data)
 
-    parts = Parts(mask=Curious(), train_data=lambda data: given.append(data) or data)
+    parts = MethodHooks(mask=Curious(), train_data=lambda data: given.append(data) or data)
     trainer = trainer_for(scene, tmp_path, parts=parts)
     assert len(given) == 2 and trainer.data.scene.test == scene.test
     for data in given:

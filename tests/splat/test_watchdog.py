@@ -10,7 +10,7 @@ import torch
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MOST_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.splat.test_trainer import parts_of
@@ -31,7 +31,7 @@ class Poison(MaskPolicy):
 
 
 def poisoned(scene, folder, poison, **config):
-    return trainer_for(scene, folder, parts=Parts(mask=poison), iterations=60, probes=0, **config)
+    return trainer_for(scene, folder, parts=MethodHooks(mask=poison), iterations=60, probes=0, **config)
 
 
 def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):

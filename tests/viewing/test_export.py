@@ -12,7 +12,7 @@ import pytest
 from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.viewing.model import FORMATS, Model, Renderer, RenderSettings, export
+from ambiguous_wild.viewing.model import FORMATS, Renderer, RenderSettings, ViewedModel, export
 from tests.command_line import aw
 from tests.tiny_scene import write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run
@@ -44,7 +44,7 @@ def test_every_format_is_written_with_size_and_loss(run: Path, tmp_path: Path) -
 
 def test_the_loss_is_what_the_renders_say(run: Path, tmp_path: Path) -> None:
     scene = load_scene(run.parents[3] / "porch")
-    model = Model("m", run / "point_cloud.ply", RenderSettings())
+    model = ViewedModel("m", run / "point_cloud.ply", RenderSettings())
     (found,) = export(model, tmp_path, ["spz"], scene.test)
     before, after = (
         Renderer(model.read(), RenderSettings()),
@@ -85,14 +85,14 @@ def test_a_model_of_nothing_is_refused(tmp_path: Path) -> None:
     model["means"][:] = np.nan
     write_splat_ply(tmp_path / "m.ply", model)
     with pytest.raises(Exception, match="no Gaussian"):
-        export(Model("m", tmp_path / "m.ply"), tmp_path / "out", ["spz"])
+        export(ViewedModel("m", tmp_path / "m.ply"), tmp_path / "out", ["spz"])
     with pytest.raises(Exception, match="unknown format 'splat'"):
-        export(Model("m", tmp_path / "m.ply"), tmp_path / "out", ["splat"])
+        export(ViewedModel("m", tmp_path / "m.ply"), tmp_path / "out", ["splat"])
 
 
 def test_models_with_a_filter_of_their_own_say_so(tmp_path: Path) -> None:
     write_splat_ply(tmp_path / "m.ply", wall_model(50))
-    (found,) = export(Model("m", tmp_path / "m.ply", RenderSettings(antialias=True)), tmp_path, ["spz"])
+    (found,) = export(ViewedModel("m", tmp_path / "m.ply", RenderSettings(antialias=True)), tmp_path, ["spz"])
     import gzip
 
     assert gzip.decompress(found.path.read_bytes())[14] == 1 and found.lost_db is None

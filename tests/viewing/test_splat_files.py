@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.core import Place
+from ambiguous_wild.core import SceneTransform
 from ambiguous_wild.harness.trained_models import read_models
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
@@ -19,9 +19,9 @@ from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.viewing.model import (
     AXES,
     FORMATS,
-    Model,
     Renderer,
     RenderSettings,
+    ViewedModel,
     export,
     moved,
     space_of,
@@ -52,7 +52,7 @@ def test_our_exports_show_what_the_run_shows(
     inner = {**wall, "means": (wall["means"] * times + offset).astype(np.float32)}
     inner["log_scales"] = wall["log_scales"] + np.float32(np.log(times))
     write_splat_ply(tmp_path / "m.ply", inner, scene.place)
-    model = Model("m", tmp_path / "m.ply")
+    model = ViewedModel("m", tmp_path / "m.ply")
     (made,) = export(model, tmp_path / "out", [form], scene.test, name="x")
     shown = read_models([made.path], scene_folder=tmp_path / "scene")
     assert shown.scene.place == scene.place and [m.label for m in shown.models] == [made.path.name]
@@ -69,7 +69,7 @@ def test_our_exports_show_what_the_run_shows(
 def test_an_upright_export_renders_the_same_from_turned_cameras(tmp_path: Path, axis: str, rest: int) -> None:
     scene, wall = load_scene(write_tiny_scene(tmp_path / "scene")), lively(rest)
     write_splat_ply(tmp_path / "m.ply", wall)
-    model, space = Model("m", tmp_path / "m.ply"), space_of(scene)
+    model, space = ViewedModel("m", tmp_path / "m.ply"), space_of(scene)
     made = export(model, tmp_path, ["ply", "gltf", "spz"], scene.test, name="up", space=space, up=axis)
     for file in made:
         assert file.psnr_to_model is not None and file.psnr_to_model > (35 if file.format == "spz" else 50)
@@ -133,8 +133,8 @@ def test_what_is_no_splat_file_is_one_line_and_leaves_nothing(tmp_path: Path) ->
 
 def test_a_scene_around_a_model_is_upright_for_a_turned_file(tmp_path: Path) -> None:
     wall = wall_model()
-    place = Place((5e5, 4e6, 10.0), 1.0, (0.5**0.5, 0.5**0.5, 0.0, 0.0))
-    write_splat_ply(tmp_path / "m.ply", moved(wall, Place(place.centre), place), place)
+    place = SceneTransform((5e5, 4e6, 10.0), 1.0, (0.5**0.5, 0.5**0.5, 0.0, 0.0))
+    write_splat_ply(tmp_path / "m.ply", moved(wall, SceneTransform(place.centre), place), place)
     shown = read_models([tmp_path / "m.ply"])
     assert np.abs(shown.models[0].read()["means"]).max() < 1000
     camera = shown.scene.test[0].camera

@@ -10,7 +10,7 @@ from ambiguous_wild.core.errors import AwError, shortlist, unknown
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, every_nth, inside, split_by_lists
 from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import Model
+from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.scene_folder import models_in, read_list, registered, several_models
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
@@ -43,7 +43,7 @@ def which_model(root: Path, chosen: str = "") -> str:
     return several_models(models, folder) if folder is not None and models else ""
 
 
-def read_named_model(root: Path, chosen: str = "") -> Model:
+def read_named_model(root: Path, chosen: str = "") -> ColmapModel:
     """Read the model and check the names of its photos; `chosen` is the name of one of several models.
 
     Raises:
@@ -66,7 +66,7 @@ def read_named_model(root: Path, chosen: str = "") -> Model:
     return model
 
 
-def model_names(model: Model) -> list[str]:
+def model_names(model: ColmapModel) -> list[str]:
     """Return the names of the registered photos, sorted."""
     return sorted(image.name for image in model.images.values())
 
@@ -176,7 +176,7 @@ def read_robustnerf(root: Path, chosen: str = "") -> ForeignScene:
     )
 
 
-def _published_factor(root: Path, model: Model) -> int:
+def _published_factor(root: Path, model: ColmapModel) -> int:
     """Return 8, the factor of the papers, or 1 for photos that were downsampled before COLMAP ran."""
     longest = max(max(c.width, c.height) for c in model.cameras.values())
     return 8 if longest / 8 >= 200 or 8 in shipped_factors(root) else 1

@@ -21,7 +21,7 @@ from ambiguous_wild.datasets.foreign import (
 )
 from ambiguous_wild.datasets.readers.colmap import sides
 from ambiguous_wild.io.colmap_model import check_camera
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, ModelImage, points_without_tracks
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, points_without_tracks
 from ambiguous_wild.io.ply import read_point_ply
 
 FIT_PX = 0.05  # largest error of the rational lens that replaces another lens
@@ -118,7 +118,7 @@ def brown_camera(
     return ModelCamera(1, model, *size, (*pinhole, *more), shear)
 
 
-def model_of_poses(rows: Iterable[Row]) -> Model:
+def model_of_poses(rows: Iterable[Row]) -> ColmapModel:
     """Make a model without points; equal cameras become one.
 
     Raises:
@@ -139,7 +139,7 @@ def model_of_poses(rows: Iterable[Row]) -> Model:
         q = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)[[3, 0, 1, 2]]  # w, x, y, z
         none = np.zeros((0, 2)), np.zeros(0, np.int64)
         images[number] = ModelImage(number, q, pose[:3, 3], camera_of_photo.camera_id, name, *none)
-    return Model({c.camera_id: c for c in cameras.values()}, images, points_without_tracks())
+    return ColmapModel({c.camera_id: c for c in cameras.values()}, images, points_without_tracks())
 
 
 def posed_scene(
@@ -153,6 +153,6 @@ def posed_scene(
         return ForeignScene(
             kind, root, model, photos, split, missing=missing, notes=(*notes, *more), points="triangulate"
         )
-    model = Model(model.cameras, model.images, points_without_tracks(*read_point_ply(cloud)))
+    model = ColmapModel(model.cameras, model.images, points_without_tracks(*read_point_ply(cloud)))
     more.append(f"points from {cloud.name}, without the photos that see them")
     return ForeignScene(kind, root, model, photos, split, missing=missing, notes=(*notes, *more))

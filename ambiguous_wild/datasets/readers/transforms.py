@@ -13,7 +13,7 @@ from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, find_photo, inside, read_text, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import sides
 from ambiguous_wild.datasets.readers.posed import brown_camera, model_of_poses
-from ambiguous_wild.io.colmap_records import Model, ModelCamera, points_without_tracks
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, points_without_tracks
 from ambiguous_wild.io.files import unique_keys
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
@@ -130,7 +130,7 @@ def frame_camera(
 
 def read_frames(
     root: Path, path: Path, data: Mapping[str, object]
-) -> tuple[Model, Path, dict[str, Mapping[str, object]]]:
+) -> tuple[ColmapModel, Path, dict[str, Mapping[str, object]]]:
     """Read the model of a transforms file, the folder of its photos, and the frames by the model's names.
 
     Raises:
@@ -171,7 +171,7 @@ def read_transforms(root: Path) -> ForeignScene:
     kind = "nerfstudio" if studio else "instant-ngp"
     if isinstance(points, str):
         xyz, rgb = read_point_ply(root / below(points, root))
-        model = Model(model.cameras, model.images, points_without_tracks(xyz, rgb))
+        model = ColmapModel(model.cameras, model.images, points_without_tracks(xyz, rgb))
         notes.append(f"points from {points}, without the photos that see them")
     where: Literal["model", "triangulate"] = "model" if len(model.points.ids) else "triangulate"
     return ForeignScene(

@@ -23,7 +23,7 @@ from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_
 from ambiguous_wild.methods.refinesplat.first_look import FirstLook
 from ambiguous_wild.methods.refinesplat.maps import sized, spread_of
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, grown, hysteresis
-from ambiguous_wild.methods.refinesplat.threshold import Cut, Pool, learnt, pool_of, t_ent
+from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshold, learnt, pool_of, t_ent
 from ambiguous_wild.splat.backend import backend_of
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ PRICE = 3.0  # price of a masked pixel in robust deviations above the median dis
 
 
 @dataclass(frozen=True)
-class Masks:
+class PhotoMasks:
     """Masks of one photo, and the statistics that they were made from."""
 
     local: Tensor  # [H, W] bool
@@ -41,8 +41,8 @@ class Masks:
     keep: Tensor  # [H, W] float32, 1 - M_final, bounded
     means: Tensor  # [K] float64, mean statistic of every instance, NaN for missing ones
     distances: Tensor  # [K] float64, mean distance in units
-    cut: Cut
-    pool: Pool  # instances that the threshold divided
+    cut: Threshold
+    pool: InstanceStats  # instances that the threshold divided
 
     def shares(self) -> Tensor:
         """Return the shares masked in all, locally and globally, and T_ent, [4] float64."""
@@ -140,7 +140,7 @@ def make_masks(
     config: MaskConfig,
     ceiling: Tensor | None = None,
     seen: Tensor | None = None,
-) -> Masks:
+) -> PhotoMasks:
     """Make M_local, M_global and the keep map of one photo (Eqs. 3-7).
 
     Args:
@@ -198,7 +198,7 @@ def make_masks(
     final = grown(final, config, judging)
     if seen is not None:
         final = final & seen
-    return Masks(local, global_, (~final).float(), means, distances, cut, pool)
+    return PhotoMasks(local, global_, (~final).float(), means, distances, cut, pool)
 
 
 def _with_row(rows: Tensor, view: int, row: Tensor) -> Tensor:
@@ -260,7 +260,7 @@ class MaskStore:
         self.keeps[view] = masks.keep
         self._shares[view].copy_(masks.shares())
 
-    def _learn(self, view: int, masks: Masks) -> None:
+    def _learn(self, view: int, masks: PhotoMasks) -> None:
         """Learn w2 from all instances; the price of a masked pixel is a robustly high distance."""
         config = self.config.mask
         rows = slice(None) if config.scope == "scene" else slice(view, view + 1)
@@ -276,7 +276,7 @@ class MaskStore:
         self.theta = learnt(self.theta, masks.pool, costs, areas, masks.cut.floor, config.threshold)
 
     @torch.no_grad()
-    def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, Masks]:
+    def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, PhotoMasks]:
         """Return the maps of the step's view and its masks at the photo's own size.
 
         Args:

@@ -102,7 +102,7 @@ class _Query:
 
 
 @dataclass(frozen=True)
-class _Points:
+class _NeighbourRays:
     """The P pixels of a view as rays in the frames of its n neighbours, and the neighbours' maps."""
 
     rays: Tensor  # [n, 3, P] at depth 1
@@ -213,7 +213,7 @@ class OtherViews:
             return None
         own, config, shape = self.queries[view], self.config, depth.shape
         stacks = self.stored, self.depth, self.surface
-        points = _Points(
+        points = _NeighbourRays(
             torch.addcmul(torch.addcmul(own.ahead, own.down, own.y), own.right, own.x).flatten(2),
             own.origin,
             self.stored.of(view)[1:].flatten(1),
@@ -238,7 +238,7 @@ class OtherViews:
         return MultiViewEvidence(*(x.view(shape) for x in maps))
 
     def _look_up_sparse(
-        self, points: _Points, depth: Tensor, answers: _Answers, few: Tensor, offset: Tensor | None
+        self, points: _NeighbourRays, depth: Tensor, answers: _Answers, few: Tensor, offset: Tensor | None
     ) -> None:
         """Use evidence about the sparse points' surface where more views see it than the render's.
 
@@ -263,7 +263,7 @@ class OtherViews:
         few[rows] &= ~more
 
     def _look_up(
-        self, points: _Points, rows: Tensor | slice, depth: Tensor, *, sparse: bool = False
+        self, points: _NeighbourRays, rows: Tensor | slice, depth: Tensor, *, sparse: bool = False
     ) -> tuple[_Answers, Tensor | None]:
         """Look up the neighbours' evidence at depths [P'] of some pixels.
 

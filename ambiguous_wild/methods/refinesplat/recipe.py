@@ -30,7 +30,7 @@ from ambiguous_wild.methods.refinesplat.threshold import Variant
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import Parts, Schedule
+from ambiguous_wild.splat.parts import MethodHooks, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.moving import moving_labels, moving_map
@@ -302,9 +302,9 @@ def _instances(config: RefineSplatConfig) -> Instances:
     return GraphSegments(config.segments) if config.instances == "graph" else make_instances(config.instances)
 
 
-def build(options: RefineSplatConfig) -> Parts:
+def build(options: RefineSplatConfig) -> MethodHooks:
     """Return 3DGS with masks, entropy terms and density control of RefineSplat."""
-    return Parts(
+    return MethodHooks(
         mask=RefineSplatMask(options),
         density=EntropyAwareDensity,
         density_config=options.density,

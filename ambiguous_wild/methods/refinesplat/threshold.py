@@ -82,7 +82,7 @@ RATE = 1.0  # rate of plain gradient steps on theta, each clipped to 1
 
 
 @dataclass(frozen=True)
-class Pool:
+class InstanceStats:
     """The instances that a threshold divides, with the sums that it and the learning of w2 need; float64."""
 
     order: Tensor  # [n] values in ascending order, NaN (missing) last
@@ -102,22 +102,22 @@ class Pool:
 
 
 @dataclass(frozen=True)
-class Cut:
+class Threshold:
     """The threshold between static and transient values."""
 
     threshold: Tensor  # 0-d float64, larger values are transient; inf = no value is an outlier
     floor: Tensor  # 0-d, bound of the gate: the larger of median + gate * robust spread and `least`
 
-    def below(self, ceiling: Tensor | None) -> Cut:
+    def below(self, ceiling: Tensor | None) -> Threshold:
         """Return the cut with threshold and floor limited to the ceiling."""
         if ceiling is None:
             return self
         high = self.threshold > ceiling
         floor = torch.where(high, torch.minimum(self.floor, ceiling), self.floor)
-        return Cut(torch.minimum(self.threshold, ceiling), floor)
+        return Threshold(torch.minimum(self.threshold, ceiling), floor)
 
 
-def pool_of(values: Tensor) -> Pool:
+def pool_of(values: Tensor) -> InstanceStats:
     """Sort values [n] >= 0 float64 and compute their statistics; NaN = missing; n >= 1."""
     order, index = values.sort()
     x = order.nan_to_num(nan=0.0).clamp_(min=0.0)
@@ -128,19 +128,19 @@ def pool_of(values: Tensor) -> Pool:
     # -sum q log q with q = x / total: log(total) - sum(x log x) / total; 0 of nothing
     lower, upper = (totals.log() - logs / totals).masked_fill_(totals <= 0, 0.0)
     above_previous = F.pad(order[1:] > order[:-1], (1, 0))
-    return Pool(
+    return InstanceStats(
         order, index, x, through[0, -1], *spread_of(values), upper, lower - upper, above_previous, logs
     )  # fmt: skip
 
 
 def t_ent(
-    pool: Pool,
+    pool: InstanceStats,
     w2: float | Tensor = 0.5,
     form: Form = "kapur",
     gate: float = 0.0,
     least: float = 0.0,
     hard: float = 0.0,
-) -> Cut:
+) -> Threshold:
     """Compute the threshold T_ent, or one of the two that it is compared with.
 
     Args:
@@ -159,7 +159,7 @@ def t_ent(
         raise unknown("threshold", form, get_args(Form))
     if form == "hard":
         fixed = torch.full_like(pool.middle, hard)  # does not depend on the values
-        return Cut(fixed, fixed)
+        return Threshold(fixed, fixed)
     floor = pool.floor(gate) if gate > 0 else torch.full_like(pool.middle, -math.inf)
     if least > 0:
         floor = floor.clamp(min=least)
@@ -171,7 +171,7 @@ def t_ent(
         mean = pool.total / count
         away = (pool.x - mean) * present
         statistics = torch.maximum(mean + (torch.dot(away, away) / count).sqrt(), floor)
-        return Cut(torch.where(apart, statistics, math.inf), floor)
+        return Threshold(torch.where(apart, statistics, math.inf), floor)
     candidate = candidates(pool, floor, form)
     scores, _ = objective(pool, w2, form)
     start = scores.masked_fill_(~candidate, -math.inf).argmax()
@@ -179,10 +179,10 @@ def t_ent(
     threshold = pool.order.take(start)
     if form != "literal":
         threshold = 0.5 * (threshold + pool.order.take((start - 1).clamp(min=0)))
-    return Cut(torch.where(candidate.any() & apart, threshold, math.inf), floor)
+    return Threshold(torch.where(candidate.any() & apart, threshold, math.inf), floor)
 
 
-def candidates(pool: Pool, floor: Tensor, form: Form) -> Tensor:
+def candidates(pool: InstanceStats, floor: Tensor, form: Form) -> Tensor:
     """Return the values below which a cut may lie, [n] bool; the printed form may cut below the smallest."""
     candidate = pool.above_previous & (pool.order > floor)
     if form == "literal":
@@ -190,7 +190,7 @@ def candidates(pool: Pool, floor: Tensor, form: Form) -> Tensor:
     return candidate
 
 
-def objective(pool: Pool, w2: float | Tensor, form: Form = "kapur") -> tuple[Tensor, Tensor]:
+def objective(pool: InstanceStats, w2: float | Tensor, form: Form = "kapur") -> tuple[Tensor, Tensor]:
     """Return (1 - w2) Ent(upper) + w2 Ent(lower) for a cut below each value, and its slope in w2, [n]."""
     upper, slope = pool.upper, pool.more_below
     if form == "literal":
@@ -200,7 +200,7 @@ def objective(pool: Pool, w2: float | Tensor, form: Form = "kapur") -> tuple[Ten
 
 def learnt(
     theta: Tensor,
-    pool: Pool,
+    pool: InstanceStats,
     costs: Tensor,
     areas: Tensor,
     floor: Tensor,

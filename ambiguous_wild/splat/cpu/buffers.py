@@ -46,7 +46,7 @@ class _Memory:
         return lease.reshape(shape)
 
 
-class Pool:
+class BufferPool:
     """Lends arrays, and lends their memory again as soon as nothing refers to an array any more.
 
     A tensor or view of an array keeps it lent, so the values that a caller holds never change. At most `keep`

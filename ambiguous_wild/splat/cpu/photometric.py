@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.splat.cpu.buffers import Pool
+from ambiguous_wild.splat.cpu.buffers import BufferPool
 from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel, threads
 from ambiguous_wild.splat.cpu.simd import fma, load, select, splat, store, sum_lanes
 
@@ -223,7 +223,7 @@ def photometric(x_rows, y_rows, width, taps, keep, outer, lam, parts, maps, ssim
                 )
 
 
-_pool = Pool()
+_pool = BufferPool()
 _taps = window()
 
 

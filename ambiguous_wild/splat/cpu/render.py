@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat.cpu import bins, blend, project, reverse
-from ambiguous_wild.splat.cpu.buffers import Pool
+from ambiguous_wild.splat.cpu.buffers import BufferPool
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import (
@@ -27,7 +27,7 @@ from ambiguous_wild.splat.rendered import (
     sum_own,
 )
 
-_pool = Pool()
+_pool = BufferPool()
 
 
 def camera_vector(camera: Camera, blur: float = project.BLUR) -> np.ndarray:
@@ -65,11 +65,11 @@ class _Lists:
     tile_instances: np.ndarray
     kept: np.ndarray
     touched: np.ndarray
-    shaded: _Shaded | None
+    shaded: _ShadedRender | None
 
 
 @dataclass
-class _Shaded:
+class _ShadedRender:
     """State of a render whose colours came from a shading function."""
 
     rows: Tensor  # [M] int64, the shaded Gaussians
@@ -156,7 +156,7 @@ class RenderedCpu:
         assert self._lists.shaded is not None
         return self._lists.shaded.rows
 
-    def _through_shading(self, sums: np.ndarray, shaded: _Shaded) -> tuple[np.ndarray, ShadeGradients]:
+    def _through_shading(self, sums: np.ndarray, shaded: _ShadedRender) -> tuple[np.ndarray, ShadeGradients]:
         """Return dL/d(SH colour) [slots, 3] of every record, and the gradients of the shading function."""
         s = self._lists
         colours = np.zeros((len(s.ids), 3), np.float32)
@@ -256,11 +256,11 @@ def render_cpu(
 
 def _shade(
     shade: Shade, base: np.ndarray, ids: np.ndarray, slots: np.ndarray, records: np.ndarray
-) -> _Shaded:
+) -> _ShadedRender:
     """Put the function's colours into the records of the visible Gaussians."""
     rows = torch.from_numpy(ids[slots].astype(np.int64))
     colours, pull = shade(torch.from_numpy(base[slots]), rows)
     if tuple(colours.shape) != (len(rows), 3):
         raise AwError(f"a shading function must give colours [{len(rows)}, 3], got {list(colours.shape)}")
     records[slots, project.RED : project.BLUE + 1] = _array(colours).clip(min=0.0)
-    return _Shaded(rows, slots, pull)
+    return _ShadedRender(rows, slots, pull)

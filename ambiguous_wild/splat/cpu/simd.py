@@ -45,7 +45,7 @@ _FLOATS = {mask16: f32x16, mask8: f64x8}
 
 
 @register_model(Lanes)
-class _Model(models.PrimitiveModel):
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
         super().__init__(dmm, fe_type, fe_type.vector)
 

@@ -14,7 +14,7 @@ from ambiguous_wild.core.errors import AwError, unknown
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.effects.base import Effect
-    from ambiguous_wild.splat.parts import Parts
+    from ambiguous_wild.splat.parts import MethodHooks
 
 # name -> (module, class, what it is for), in the order in which they act on a render
 EFFECTS: dict[str, tuple[str, str, str]] = {
@@ -49,7 +49,7 @@ def check_effects(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in EFFECTS if name in wanted)
 
 
-def with_effects(parts: Parts, names: Sequence[str]) -> Parts:
+def with_effects(parts: MethodHooks, names: Sequence[str]) -> MethodHooks:
     """Add effects to a method's parts; without effects returns the same object."""
     if not names:
         return parts

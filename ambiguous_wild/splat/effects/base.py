@@ -28,7 +28,7 @@ from ambiguous_wild.splat.rendered import (
     ShadeGradients,
     ShadePull,
 )
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Shot, Step, TrainData
+from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
 
 
 class Effect:
@@ -61,21 +61,21 @@ class Effect:
         """Return the rows that density control must neither copy nor remove, [N] bool, from means [N, 3]."""
         return torch.zeros(len(means), dtype=torch.bool, device=means.device)
 
-    def camera(self, shot: Shot) -> Camera:
+    def camera(self, shot: ViewContext) -> Camera:
         """Return the camera of a train photo, at the resolution of the step."""
         return shot.camera
 
-    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
         """Return the Gaussians as they are drawn, all rows, and a pull that changes no tensor in place."""
         return gaussians, same
 
     def shade(
-        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: Shot
+        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: ViewContext
     ) -> tuple[Tensor, ShadePull]:
         """Return colours [M, 3] of the visible rows from those of the harmonics, see `rendered.Shade`."""
         return base, ShadeGradients
 
-    def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
+    def image(self, frame: Frame, shot: ViewContext) -> tuple[Frame, FramePull]:
         """Return the pictures as they are compared with the photo, as new tensors.
 
         The effect learns from `Cotangents.image` alone: a method's own loss on the render (`extra`) tells
@@ -83,11 +83,11 @@ class Effect:
         """
         return frame, unchanged
 
-    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: Shot) -> Mapping[str, Tensor]:
+    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: ViewContext) -> Mapping[str, Tensor]:
         """Return own gradients from a train photo's camera, given Gaussians and gradients of the render."""
         return {}
 
-    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
         """Learn from the gradients of one step.
 
         Args:
@@ -187,7 +187,7 @@ def decayed(first: float, last: float, progress: float) -> float:
     return float(first * (last / first) ** progress)
 
 
-def rate_for_run_length(rate: float, made_for: int, shot: Shot) -> float:
+def rate_for_run_length(rate: float, made_for: int, shot: ViewContext) -> float:
     """Return Adam's learning rate for a run of another length than the rate was published for.
 
     It grows with the square root of the ratio of the lengths, at most tenfold; longer runs get the rate

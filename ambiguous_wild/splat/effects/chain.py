@@ -32,13 +32,13 @@ from ambiguous_wild.splat.rendered import (
     sum_own,
     sum_where,
 )
-from ambiguous_wild.splat.step import Shot, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
-Draw = Callable[[Gaussians, Shot, Shade | None], Rendered]
+Draw = Callable[[Gaussians, ViewContext, Shade | None], Rendered]
 FIT_STEPS = 128  # WildGaussians' number for an embedding on half a test photo
 
 
-class Chain:
+class EffectPipeline:
     """Calls the effects in order; an effect is called only for the hooks that it overrides."""
 
     def __init__(self, effects: Sequence[Effect], data: TrainData) -> None:
@@ -81,14 +81,14 @@ class Chain:
             return None
         return lambda means: torch.stack([effect.spared(means) for effect in protecting]).any(dim=0)
 
-    def camera(self, shot: Shot) -> Camera:
+    def camera(self, shot: ViewContext) -> Camera:
         """Return the camera of a train photo as the effects change it."""
         for effect in self._with("camera"):
             shot = replace(shot, camera=effect.camera(shot))
         return shot.camera
 
     def model(
-        self, gaussians: Gaussians, shot: Shot, without: Collection[str] = ()
+        self, gaussians: Gaussians, shot: ViewContext, without: Collection[str] = ()
     ) -> tuple[Gaussians, list[Pull]]:
         """Return the Gaussians as they are drawn, and the pulls in the order of the effects."""
         pulls = []
@@ -101,10 +101,12 @@ class Chain:
     def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
         """Return the Gaussians as they are drawn without a photo; they do not hold the colours of nets."""
         camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))  # effects on the model do not read it
-        shot = Shot(iteration=iteration, nominal=0.0, view=None, camera=camera)
+        shot = ViewContext(iteration=iteration, nominal=0.0, view=None, camera=camera)
         return self.model(gaussians, shot)[0]
 
-    def render(self, gaussians: Gaussians, shot: Shot, draw: Draw, without: Collection[str] = ()) -> Rendered:
+    def render(
+        self, gaussians: Gaussians, shot: ViewContext, draw: Draw, without: Collection[str] = ()
+    ) -> Rendered:
         """Draw with all effects except those named; the effects have already changed the camera."""
         if not self.effects:
             return draw(gaussians, shot, None)
@@ -117,7 +119,7 @@ class Chain:
         posing = () if shot.view is None else self._with("pose", without)
         return EffectRender(rendered, frame.image, frame.alpha, drawn, shot, model_pulls, frame_pulls, posing)
 
-    def _shade(self, drawn: Gaussians, shot: Shot, without: Collection[str]) -> Shade | None:
+    def _shade(self, drawn: Gaussians, shot: ViewContext, without: Collection[str]) -> Shade | None:
         shading = self._with("shade", without)
         if not shading:
             return None
@@ -131,7 +133,7 @@ class Chain:
 
         return shade
 
-    def step(self, gradients: Gradients, shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, gradients: Gradients, shot: ViewContext, called_off: Tensor | None = None) -> None:
         """Let every effect learn from the last backward pass; see `Effect.step`."""
         for effect in self._with("step"):
             own = gradients.own.get(effect.name)
@@ -148,7 +150,9 @@ class Chain:
         for effect in self._with("rows_changed"):
             effect.rows_changed()
 
-    def fit_view(self, gaussians: Gaussians, shot: Shot, photo: Tensor, keep: Tensor, draw: Draw) -> Tensor:
+    def fit_view(
+        self, gaussians: Gaussians, shot: ViewContext, photo: Tensor, keep: Tensor, draw: Draw
+    ) -> Tensor:
         """Fit only the colour effects to a part of a photo; returns the picture [H, W, 3] after the fit.
 
         Args:
@@ -221,7 +225,7 @@ class EffectRender:
         image: Tensor,
         alpha: Tensor,
         drawn: Gaussians,
-        shot: Shot,
+        shot: ViewContext,
         model_pulls: Sequence[Pull],
         frame_pulls: Sequence[FramePull],
         posing: Sequence[Effect],

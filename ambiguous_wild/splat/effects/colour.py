@@ -22,11 +22,11 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, same, unchanged
-from ambiguous_wild.splat.effects.placing import Unit
+from ambiguous_wild.splat.effects.placing import SceneNormaliser
 from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.rendered import Cotangents, Frame, FramePull, Gradients, Own, Pull, sum_own
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.step import TrainData, ViewContext
 
 EXPOSURE_RATE, EXPOSURE_RATE_FINAL = 0.01, 0.001  # 3DGS's exposure_lr
 EXPOSURE_FIT_RATE = 0.02
@@ -53,7 +53,7 @@ class AffineExposure(Effect):
         row = self.adam.values[view]
         return row[:, :3] + torch.eye(3, dtype=row.dtype, device=row.device), row[:, 3]
 
-    def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
+    def image(self, frame: Frame, shot: ViewContext) -> tuple[Frame, FramePull]:
         row = shot.row(self.views)
         if row is None:
             return frame, unchanged
@@ -73,7 +73,7 @@ class AffineExposure(Effect):
 
         return replace(frame, image=(before @ matrix.T + offset).contiguous()), pull
 
-    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
         assert shot.view is not None
         self.adam.step(
             shot.view, own["affine"], decayed(EXPOSURE_RATE, EXPOSURE_RATE_FINAL, shot.progress), called_off
@@ -109,7 +109,7 @@ class AppearanceEmbedding(Effect):
 
     def setup(self, data: TrainData) -> None:
         self.views = len(data.photos)
-        self.unit = Unit(data.scene.points.xyz, data.device)
+        self.unit = SceneNormaliser(data.scene.points.xyz, data.device)
         rng = np.random.default_rng([data.seed, 0xA9])
 
         def weights(*shape: int) -> Tensor:
@@ -134,7 +134,7 @@ class AppearanceEmbedding(Effect):
         # multiply by the embedding first: one matrix [33, 6] a view instead of SIZE of them a Gaussian
         return hidden @ torch.einsum("hse,s->he", net["last"].reshape(-1, SIZE, 6), embedding)
 
-    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
         row = shot.row(self.views)
         if row is None:
             return gaussians, same
@@ -153,7 +153,7 @@ class AppearanceEmbedding(Effect):
 
         return replace(gaussians, sh0=sh0.detach()), pull
 
-    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
         assert shot.view is not None
         share = decayed(1.0, FINAL, shot.progress)
         self.rows_of_photos.step(shot.view, own["row"], RATE_ROWS * share, called_off)

@@ -65,7 +65,7 @@ _PEAK = 3  # planes around the best one that belong to its peak
 
 
 @dataclass(frozen=True)
-class _Photo:
+class _ReducedPhoto:
     """One photo, reduced."""
 
     camera: Camera  # for the size of the reduced photo
@@ -113,7 +113,7 @@ def dense_points(
 
 def _small(
     camera: Camera, photo: np.ndarray, keep: np.ndarray | None, xyz: np.ndarray, track: np.ndarray, side: int
-) -> _Photo:
+) -> _ReducedPhoto:
     share = min(1.0, side / max(photo.shape[:2]))
     size = tuple(max(round(n * share), 8) for n in photo.shape[1::-1])
     rgb = cv2.resize(np.ascontiguousarray(photo, np.float32), size, interpolation=cv2.INTER_AREA)
@@ -127,10 +127,10 @@ def _small(
         pixels, z = _projected(shrunk, xyz[some])
         seen = some[_inside(pixels, z, rgb.shape[:2])]
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    return _Photo(shrunk, rgb, grey, np.where(static, grey, np.float32(-1.0)), static, seen)
+    return _ReducedPhoto(shrunk, rgb, grey, np.where(static, grey, np.float32(-1.0)), static, seen)
 
 
-def _neighbours(small: Sequence[_Photo], at: int, xyz: np.ndarray, most: int) -> list[int]:
+def _neighbours(small: Sequence[_ReducedPhoto], at: int, xyz: np.ndarray, most: int) -> list[int]:
     """Return the photos with most common sparse points under good angles, best first (as MVSNet)."""
     own, scores = small[at], []
     for k, other in enumerate(small):
@@ -146,7 +146,7 @@ def _neighbours(small: Sequence[_Photo], at: int, xyz: np.ndarray, most: int) ->
     return [k for _, k in sorted(scores)[:most]]
 
 
-def _depth(photo: _Photo, others: Sequence[_Photo], xyz: np.ndarray) -> np.ndarray:
+def _depth(photo: _ReducedPhoto, others: Sequence[_ReducedPhoto], xyz: np.ndarray) -> np.ndarray:
     """Return the depth [h, w] float32 of a photo; 0 where it is unknown."""
     shape = photo.grey.shape
     z = _projected(photo.camera, xyz[photo.seen])[1]
@@ -219,7 +219,9 @@ def _box(x: np.ndarray, window: int) -> np.ndarray:
     return cv2.blur(x, (window, window), borderType=cv2.BORDER_REFLECT)
 
 
-def _agreeing(photo: _Photo, depth: np.ndarray, others: Sequence[tuple[_Photo, np.ndarray]]) -> np.ndarray:
+def _agreeing(
+    photo: _ReducedPhoto, depth: np.ndarray, others: Sequence[tuple[_ReducedPhoto, np.ndarray]]
+) -> np.ndarray:
     """Keep the depths [h, w] that enough other photos agree with; 0 elsewhere."""
     rows, columns = np.nonzero(depth > 0)
     world = _world(photo.camera, columns, rows, depth[rows, columns])
@@ -243,7 +245,7 @@ def _same_surface(camera: Camera, depth: np.ndarray, world: np.ndarray, toleranc
 
 
 def _thinned(
-    small: Sequence[_Photo], depths: Sequence[np.ndarray], most: int, tolerance: float
+    small: Sequence[_ReducedPhoto], depths: Sequence[np.ndarray], most: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose points evenly over the photos, each surface once: xyz [M, 3], rgb [M, 3] in [0, 1], M <= most.
 
@@ -261,7 +263,7 @@ def _thinned(
 
 
 def _one_a_cell(
-    small: Sequence[_Photo], depths: Sequence[np.ndarray], cell: int, tolerance: float
+    small: Sequence[_ReducedPhoto], depths: Sequence[np.ndarray], cell: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3))
     for photo, depth in zip(small, depths):

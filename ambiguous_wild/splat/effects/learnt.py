@@ -30,7 +30,7 @@ from ambiguous_wild.splat.rendered import (
     ShadePull,
     sum_own,
 )
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.step import TrainData, ViewContext
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,17 @@ class Learnt(Effect):
         """Return what is learnt beside the attributes of Gaussians (`Effect.rows`)."""
         return {}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         """Return colours [M, 3] of the visible Gaussians; the renderer clamps them at 0."""
         return visible.base
 
-    def change(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: Shot) -> Mapping[str, Tensor]:
+    def change(
+        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext
+    ) -> Mapping[str, Tensor]:
         """Return by name those raw parameters [N, ...] that are drawn with other values."""
         return {}
 
-    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: Shot) -> Tensor:
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
         """Return the picture [H, W, 3] as it is compared with the photo."""
         return image
 
@@ -98,11 +100,11 @@ class Learnt(Effect):
             return values.clone()[None]
         return torch.cat([values, torch.zeros_like(values[:1])])
 
-    def _leaf(self, shot: Shot) -> dict[str, Tensor]:
+    def _leaf(self, shot: ViewContext) -> dict[str, Tensor]:
         """Return copies of the leaves, to differentiate and to read after the optimiser's step."""
         return {name: self._row(name, shot).detach().clone() for name in self._leaves}
 
-    def _row(self, name: str, shot: Shot) -> Tensor:
+    def _row(self, name: str, shot: ViewContext) -> Tensor:
         values = self._adam[name].values
         if not self._leaves[name].per_photo:
             return values[0]
@@ -121,7 +123,7 @@ class Learnt(Effect):
             else getattr(type(self), function) is not getattr(Learnt, function)
         )
 
-    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
         leaf = self._leaf(shot)
         given = {name: tensor.detach().clone() for name, tensor in gaussians.rows()}
         graph = _Graph(leaf, given)
@@ -148,7 +150,7 @@ class Learnt(Effect):
         return replace(gaussians, **drawn), pull
 
     def shade(
-        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: Shot
+        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: ViewContext
     ) -> tuple[Tensor, ShadePull]:
         leaf = self._leaf(shot)
         attributes = {name: values[rows].detach() for name, values in gaussians.attributes.items()}
@@ -169,7 +171,7 @@ class Learnt(Effect):
 
         return colours.detach(), pull
 
-    def image(self, frame: Frame, shot: Shot) -> tuple[Frame, FramePull]:
+    def image(self, frame: Frame, shot: ViewContext) -> tuple[Frame, FramePull]:
         leaf, image, alpha = self._leaf(shot), frame.image.detach().clone(), frame.alpha.detach().clone()
         graph = _Graph(leaf, {"image": image, "alpha": alpha})
         with torch.enable_grad():
@@ -190,7 +192,7 @@ class Learnt(Effect):
 
         return replace(frame, image=toned.detach().contiguous()), pull
 
-    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
         for name, gradient in own.items():
             leaf = self._leaves[name]
             row = shot.view if leaf.per_photo else 0

@@ -53,7 +53,7 @@ def mean_of_seen(values: Tensor, means: Tensor, camera: Camera) -> Tensor:
     return backend_of(means.device).mean_of_rows(values, lambda: in_picture(means, camera))
 
 
-class Unit:
+class SceneNormaliser:
     """Maps positions to units of the scene: 0 at the median, 1 at the 97 % quantile of each axis."""
 
     def __init__(self, xyz: np.ndarray, device: torch.device) -> None:

@@ -22,7 +22,7 @@ from ambiguous_wild.splat.effects.placing import higher_harmonics
 from ambiguous_wild.splat.effects.posed import PosedCamera, on_device, scaled
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.step import TrainData, ViewContext
 
 RATE_PX, FINAL = 0.2, 0.01  # motion of a step in the picture, px, and the share that it decays to
 BEGIN = 0.05  # share of the run before which renders are too poor to correct cameras
@@ -45,7 +45,7 @@ class PoseRefinement(Effect):
         self.cameras = data.cameras
         self.rate = RATE_PX / float(np.median([camera.fx for camera in data.cameras]))  # rad, and depths
 
-    def camera(self, shot: Shot) -> Camera:
+    def camera(self, shot: ViewContext) -> Camera:
         assert shot.view is not None
         if not self.adam.steps[shot.view]:  # never moved: its row need not be read
             return shot.camera
@@ -57,7 +57,7 @@ class PoseRefinement(Effect):
         smaller = shot.camera.width / full.width, shot.camera.height / full.height
         return PosedCamera(shot.camera, pose, scaled(base.intrinsics[0], *smaller))
 
-    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: Shot) -> Mapping[str, Tensor]:
+    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: ViewContext) -> Mapping[str, Tensor]:
         assert shot.view is not None
         row = self.adam.values[shot.view]
         left = left_gradient(gaussians, shot.camera, gradients)
@@ -65,7 +65,7 @@ class PoseRefinement(Effect):
         turn = left[:3] - torch.linalg.cross(self.depth * row[3:], left[3:])
         return {"motion": torch.cat([left_jacobian(row[:3]).T @ turn, self.depth * left[3:]])}
 
-    def step(self, own: Mapping[str, Tensor], shot: Shot, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
         if shot.progress < BEGIN or shot.view is None:
             return
         row = self.adam.values[shot.view]

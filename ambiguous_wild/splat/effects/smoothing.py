@@ -17,7 +17,7 @@ from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.placing import pose_like
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Gradients, Pull
-from ambiguous_wild.splat.step import Shot, TrainData
+from ambiguous_wild.splat.step import TrainData, ViewContext
 
 VARIANCE = 0.2  # variance of the filter, in squared sampling intervals
 MARGIN = 0.15  # share of the picture by which it is widened on each side when points count as seen
@@ -37,7 +37,7 @@ class SmoothingFilter(Effect):
         self._stale = True  # whether rows have changed since the sizes were computed
         self._at = 0  # iteration of the sizes
 
-    def model(self, gaussians: Gaussians, shot: Shot) -> tuple[Gaussians, Pull]:
+    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
         size = self.size
         due = self._stale or (not shot.neutral and shot.iteration - self._at >= EVERY)
         if due or shot.other_gaussians:

@@ -243,7 +243,7 @@ def boards() -> list[bytes]:
 
 @functools.cache
 def board_images() -> list[bytes]:
-    place = board_pictures._Place("tiny", "a, b", "1.png", "=m", "2000 iterations")
+    place = board_pictures._PictureSubject("tiny", "a, b", "1.png", "=m", "2000 iterations")
     kept = board_pictures.folder_of(workshop() / "board")
     board_pictures._write(workshop() / "board", place, encoded(".png", picture()), "0", 20.5, index := {})
     board_pictures._write_index(workshop() / "board", index.values())

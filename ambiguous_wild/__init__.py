@@ -27,7 +27,7 @@ _OFFERED = {
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import build_scene as build_scene
-    from ambiguous_wild.harness.bench import bench as bench
+    from ambiguous_wild.harness.benchmark import bench as bench
     from ambiguous_wild.harness.mask_plan import plan as plan
     from ambiguous_wild.harness.measures import Metric as Metric
     from ambiguous_wild.harness.replay import open_run as open_run

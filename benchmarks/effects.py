@@ -23,8 +23,8 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 
 

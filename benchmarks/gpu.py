@@ -43,7 +43,7 @@ from ambiguous_wild.splat.gsplat_seam import gsplat
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.trainer import Trainer
-from ambiguous_wild.stress import table
+from ambiguous_wild.stress import stress_table
 from ambiguous_wild.stress.case import run
 
 RESULTS = Path(__file__).parent / "results" / "gpu.json"
@@ -132,7 +132,7 @@ def late(trainer: Trainer, gaussians: Gaussians) -> Trainer:
 
 def parity(args: argparse.Namespace) -> list[dict[str, Any]]:
     """The hard cases that apply to a GPU: error against float64, and the allowed error."""
-    rows = [run(case, args.device).plain() for case in table.CASES if "cuda" in case.devices]
+    rows = [run(case, args.device).plain() for case in stress_table.CASES if "cuda" in case.devices]
     for row in rows:
         print({name: row[name] for name in ("key", "error", "tolerance", "passed")}, flush=True)
     return rows

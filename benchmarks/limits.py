@@ -33,7 +33,7 @@ from ambiguous_wild.io.splat_files import read_splats
 from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.cpu import adam, bins, blend, photometric, project, reverse
 from ambiguous_wild.splat.cpu.compile import parallel_kernel, threads
-from ambiguous_wild.splat.cpu.render import RenderedCpu, render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import RenderedCpu, render_cpu
 from ambiguous_wild.splat.cpu.simd import fma, splat, store
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.losses import photometric as photometric_loss

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from ambiguous_wild import bench, build_scene, table
 from ambiguous_wild.builder.settings import BuildSettings
-from ambiguous_wild.harness.bench import Lines
+from ambiguous_wild.harness.benchmark import Lines
 from ambiguous_wild.report.plain_formats import to_markdown
-from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.presets import preset
 
 

@@ -11,9 +11,9 @@ right one.
 
 import torch
 
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt
 from ambiguous_wild.splat.field import GaussianAttribute
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 
 LAMPS = 2
 
@@ -32,7 +32,7 @@ class Lamps(Learnt):
         share[:, 0] = 1.0  # the first lamp starts as light that falls on everything
         return {"lit": GaussianAttribute(share, rate=0.005)}
 
-    def forward(self, visible, leaf, shot):
+    def forward(self, visible, leaf, context):
         light = visible.attributes["lit"] @ leaf["lamps"]  # [M, 3]; zero lamps leave the colours as they are
         return visible.base * (1.0 + light)
 

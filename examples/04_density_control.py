@@ -12,7 +12,7 @@ per Gaussian, carried through growth and pruning, and saved in checkpoints.
 import torch
 
 from ambiguous_wild.splat.density import DensityControl, Growth, largest
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 
 
 class ByPixels(DensityControl):

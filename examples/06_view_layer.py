@@ -13,7 +13,7 @@ import torch
 
 from ambiguous_wild.splat.fields import STATIC, Fields, FieldStart, over
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 
 SIDE, DEPTH, COVER = 24, 0.1, 0.1  # grid of Gaussians; distance from the camera; price of a covered pixel
@@ -35,16 +35,16 @@ class ViewLayers(Fields):
         grey = np.full((len(world), 3), 128, np.uint8)
         return Gaussians.from_points(world, grey, sh_degree=0, opacity=0.006)
 
-    def drawn(self, shot):
-        return [str(shot.view)]
+    def drawn(self, context):
+        return [str(context.view)]
 
-    def compose(self, frames, shot):
-        frame, pull = over(frames[str(shot.view)], frames[STATIC])
-        return frame, lambda cotangents: dict(zip([str(shot.view), STATIC], pull(cotangents)))
+    def compose(self, frames, context):
+        frame, vjp = over(frames[str(context.view)], frames[STATIC])
+        return frame, lambda cotangents: dict(zip([str(context.view), STATIC], vjp(cotangents)))
 
-    def regularise(self, frames, shot):
-        alpha = frames[str(shot.view)].alpha
-        return {str(shot.view): Cotangents(alpha=torch.full_like(alpha, COVER / alpha.numel()))}
+    def regularise(self, frames, context):
+        alpha = frames[str(context.view)].alpha
+        return {str(context.view): Cotangents(alpha=torch.full_like(alpha, COVER / alpha.numel()))}
 
 
 def view_layers() -> MethodHooks:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-from ambiguous_wild.builder import report
+from ambiguous_wild.builder import scene_record
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import SceneRecord
@@ -165,7 +165,7 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> SceneRecord | No
             return None
         return cast(SceneRecord, info)
     if not overwrite:
-        changed = report.what_changed(info.get("inputs", {}), stages.inputs)
+        changed = scene_record.what_changed(info.get("inputs", {}), stages.inputs)
         raise AwError(
             f"{target} exists, built from other {changed}; pass --overwrite to replace it, or "
             "choose another -o"

@@ -11,13 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.builder import report
+from ambiguous_wild.builder import scene_record
 from ambiguous_wild.builder.collect import Capture, read_test_list, split_photos
 from ambiguous_wild.builder.diagnosis import check_registered
 from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
-from ambiguous_wild.builder.map_drawing import FILE as MAP
-from ambiguous_wild.builder.map_drawing import draw_built
-from ambiguous_wild.builder.masks import (
+from ambiguous_wild.builder.keep_masks import (
     add_fixed,
     alphas,
     find_masks,
@@ -25,8 +23,9 @@ from ambiguous_wild.builder.masks import (
     mask_hashes,
     mask_warnings,
 )
-from ambiguous_wild.builder.moving import write_motion
-from ambiguous_wild.builder.package import SceneParts, package
+from ambiguous_wild.builder.map_drawing import FILE as MAP
+from ambiguous_wild.builder.map_drawing import draw_built
+from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     BuildInputs,
@@ -41,6 +40,7 @@ from ambiguous_wild.builder.records import (
     UndistortResult,
 )
 from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.scene_package import SceneParts, package
 from ambiguous_wild.builder.screen import panorama_warnings, screen, without_copies
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan, plans
 from ambiguous_wild.builder.sfm import (
@@ -171,7 +171,7 @@ class Stages:
                 lambda f: downsample(f, flat.folder, factor, jobs=self.jobs, bar=bar),
             )
             small_key, small_folder = small.key, small.folder
-        record_of_build = report.scene_record(
+        record_of_build = scene_record.scene_record(
             settings,
             screened.facts,
             features.facts,
@@ -189,7 +189,7 @@ class Stages:
             warnings=[
                 *mask_warnings(mask_stage.facts if mask_stage else None),
                 *split_warnings,
-                *report.map_warnings(drawn.facts),
+                *scene_record.map_warnings(drawn.facts),
             ],
         )
         record: KeyedRecord = {
@@ -275,7 +275,7 @@ class Stages:
         # Of attempts that place equally many photos the last is taken, which is the most precise.
         best = max(reversed(attempts), key=lambda a: (a.mapping.facts["firm"], a.placed))
         sources, wanted = {f["work_name"]: f["source"] for f in facts}, self.settings.part
-        parts = report.part_lines(best.mapping.facts["parts"], sources, wanted)
+        parts = scene_record.part_lines(best.mapping.facts["parts"], sources, wanted)
         if wanted > len(best.mapping.facts["parts"]) > 0:
             raise AwError(f"no part {wanted}: {'; '.join(parts) or 'the photos form one part'}; omit --part")
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
@@ -290,7 +290,7 @@ class Stages:
             [
                 *panorama_warnings(facts),
                 *used,
-                *report.fixed_lines(best.matches.facts["fixed"]),
+                *scene_record.fixed_lines(best.matches.facts["fixed"]),
                 *parts,
                 "'aw screen PHOTOS -o map.png' draws which photos overlap",
             ],

@@ -13,7 +13,7 @@ import click
 
 from ambiguous_wild.cli.options import PathName, choose_device, prepare_cpu, training_options
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.methods.ablation import Group
+from ambiguous_wild.methods.ablation_groups import Group
 
 
 @click.command(name="ablate")
@@ -63,7 +63,7 @@ def command(
     aw ablate --method refinesplat --scene scene --group masks --iterations 3000 -o ablation
     aw ablate --method my.py:trimmed --scene scene --sweep share=0.7,0.9 -o ablation
     """
-    from ambiguous_wild.methods.ablation import choose_groups, sweep_groups
+    from ambiguous_wild.methods.ablation_groups import choose_groups, sweep_groups
     from ambiguous_wild.methods.registry import get_method, load_plugin, register
 
     for plugin in plugins:
@@ -84,12 +84,12 @@ def command(
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
 
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.cli.progress import ProgressBar
-    from ambiguous_wild.harness.ablation import earlier_groups, plan_study
+    from ambiguous_wild.cli.run_progress import ProgressBar
+    from ambiguous_wild.harness.ablation_study import earlier_groups, plan_study
     from ambiguous_wild.harness.cell import RunOptions
     from ambiguous_wild.harness.grid import run_cells
     from ambiguous_wild.io.files import check_output
-    from ambiguous_wild.report.ablation import markdown_of, report, write_report
+    from ambiguous_wild.report.ablation_report import markdown_of, report, write_report
     from ambiguous_wild.splat.pace import TrainConfig
 
     on = choose_device(device)

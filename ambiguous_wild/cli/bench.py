@@ -18,9 +18,9 @@ from ambiguous_wild.cli.options import (
     say,
     training_options,
 )
-from ambiguous_wild.cli.progress import ProgressBar, finish
+from ambiguous_wild.cli.run_progress import ProgressBar, finish
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.harness.bench import Engine, bench
+from ambiguous_wild.harness.benchmark import Engine, bench
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.suite import PreparedSuite

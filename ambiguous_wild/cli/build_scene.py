@@ -130,7 +130,7 @@ def command(
     any name (front/, back/); several RAW become one scene. They are not changed. If the build is killed,
     the same command continues it.
     """
-    from ambiguous_wild.builder import report
+    from ambiguous_wild.builder import scene_record
     from ambiguous_wild.builder.pipeline import build_scene
     from ambiguous_wild.builder.settings import BuildSettings
     from ambiguous_wild.core.config import from_plain
@@ -154,17 +154,17 @@ def command(
     info = result.info
     first = next(iter(sorted((result.scene / info["images"]).iterdir())))
     size = image_size(first)
-    verdict = report.verdict(info, size, output)
+    verdict = scene_record.verdict(info, size, output)
     if as_json:
         click.echo(json.dumps(_facts(result, size, verdict), indent=2, ensure_ascii=False))
         return
     if result.up_to_date:
         click.echo(f"{output} is up to date")
-    for line in report.summary_lines(info):
+    for line in scene_record.summary_lines(info):
         click.echo(line)
     if not result.up_to_date:
         spent = ", ".join(f"{stage} {s:.1f}" for stage, s in info["seconds"].items())
-        click.echo(f"{result.seconds:.1f} s ({spent}; COLMAP {100 * report.sfm_share(info):.0f} %)")
+        click.echo(f"{result.seconds:.1f} s ({spent}; COLMAP {100 * scene_record.sfm_share(info):.0f} %)")
     click.echo(verdict)
 
 

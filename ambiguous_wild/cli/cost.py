@@ -64,7 +64,7 @@ def command(
     if any(not math.isfinite(t) for t in targets):
         raise AwError("--target must be a number of dB, e.g. 25")
     from ambiguous_wild.io.files import check_output
-    from ambiguous_wild.report.cost import cost_report, plain_data, to_text, write_report
+    from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text, write_report
     from ambiguous_wild.report.cost_runs import read_cost_runs
 
     if (recommended is None) != (budget is None):

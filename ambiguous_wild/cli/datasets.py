@@ -123,7 +123,7 @@ def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, a
         return
     if name is None:
         raise AwError("which dataset? 'aw fetch --list' lists them")
-    from ambiguous_wild.cli.progress import ticking
+    from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.datasets.fetch import fetch
 
     data = find_public(name)
@@ -261,7 +261,7 @@ def verify_command(package: Path, scratch: Path | None, as_json: bool) -> None:
 
     Nothing is trusted: hostile archives are refused.
     """
-    from ambiguous_wild.datasets.verify import verify
+    from ambiguous_wild.datasets.package_check import verify
 
     verified = verify(package, scratch=scratch)
     if as_json:

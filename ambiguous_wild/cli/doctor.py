@@ -285,7 +285,7 @@ def _installed(name: str, extra: str, use: str) -> SystemCheck:
 
 def _extras() -> list[SystemCheck]:
     """Check packages for single commands, and nerfbaselines, which has its own environment."""
-    from ambiguous_wild.methods.nerfbaselines import find_program
+    from ambiguous_wild.methods.nerfbaselines_methods import find_program
 
     checks = [
         _installed("ray", "ray", "aw bench --engine ray"),
@@ -303,15 +303,15 @@ def _extras() -> list[SystemCheck]:
 
 def _vision() -> list[SystemCheck]:
     """Check foundation models: transformers and the weights."""
-    from ambiguous_wild.vision import weights
+    from ambiguous_wild.vision import weight_registry
 
     # Weights of LPIPS are listed by metric.
-    listed = {w.name: w for w in weights.KNOWN if "LPIPS" not in w.used_for}
+    listed = {w.name: w for w in weight_registry.KNOWN if "LPIPS" not in w.used_for}
     return [
         _installed("transformers", "masks", "DINO features, SAM masks"),
         *(
             _optional(w.name, w.present, f"{listed[w.name].used_for}: {w.where}", w.command)
-            for w in weights.status(listed.values())
+            for w in weight_registry.status(listed.values())
         ),
     ]
 
@@ -329,13 +329,15 @@ def _torchvision(probed: Probe | None) -> SystemCheck:
 def _metrics() -> list[SystemCheck]:
     """Check LPIPS metric by metric, because each needs two files."""
     from ambiguous_wild.metrics import lpips
-    from ambiguous_wild.vision import weights
+    from ambiguous_wild.vision import weight_registry
 
     checks = []
     for metric in lpips.VARIANTS:
         missing = lpips.missing_weights(metric)
         detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
-        checks.append(_optional(metric, not missing, detail, weights.fix(*missing) if missing else ""))
+        checks.append(
+            _optional(metric, not missing, detail, weight_registry.fix(*missing) if missing else "")
+        )
     return checks
 
 

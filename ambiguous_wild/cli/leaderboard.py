@@ -76,7 +76,7 @@ def add_command(
     Changed, partial, failed and foreign runs are refused, one line each; unfinished runs are
     left for later. Adding a run twice changes nothing.
     """
-    from ambiguous_wild.cli.progress import ticking
+    from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.report.board_edit import add
 
     with ticking(unit="run") as tick:

@@ -204,7 +204,7 @@ def _printed() -> logging.Handler:
     """Return a handler that prints records above a progress bar."""
     from tqdm import tqdm
 
-    from ambiguous_wild.cli.progress import VERBOSE
+    from ambiguous_wild.cli.run_progress import VERBOSE
 
     handler = logging.Handler()
     handler.set_name(VERBOSE)

@@ -16,8 +16,8 @@ from ambiguous_wild.cli.options import FiniteFloat, PathName, seed_option
 from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
-    from ambiguous_wild.simulate.records import PhotoTruth, Spread
     from ambiguous_wild.simulate.spec import CaptureSpec
+    from ambiguous_wild.simulate.truth_records import PhotoTruth, Spread
 
 
 @click.command("simulate")
@@ -99,7 +99,7 @@ def simulate_command(
     from tqdm import tqdm
 
     from ambiguous_wild.io.files import check_output, folder_lock, sweep_siblings
-    from ambiguous_wild.simulate.capture import simulate
+    from ambiguous_wild.simulate.capture_writer import simulate
 
     bar = functools.partial(tqdm, unit="photo", desc=f"simulate {spec.name}", disable=as_json or None)
     check_output(output)

@@ -63,7 +63,7 @@ def command(
     if run is not None:
         _replay(run)
         return
-    from ambiguous_wild.stress import table
+    from ambiguous_wild.stress import stress_table
 
     if methods:
         from ambiguous_wild.methods.registry import get_method
@@ -73,7 +73,7 @@ def command(
             raise AwError("--method is checked on the CPU, alone: leave out --only and --device cuda")
         cases, device = [case_of(get_method(name)) for name in methods], "cpu"
     else:
-        cases = table.chosen(only)
+        cases = stress_table.chosen(only)
     if listing:
         click.echo("\n".join(c.key for c in cases))
         return
@@ -81,17 +81,21 @@ def command(
     style = "json" if as_json else style
     live = style == "text" and output is None
     if live:
-        click.echo(table.HEADER)
-    outcomes = table.run_all(cases, devices, (lambda o: click.echo(table.to_line(o))) if live else None)
+        click.echo(stress_table.HEADER)
+    outcomes = stress_table.run_all(
+        cases, devices, (lambda o: click.echo(stress_table.to_line(o))) if live else None
+    )
     if style == "json":
         text = json.dumps([o.plain() for o in outcomes], indent=2, allow_nan=False) + "\n"
     elif style == "markdown":
         from ambiguous_wild.report.plain_formats import to_markdown
-        from ambiguous_wild.report.table import text_table
+        from ambiguous_wild.report.table_layout import text_table
 
-        text = to_markdown([text_table("", table.HEAD, map(table.row, outcomes), words=table.WORDS)])
+        text = to_markdown(
+            [text_table("", stress_table.HEAD, map(stress_table.row, outcomes), words=stress_table.WORDS)]
+        )
     else:
-        text = "\n".join([table.HEADER, *map(table.to_line, outcomes)]) + "\n"
+        text = "\n".join([stress_table.HEADER, *map(stress_table.to_line, outcomes)]) + "\n"
     if output is not None:
         from ambiguous_wild.io.files import write_text
 

@@ -165,7 +165,7 @@ def score_command(
     from ambiguous_wild.io.files import check_output, is_record, refuse_files_there
     from ambiguous_wild.io.files import refuse_foreign_files as refuse_strangers
     from ambiguous_wild.study.answers import read_answers, read_key
-    from ambiguous_wild.study.report import SCORE_FILES, markdown_of, write_scores
+    from ambiguous_wild.study.score_report import SCORE_FILES, markdown_of, write_scores
     from ambiguous_wild.study.scores import score
 
     key_of_study = read_key(key)

@@ -24,7 +24,7 @@ from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.store import Runs
-    from ambiguous_wild.report.table import Table
+    from ambiguous_wild.report.table_layout import Table
 
 STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
 # Suffix of -o -> format.
@@ -228,7 +228,7 @@ def _layouts(
     reported_from: Path | None,
 ) -> list[Table]:
     from ambiguous_wild.report import papers
-    from ambiguous_wild.report.ablation import ablation
+    from ambiguous_wild.report.ablation_report import ablation
     from ambiguous_wild.report.papers import datasets_of, read_reported, with_reported
 
     if loaded is None:

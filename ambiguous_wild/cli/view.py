@@ -158,7 +158,7 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
     aw video runs -o video.mp4
     aw video runs --path orbit --seconds 12 --fps 30 --gif video.gif
     """
-    from ambiguous_wild.cli.progress import ticking
+    from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.report.model_views import video_runs
 
     with ticking(unit="frame") as tick:

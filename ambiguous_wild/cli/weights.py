@@ -26,10 +26,10 @@ def command() -> None:
 def list_command(as_json: bool) -> None:
     """List every network: size, licence, source, use, and whether it is on this machine."""
     from ambiguous_wild.core.weight_files import folder_fault, weights_folder
-    from ambiguous_wild.vision import weights
+    from ambiguous_wild.vision import weight_registry
 
-    every = weights.KNOWN + weights.OTHER_SIZES
-    rows = list(zip(every, weights.status(every)))
+    every = weight_registry.KNOWN + weight_registry.OTHER_SIZES
+    rows = list(zip(every, weight_registry.status(every)))
     if as_json:
         facts = [
             {
@@ -52,7 +52,7 @@ def list_command(as_json: bool) -> None:
             f"{mark} {w.name.ljust(width)}  {size.rjust(7)}  {w.source.ljust(source)}  {w.licence.ljust(18)}"
         )
         click.echo(f"{text}  {w.used_for}")
-    for name, members in weights.GROUPS.items():
+    for name, members in weight_registry.GROUPS.items():
         click.echo(f"\n{name} = {', '.join(members)}")
     present = sum(line.present for _, line in rows)
     how = folder_fault() or f"'aw weights get NAME' downloads into {weights_folder()}"
@@ -69,10 +69,10 @@ def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     A network that is already there is checked, and downloaded again only if it is damaged. Hashes are checked;
     pickles are converted to safetensors, and only arrays are read from them.
     """
-    from ambiguous_wild.vision import fetch, weights
+    from ambiguous_wild.vision import weight_download, weight_registry
 
-    wanted = weights.chosen(names)
-    places = fetch.get(wanted, lambda line: click.echo(line, err=True), again)
+    wanted = weight_registry.chosen(names)
+    places = weight_download.get(wanted, lambda line: click.echo(line, err=True), again)
     if as_json:
         rows = [{"name": w.name, "where": str(place)} for w, place in zip(wanted, places)]
         click.echo(json.dumps(rows, indent=2))
@@ -87,11 +87,13 @@ def check_command(names: tuple[str, ...], as_json: bool) -> None:
     Exit code 2 if one is missing, damaged, or not the network that its name says.
     """
     from ambiguous_wild.core.weight_files import folder_fault
-    from ambiguous_wild.vision import weights
-    from ambiguous_wild.vision.verify import verify
+    from ambiguous_wild.vision import weight_registry
+    from ambiguous_wild.vision.weight_check import verify
 
-    every = weights.KNOWN + weights.OTHER_SIZES
-    wanted = weights.chosen(names) if names else [w for w in every if weights.where(w) is not None]
+    every = weight_registry.KNOWN + weight_registry.OTHER_SIZES
+    wanted = (
+        weight_registry.chosen(names) if names else [w for w in every if weight_registry.where(w) is not None]
+    )
     verdicts = []
     for weight in wanted:
         verdicts.append(verify(weight))

@@ -15,7 +15,7 @@ import numpy as np
 from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.foreign import without_suffix
-from ambiguous_wild.datasets.photos import link_file
+from ambiguous_wild.datasets.imported_photos import link_file
 from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera

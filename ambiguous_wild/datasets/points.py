@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from ambiguous_wild.builder.moving import write_motion
+from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import MotionResult, ScreenedPhoto
 from ambiguous_wild.builder.retrieval import MOTIONS

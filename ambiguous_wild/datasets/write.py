@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import NotRequired, TypedDict, cast
 
 from ambiguous_wild.builder.downsample import check_factor
-from ambiguous_wild.builder.masks import mask_warnings
-from ambiguous_wild.builder.package import list_files, nerfbaselines_info
+from ambiguous_wild.builder.keep_masks import mask_warnings
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.report import point_checks
+from ambiguous_wild.builder.scene_package import list_files, nerfbaselines_info
+from ambiguous_wild.builder.scene_record import point_checks
 from ambiguous_wild.builder.workspace import build_lock, content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
-from ambiguous_wild.datasets.photos import (
+from ambiguous_wild.datasets.imported_photos import (
     PhotoPlan,
     PlacedPhoto,
     at_photo_size,

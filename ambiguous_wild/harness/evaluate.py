@@ -18,7 +18,7 @@ from ambiguous_wild.harness.result_file import Cost, MaskScores
 from ambiguous_wild.io.files import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.metrics import image as image_metrics
-from ambiguous_wild.metrics import masks as mask_metrics
+from ambiguous_wild.metrics import mask_scores as mask_metrics
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.trainer import Trainer

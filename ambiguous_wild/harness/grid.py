@@ -18,6 +18,14 @@ from ambiguous_wild.harness.cell import (
     RunOptions,
     scene_identity,
 )
+from ambiguous_wild.harness.cell_run import (
+    left_alone,
+    made_anew,
+    refuse_other_code,
+    refuse_other_config,
+    refuse_strange_folder,
+    run_cell,
+)
 from ambiguous_wild.harness.chosen_effects import (
     Chosen,
     check_wanted,
@@ -26,22 +34,14 @@ from ambiguous_wild.harness.chosen_effects import (
     takes_effects,
 )
 from ambiguous_wild.harness.effects_plan import EffectsPlan, plan_effects
-from ambiguous_wild.harness.run import (
-    left_alone,
-    made_anew,
-    refuse_other_code,
-    refuse_other_config,
-    refuse_strange_folder,
-    run_cell,
-)
 from ambiguous_wild.harness.start import start_file, start_line, started
 from ambiguous_wild.harness.timing import LEAST, MOST, expected_s, slowness
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.effects import ALL, check_effects
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MethodHooks
 
 
 def try_recipes(cells: Sequence[Cell]) -> list[str]:

@@ -19,10 +19,10 @@ from pathlib import Path
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
+from ambiguous_wild.harness.cell_run import error_line, run_cell
 from ambiguous_wild.harness.chosen_effects import Chosen
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
-from ambiguous_wild.harness.run import error_line, run_cell
 from ambiguous_wild.harness.start import recorded_start
 from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene

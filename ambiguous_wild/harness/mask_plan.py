@@ -35,8 +35,8 @@ from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.splat.data import load_train_data, shrink_keep
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import ALL, with_effects
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
 

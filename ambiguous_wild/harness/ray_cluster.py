@@ -19,9 +19,9 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.callbacks import Engine
 from ambiguous_wild.harness.cell import CellReport, RunOptions
+from ambiguous_wild.harness.cell_run import error_line, is_finished, left_alone
 from ambiguous_wild.harness.job import LOCK_WAIT_S, Job, run_job
 from ambiguous_wild.harness.result_file import RESULT, read_result
-from ambiguous_wild.harness.run import error_line, is_finished, left_alone
 from ambiguous_wild.io.archive import Limits, pack_folder, unpack
 from ambiguous_wild.io.files import atomic_dir, folder_lock, patient_lock
 

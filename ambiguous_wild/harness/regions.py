@@ -21,7 +21,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.images import read_gray, read_keep_map
-from ambiguous_wild.metrics import masks
+from ambiguous_wild.metrics import mask_scores
 from ambiguous_wild.vision.sparse_surface import (
     BEHIND,
     in_map,
@@ -144,7 +144,7 @@ def _psnr(metric: str, drawn: np.ndarray, photo: np.ndarray, view: View, scene: 
     if metric in regions.missing:
         raise AwError(regions.missing[metric])
     pixels = regions.pixels[metric].get(view.name)
-    return math.nan if pixels is None else masks.psnr_valid(drawn, photo, pixels[:, -photo.shape[1] :])
+    return math.nan if pixels is None else mask_scores.psnr_valid(drawn, photo, pixels[:, -photo.shape[1] :])
 
 
 psnr_covered, psnr_uncovered = partial(_psnr, COVERED), partial(_psnr, UNCOVERED)

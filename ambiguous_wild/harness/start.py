@@ -14,8 +14,8 @@ from ambiguous_wild.io.ply import has_splats, read_point_ply
 from ambiguous_wild.io.splat_files import SplatFile, read_splats
 
 if TYPE_CHECKING:
+    from ambiguous_wild.splat.method_hooks import MethodHooks
     from ambiguous_wild.splat.pace import TrainConfig
-    from ambiguous_wild.splat.parts import MethodHooks
 
 _CHECKED_POINTS = 2000  # number of points that are projected into the train views
 
@@ -72,8 +72,8 @@ def started(parts: MethodHooks, start: StartFile | None, scene: Scene) -> Method
 
 def start_line(start: StartFile, method: str, parts: MethodHooks, train: TrainConfig, scene: Scene) -> str:
     """Return a line that says how many splats or points of the file a run starts from."""
+    from ambiguous_wild.splat.method_hooks import thinned
     from ambiguous_wild.splat.pace import room
-    from ambiguous_wild.splat.parts import thinned
 
     sizes = [(view.camera.height, view.camera.width) for view in scene.train]
     most = room(train, parts.schedule, sizes, parts.density_config.max_gaussians)

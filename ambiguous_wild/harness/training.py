@@ -32,8 +32,8 @@ from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.run import Stopped
 from ambiguous_wild.splat.trainer import Trainer
 
@@ -328,7 +328,7 @@ def _measure(
     """Write the model, renders, masks and pictures of a trained cell; return its result."""
     folder = trainer.folder
     shutil.rmtree(folder / STOPPED, ignore_errors=True)
-    trainer.check_taught()
+    trainer.check_photos_used()
     cost = cost_of(cell, trainer)  # before the measurements below, which are no training
     if first is not None:
         cost = both_passes(first.cost, cost)

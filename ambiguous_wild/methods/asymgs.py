@@ -34,7 +34,7 @@ from ambiguous_wild.splat.field import GaussianAttribute, Rates
 from ambiguous_wild.splat.fields import STATIC, Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks, Schedule
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import make_features, make_instances
@@ -215,18 +215,18 @@ class SecondModel(Fields):
         density = DensityControl(self.config.density, data.scene.extent, data.seed + 1)
         return {TWIN: FieldStart(start, rates, density, most=None)}
 
-    def drawn(self, shot: ViewContext) -> tuple[str, ...]:
+    def drawn(self, context: ViewContext) -> tuple[str, ...]:
         return (TWIN,)
 
-    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
+    def regularise(self, frames: Mapping[str, Frame], context: ViewContext) -> Mapping[str, Cotangents]:
         """Return gradients of the models' difference and of the second one's loss in its own view."""
         apart = frames[STATIC].image - frames[TWIN].image
-        weight = self.config.consistency if shot.nominal > self.config.warm_up else 0.0
-        pull = apart.sign() * (weight / apart.numel())
-        second = -pull
-        if self._second is not None and shot.camera is self._second[1]:
-            second = second + self._photometric(self._second[0], frames[TWIN].image, shot.divisor)
-        return {STATIC: Cotangents(image=pull), TWIN: Cotangents(image=second)}
+        weight = self.config.consistency if context.nominal > self.config.warm_up else 0.0
+        vjp = apart.sign() * (weight / apart.numel())
+        second = -vjp
+        if self._second is not None and context.camera is self._second[1]:
+            second = second + self._photometric(self._second[0], frames[TWIN].image, context.divisor)
+        return {STATIC: Cotangents(image=vjp), TWIN: Cotangents(image=second)}
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
         """Return gradients of both models in the second view, which is drawn with replacement."""

@@ -63,7 +63,7 @@ BUILTIN = (
         name="wildgaussians",
         summary="masks by an uncertainty learnt from features; embeddings change colours",
         recipe="ambiguous_wild.methods.wildgaussians:build",
-        ablations="ambiguous_wild.methods.ablation:WILDGAUSSIANS",
+        ablations="ambiguous_wild.methods.ablation_groups:WILDGAUSSIANS",
         paper="Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447)",
         note="features {features}",
     ),
@@ -129,7 +129,7 @@ BUILTIN = (
         name="gs-w",
         summary="colours by a net, from what each Gaussian is and what it samples in maps of its photo",
         recipe="ambiguous_wild.methods.gsw:build",
-        ablations="ambiguous_wild.methods.ablation:GSW",
+        ablations="ambiguous_wild.methods.ablation_groups:GSW",
         paper="Gaussian in the Wild, from its code",
     ),
     MethodEntry(

@@ -19,9 +19,9 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.field import Rates
-from ambiguous_wild.splat.fields import STATIC, ComposePull, Fields, FieldStart, frames_of, over
+from ambiguous_wild.splat.fields import STATIC, ComposeVjp, Fields, FieldStart, frames_of, over
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Frame
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
@@ -99,17 +99,19 @@ class Layers(Fields):
         gaussians = Gaussians.from_points(world, colours, sh_degree=0, opacity=self.config.start_opacity)
         return replace(gaussians, quats=torch.from_numpy(rng.standard_normal((n, 4)).astype(np.float32)))
 
-    def drawn(self, shot: ViewContext) -> Sequence[str]:
-        return () if shot.view is None or shot.iteration < self.config.min_start else (str(shot.view),)
+    def drawn(self, context: ViewContext) -> Sequence[str]:
+        return (
+            () if context.view is None or context.iteration < self.config.min_start else (str(context.view),)
+        )
 
-    def compose(self, frames: Mapping[str, Frame], shot: ViewContext) -> tuple[Frame, ComposePull]:
-        front = next(iter(self.drawn(shot)), None)
+    def compose(self, frames: Mapping[str, Frame], context: ViewContext) -> tuple[Frame, ComposeVjp]:
+        front = next(iter(self.drawn(context)), None)
         if front is None:
             return frames[STATIC], lambda given: {STATIC: given}
-        frame, pull = over(frames[front], frames[STATIC])
-        return frame, lambda given: dict(zip((front, STATIC), pull(given)))
+        frame, vjp = over(frames[front], frames[STATIC])
+        return frame, lambda given: dict(zip((front, STATIC), vjp(given)))
 
-    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
+    def regularise(self, frames: Mapping[str, Frame], context: ViewContext) -> Mapping[str, Cotangents]:
         weights = dict.fromkeys(frames, self.config.alpha_own) | {STATIC: -self.config.alpha_static}
         alphas = {name: frame.alpha for name, frame in frames.items()}
         return {k: Cotangents(alpha=torch.full_like(a, weights[k] / a.numel())) for k, a in alphas.items()}

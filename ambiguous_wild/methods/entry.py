@@ -18,11 +18,11 @@ from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.methods.ablation import Group
+from ambiguous_wild.methods.ablation_groups import Group
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.external_process import Program
-    from ambiguous_wild.splat.parts import MethodHooks
+    from ambiguous_wild.splat.method_hooks import MethodHooks
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,9 @@ class MethodEntry:
     config: str | type | None = None
     paper: str = ""
     needs: str = ""  # required extras, weights or hardware; empty = none
-    ablations: str | tuple[Group, ...] = ()  # "module:ABLATIONS" or the groups, see methods/ablation.py
+    ablations: (
+        str | tuple[Group, ...]
+    ) = ()  # "module:ABLATIONS" or the groups, see methods/ablation_groups.py
     source_hash: str = ""  # hash of a plugin's file: a changed plugin is another configuration
     # for a graft the method behind each field of its options, see graft.py
     places: tuple[tuple[str, str], ...] = ()
@@ -119,7 +121,7 @@ class MethodEntry:
         Raises:
             AwError: the recipe returned something else, or takes more than the options.
         """
-        from ambiguous_wild.splat.parts import MethodHooks
+        from ambiguous_wild.splat.method_hooks import MethodHooks
 
         recipe = resolve(self.recipe)
         needed = required(recipe)
@@ -131,7 +133,7 @@ class MethodEntry:
         parts = recipe(options) if needed or self.config else recipe()
         if not isinstance(parts, MethodHooks):
             what = "None" if parts is None else type(parts).__name__
-            raise AwError(f"{self.name} returned {what}, it must return Parts (see docs/extend.md)")
+            raise AwError(f"{self.name} returned {what}, it must return MethodHooks (see docs/extend.md)")
         return parts
 
 

@@ -27,15 +27,15 @@ from ambiguous_wild.methods.dronesplat import label_means
 from ambiguous_wild.methods.masking_common import EffectMask, d_keep, resized
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, mlp_leaves
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, mlp_leaves
-from ambiguous_wild.splat.effects.placing import SceneNormaliser, conv_leaves, frequencies
+from ambiguous_wild.splat.effects.geometry import SceneNormaliser, conv_leaves, frequencies
 from ambiguous_wild.splat.field import Rates
-from ambiguous_wild.splat.fields import STATIC, ComposePull, Fields, FieldStart
+from ambiguous_wild.splat.fields import STATIC, ComposeVjp, Fields, FieldStart
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MethodHooks
-from ambiguous_wild.splat.rendered import Cotangents, Frame, Pull
+from ambiguous_wild.splat.method_hooks import MethodHooks
+from ambiguous_wild.splat.rendered import Cotangents, Frame, Vjp
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 OCTAVES, LAYERS, SKIP = 10, 8, 4
@@ -103,11 +103,11 @@ class Nets(Learnt):
         return leaves | conv_leaves("last", (128, 1), rng, self.config.lr_mask, side=1)
 
     def change(
-        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext
+        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], context: ViewContext
     ) -> Mapping[str, Tensor]:
         """Deform the transient Gaussians for this photo."""
-        assert shot.view is not None
-        time = torch.full_like(gaussians.means[:, :1], shot.view / max(self.photos - 1, 1))
+        assert context.view is not None
+        time = torch.full_like(gaussians.means[:, :1], context.view / max(self.photos - 1, 1))
         code = frequencies(torch.cat([self.unit(gaussians.means.detach()), time], dim=1), OCTAVES)
         x = code
         for i in range(LAYERS):
@@ -177,25 +177,25 @@ class Forest(Fields):
         rows = torch.from_numpy(np.sort(rng.choice(len(static), count, replace=False))).to(static.device)
         return {TRANSIENT: FieldStart(replace(static.select(rows), attributes={}), rates)}
 
-    def drawn(self, shot: ViewContext) -> Sequence[str]:
-        return () if shot.view is None else (TRANSIENT,)
+    def drawn(self, context: ViewContext) -> Sequence[str]:
+        return () if context.view is None else (TRANSIENT,)
 
-    def deform(self, name: str, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
-        return self.nets.model(gaussians, shot)
+    def deform(self, name: str, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
+        return self.nets.model(gaussians, context)
 
     @torch.no_grad()
-    def mask(self, shot: ViewContext) -> Tensor:
+    def mask(self, context: ViewContext) -> Tensor:
         """Return M_f of a train photo."""
-        assert shot.photo is not None and shot.view is not None
-        return self.nets.filled(self.nets.masked(shot.photo, self.nets._leaf(shot)), shot.view)
+        assert context.photo is not None and context.view is not None
+        return self.nets.filled(self.nets.masked(context.photo, self.nets._leaf(context)), context.view)
 
-    def compose(self, frames: Mapping[str, Frame], shot: ViewContext) -> tuple[Frame, ComposePull]:
-        front, back, mask = frames[TRANSIENT], frames[STATIC], self.mask(shot)
+    def compose(self, frames: Mapping[str, Frame], context: ViewContext) -> tuple[Frame, ComposeVjp]:
+        front, back, mask = frames[TRANSIENT], frames[STATIC], self.mask(context)
         share = {TRANSIENT: mask, STATIC: 1.0 - mask}
         image = mask[..., None] * front.image + (1.0 - mask)[..., None] * back.image
         alpha = mask * front.alpha + (1.0 - mask) * back.alpha
 
-        def pull(c: Cotangents) -> Mapping[str, Cotangents]:
+        def vjp(c: Cotangents) -> Mapping[str, Cotangents]:
             def of(name: str, value: Tensor | None) -> Tensor | None:
                 if value is None:
                     return None
@@ -206,22 +206,23 @@ class Forest(Fields):
             return {
                 name: Cotangents(
                     of(name, c.image), of(name, c.extra), of(name, c.alpha),
-                    c.depth if name == STATIC else None, own=c.own if name == STATIC else {},
+                    c.depth if name == STATIC else None,
+                    effect_grads=c.effect_grads if name == STATIC else {},
                 )
                 for name in share
             }  # fmt: skip
 
-        return Frame(image, alpha, lambda: back.depth), pull
+        return Frame(image, alpha, lambda: back.depth), vjp
 
-    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
-        assert shot.photo is not None
-        config, nets, photo = self.config, self.nets, shot.photo
+    def regularise(self, frames: Mapping[str, Frame], context: ViewContext) -> Mapping[str, Cotangents]:
+        assert context.photo is not None
+        config, nets, photo = self.config, self.nets, context.photo
         static, transient = frames[STATIC].image.detach(), frames[TRANSIENT].image.detach()
         with torch.enable_grad():
-            leaf = {name: value.requires_grad_() for name, value in nets._leaf(shot).items()}
+            leaf = {name: value.requires_grad_() for name, value in nets._leaf(context).items()}
             mask = nets.masked(photo, leaf)
         m, apart = mask.detach(), transient - photo
-        area = max(config.area_final, config.area * math.exp(-0.001 * shot.nominal))
+        area = max(config.area_final, config.area * math.exp(-0.001 * context.nominal))
         d_mask = 2.0 * area / m.numel() * m + apart.abs().mean(dim=2) / m.numel()
         d_mask = d_mask - config.static * d_keep(static, photo, 1.0 - m)
         with torch.enable_grad():
@@ -229,7 +230,8 @@ class Forest(Fields):
         own = {nets.name: {name: d for name, d in zip(leaf, d_leaves) if d is not None}}
         d_static = config.static * photometric(static, photo, 1.0 - m, weighting="images").d_image
         d_transient = m[..., None] * apart.sign() / apart.numel()
-        return {STATIC: Cotangents(image=d_static, own=own), TRANSIENT: Cotangents(image=d_transient)}
+        of_static = Cotangents(image=d_static, effect_grads=own)
+        return {STATIC: of_static, TRANSIENT: Cotangents(image=d_transient)}
 
 
 class Mixed(EffectMask):

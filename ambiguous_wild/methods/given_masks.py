@@ -12,7 +12,7 @@ from torch import Tensor
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.parts import MaskPolicy
+from ambiguous_wild.splat.method_hooks import MaskPolicy
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 

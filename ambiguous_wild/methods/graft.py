@@ -26,7 +26,7 @@ from ambiguous_wild.methods.references import is_program, is_reference, referenc
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.graft_checks import Member
-    from ambiguous_wild.splat.parts import MethodHooks
+    from ambiguous_wild.splat.method_hooks import MethodHooks
 
 PLACES = ("mask", "density", "regulariser", "effects")
 ALIASES = {"none": "3dgs", "motion": "3dgs+motion", "truth": "3dgs+truth"}  # short names of donors

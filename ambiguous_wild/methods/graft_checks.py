@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 
 NOTHING = ("none", "3dgs")  # donors that leave a place empty
 # hooks by which an effect changes a picture, or the Gaussians in it

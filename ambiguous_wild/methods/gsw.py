@@ -27,8 +27,8 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import EffectMask, d_keep, hashed_uniform
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.effects.placing import (
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.geometry import (
     SceneNormaliser,
     conv_leaves,
     directions,
@@ -39,7 +39,7 @@ from ambiguous_wild.splat.effects.placing import (
 )
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MethodHooks, Schedule
+from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
@@ -176,74 +176,74 @@ class GswAppearance(Learnt):
             "gsw_box": GaussianAttribute(torch.ones(len(means), 2, device=means.device), box, box / 100),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
-        photo, means = self._seen(shot), visible.means.detach()
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+        photo, means = self._seen(context), visible.means.detach()
         intrinsic = visible.attributes["gsw_intrinsic"]
-        maps = self._mean_maps(shot, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
+        maps = self._mean_maps(context, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
         places, box = visible.attributes["gsw_places"], visible.attributes["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
-        width = shot.camera.width // 2 if shot.fitting else shot.camera.width  # of the picture read
-        own, inside = at_pixels(maps[FREE], means, shot.camera, width, box)
-        if shot.fitting or photo is None:
-            usual = self._usual(shot, leaf, means, box)
+        width = context.camera.width // 2 if context.fitting else context.camera.width  # of the picture read
+        own, inside = at_pixels(maps[FREE], means, context.camera, width, box)
+        if context.fitting or photo is None:
+            usual = self._usual(context, leaf, means, box)
             own = usual if photo is None else torch.where(inside[:, None], own, usual)
         else:
             own = own * inside[:, None]
         dynamic = torch.cat([*free, own], dim=1)
-        if shot.view is not None and self.config.dropout:
-            key = (self.seed, shot.iteration)
+        if context.view is not None and self.config.dropout:
+            key = (self.seed, context.iteration)
             kept = hashed_uniform(dynamic.numel(), key, dynamic.device) >= self.config.dropout
             dynamic = dynamic * kept.reshape(dynamic.shape) / (1.0 - self.config.dropout)
         code = frequencies(self.unit(means), OCTAVES)
         hidden = mlp(torch.cat([code, dynamic, intrinsic], dim=1), leaf, "encoder")
         hidden = mlp(torch.cat([hidden, intrinsic], dim=1), leaf, "decoder")
-        colours = 0.5 + mlp(torch.cat([hidden, directions(means, shot.camera)], dim=1), leaf, "head")
+        colours = 0.5 + mlp(torch.cat([hidden, directions(means, context.camera)], dim=1), leaf, "head")
         if self.config.residual:
             colours = colours + SH_C0 * intrinsic[:, :3]
-        beyond = mean_of_seen(F.relu(places.abs() - 1.0), means, shot.camera)
+        beyond = mean_of_seen(F.relu(places.abs() - 1.0), means, context.camera)
         return with_penalty(colours, self.config.outside * beyond)
 
-    def _seen(self, shot: ViewContext) -> Tensor | None:
+    def _seen(self, context: ViewContext) -> Tensor | None:
         """Return the input of the U-Net: the photo, or the left half of a test photo."""
-        if shot.photo is None or shot.neutral:
+        if context.photo is None or context.neutral:
             return None
-        return shot.photo[:, : shot.photo.shape[1] // 2] if shot.fitting else shot.photo
+        return context.photo[:, : context.photo.shape[1] // 2] if context.fitting else context.photo
 
     @torch.no_grad()
-    def _maps(self, shot: ViewContext, leaf: Mapping[str, Tensor]) -> list[Tensor]:
+    def _maps(self, context: ViewContext, leaf: Mapping[str, Tensor]) -> list[Tensor]:
         """Return maps of at most `MOST` train photos, evenly chosen; computed once an iteration."""
-        if self._cached is None or self._cached[0] != shot.nominal:
+        if self._cached is None or self._cached[0] != context.nominal:
             maps = [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen]
-            self._cached = shot.nominal, maps
+            self._cached = context.nominal, maps
         return self._cached[1]
 
     @torch.no_grad()
-    def _mean_maps(self, shot: ViewContext, leaf: Mapping[str, Tensor]) -> Tensor:
+    def _mean_maps(self, context: ViewContext, leaf: Mapping[str, Tensor]) -> Tensor:
         """Return the mean of `_maps`, at the size of the first."""
-        maps = self._maps(shot, leaf)
+        maps = self._maps(context, leaf)
         size = maps[0].shape[2:]
         return torch.stack([F.interpolate(m, size=size, mode="bilinear") for m in maps]).mean(dim=0)
 
     @torch.no_grad()
-    def _usual(self, shot: ViewContext, leaf: Mapping[str, Tensor], means: Tensor, box: Tensor) -> Tensor:
+    def _usual(self, context: ViewContext, leaf: Mapping[str, Tensor], means: Tensor, box: Tensor) -> Tensor:
         """Return the mean sample of each Gaussian in the train photos that show it, [M, 16]."""
         total, count = means.new_zeros(len(means), CHANNELS), means.new_zeros(len(means), 1)
-        for k, maps in zip(self.chosen, self._maps(shot, leaf)):
+        for k, maps in zip(self.chosen, self._maps(context, leaf)):
             own, inside = at_pixels(maps[FREE], means, self.cameras[k], self.cameras[k].width, box)
             total, count = total + own * inside[:, None], count + inside[:, None].float()
         return total / count.clamp(min=1.0)
 
-    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None) -> None:
         self._cached = None
-        super().step(own, shot, called_off)
+        super().step(own, context, skip_step)
 
     def load_state_dict(self, state: State) -> None:
         self._cached = None
         super().load_state_dict(state)
 
-    def learnable(self, shot: ViewContext) -> dict[str, Tensor]:
+    def learnable(self, context: ViewContext) -> dict[str, Tensor]:
         """Return copies of all leaves that can be differentiated."""
-        return {name: value.requires_grad_() for name, value in self._leaf(shot).items()}
+        return {name: value.requires_grad_() for name, value in self._leaf(context).items()}
 
 
 def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -290,7 +290,7 @@ class Visibility(EffectMask):
                 mask, list(leaf.values()), self.d_mask(step, mask.detach()), allow_unused=True
             )
         own = {name: d for name, d in zip(leaf, d_leaves) if d is not None}
-        return Cotangents(own={self.effect.name: own})
+        return Cotangents(effect_grads={self.effect.name: own})
 
     def d_mask(self, step: Step, mask: Tensor) -> Tensor:
         """Return dL/dM [H, W] of 0.8 |M R - M I| + 0.2 D-SSIM(M R, M I) + prior mean (1 - M)^2."""

@@ -22,9 +22,9 @@ from torch import Tensor
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import CountingMask, EffectMask, MaskedShares
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
@@ -73,15 +73,17 @@ class Plane(Learnt):
         start[..., 5:8] = rng.uniform(0.0, 1.0, (*shape, 3))
         return {"planar": Leaf(torch.from_numpy(start), self.config.lr, per_photo=True)}
 
-    def layer(self, planar: Tensor, shot: ViewContext) -> tuple[Tensor, Tensor]:
+    def layer(self, planar: Tensor, context: ViewContext) -> tuple[Tensor, Tensor]:
         """Return T [H, W, 3] and M [H, W] of the photo."""
-        sums = planar_sums(planar, shot.camera.height, shot.camera.width, self.config.reach).clamp(0.0, 1.0)
+        sums = planar_sums(planar, context.camera.height, context.camera.width, self.config.reach).clamp(
+            0.0, 1.0
+        )
         return sums[..., :3], sums[..., 3]
 
-    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
-        if shot.view is None or shot.other_gaussians or shot.nominal < self.config.joint:
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+        if context.view is None or context.other_gaussians or context.nominal < self.config.joint:
             return image
-        return composed(*self.layer(leaf["planar"], shot), image)
+        return composed(*self.layer(leaf["planar"], context), image)
 
 
 def composed(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
@@ -119,13 +121,13 @@ class PlaneMask(EffectMask, CountingMask):
         with torch.enable_grad():
             planar = self.effect._leaf(step)["planar"].requires_grad_()
             front, mask = self.effect.layer(planar, step)
-            outputs, pulls = [mask], [torch.full_like(mask, self.config.area / mask.numel())]
+            outputs, vjps = [mask], [torch.full_like(mask, self.config.area / mask.numel())]
             if step.nominal < self.config.joint:
                 picture = composed(front, mask, step.rendered.image.detach())
                 outputs.append(picture)
-                pulls.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
-            (d_planar,) = torch.autograd.grad(outputs, planar, pulls)
-        return Cotangents(own={self.effect.name: {"planar": d_planar}})
+                vjps.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
+            (d_planar,) = torch.autograd.grad(outputs, planar, vjps)
+        return Cotangents(effect_grads={self.effect.name: {"planar": d_planar}})
 
     @staticmethod
     def _user(keep: Tensor | None, mask: Tensor) -> Tensor | None:

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.effects.learnt import Learnt
+from ambiguous_wild.splat.effects.autograd_effect import Learnt
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MaskPolicy
+from ambiguous_wild.splat.method_hooks import MaskPolicy
 from ambiguous_wild.splat.step import Step, TrainData
 
 

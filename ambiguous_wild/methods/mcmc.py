@@ -17,8 +17,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices, shaped
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
 

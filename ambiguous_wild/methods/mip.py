@@ -20,7 +20,7 @@ from ambiguous_wild.methods.absgs import AbsoluteSums
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 
 

@@ -19,10 +19,10 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.palette import MASKED, faded, tint
 from ambiguous_wild.methods.given_masks import FixedMasks
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances
-from ambiguous_wild.vision.moving import MOVES, POINTS, draw_points, moving_labels, moving_map
+from ambiguous_wild.vision.motion_maps import MOVES, POINTS, draw_points, moving_labels, moving_map
 from ambiguous_wild.vision.precompute import instance_labels
 from ambiguous_wild.vision.sparse_surface import map_size
 

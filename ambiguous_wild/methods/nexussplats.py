@@ -34,11 +34,11 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.methods.wildgaussians import FeatureDistance, fourier
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.effects.placing import directions, in_picture
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.geometry import directions, in_picture
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import check_features
@@ -126,12 +126,12 @@ class Codes(Learnt):
             "nexus_doubt": GaussianAttribute(doubt, self.config.lr_code),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["light"].expand(len(visible.base), CODE)
-        towards = directions(visible.means.detach(), shot.camera)
+        towards = directions(visible.means.detach(), context.camera)
         inputs = torch.cat([visible.base, visible.attributes["nexus_light"], photo, towards], dim=1)
-        if shot.view is not None and self.config.dropout:
-            kept = hashed_uniform(inputs.numel(), (self.seed, shot.iteration), inputs.device)
+        if context.view is not None and self.config.dropout:
+            kept = hashed_uniform(inputs.numel(), (self.seed, context.iteration), inputs.device)
             kept = (kept >= self.config.dropout).reshape(inputs.shape) / (1.0 - self.config.dropout)
             inputs = inputs * kept
         return visible.base + 2.0 * torch.sigmoid(mlp(inputs, leaf, "toned")) - 1.0
@@ -210,7 +210,7 @@ class Doubt(EffectMask, CountingMask, WarmUpMask):
         gradients = replace(
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
             screen=torch.zeros_like(back.screen), attributes={"nexus_doubt": d_codes},
-            own={self.effect.name: own},
+            effect_grads={self.effect.name: own},
         )  # fmt: skip
         return judged, gradients
 
@@ -250,5 +250,5 @@ class SmallVolumes(DensityControl):
 
     def before_step(self, step: Step, gradients: Gradients) -> Gradients:
         g = step.gaussians
-        pull = self.weight * self.weights(g) * g.log_scales.sum(dim=1).exp()
-        return replace(gradients, log_scales=gradients.log_scales + pull[:, None])
+        vjp = self.weight * self.weights(g) * g.log_scales.sum(dim=1).exp()
+        return replace(gradients, log_scales=gradients.log_scales + vjp[:, None])

@@ -18,8 +18,8 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 
 

@@ -59,6 +59,8 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
         raise AwError(f"plugin {path}, line {error.lineno}: {error.msg}") from None
     except (Exception, SystemExit) as error:
         why = f"{type(error).__name__}: {error}{place_of(error)}"
+        if "splat.parts" in why:
+            why += "; Parts is MethodHooks of ambiguous_wild.splat.method_hooks now"
         raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
     finally:
         files = {new: _file_of(new) for new in sys.modules.keys() - before}
@@ -135,7 +137,7 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
 
         entry = load_description(Path(name.removeprefix(EXTERNAL)))
     elif name.startswith(NERFBASELINES):
-        from ambiguous_wild.methods.nerfbaselines import nerfbaselines_entry
+        from ambiguous_wild.methods.nerfbaselines_methods import nerfbaselines_entry
 
         entry = nerfbaselines_entry(name.removeprefix(NERFBASELINES))
     else:
@@ -144,7 +146,7 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
 
 
 def _recipe(name: str) -> MethodEntry:
-    """Return a MethodEntry of the file, or make one of a function that returns `Parts`."""
+    """Return a MethodEntry of the file, or make one of a function that returns `MethodHooks`."""
     path_text, _, attribute = name.rpartition(":")
     path = Path(path_text)
     module, digest = import_file(path)
@@ -155,7 +157,8 @@ def _recipe(name: str) -> MethodEntry:
         return dataclasses.replace(target, source_hash=digest)
     if not inspect.isfunction(target):
         raise AwError(
-            f"{name} is a {type(target).__name__}: it must be a function that returns Parts, or a MethodEntry"
+            f"{name} is a {type(target).__name__}: it must be a function that returns MethodHooks, or a "
+            "MethodEntry"
         )
     summary = (inspect.getdoc(target) or f"{attribute} of {path.name}").splitlines()[0]
     entry = MethodEntry(check_name("method name", attribute), summary, target, source_hash=digest)
@@ -170,7 +173,7 @@ def without_recipe(path: Path) -> AwError:
         return AwError(f"no file {path}: write FILE.py:RECIPE, or a name of 'aw methods'")
     names = _recipes(import_file(path)[0])
     if not names:
-        return AwError(f"{path} has no recipe: write a function that returns Parts (docs/extend.md)")
+        return AwError(f"{path} has no recipe: write a function that returns MethodHooks (docs/extend.md)")
     return AwError(
         f"{path} is a file: add the name of a recipe in it: {', '.join(f'{path}:{n}' for n in names)}"
     )
@@ -187,6 +190,6 @@ def _recipes(module: ModuleType) -> list[str]:
     sure = [
         key
         for key, value in own.items()
-        if "Parts" in str(getattr(value, "__annotations__", {}).get("return"))
+        if "MethodHooks" in str(getattr(value, "__annotations__", {}).get("return"))
     ]
     return sure or list(own)

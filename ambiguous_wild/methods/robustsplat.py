@@ -37,7 +37,7 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
-from ambiguous_wild.splat.parts import MethodHooks, Schedule
+from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import BY_MACHINE, DINO, check_features, first_here, make_features, parse
 from ambiguous_wild.vision.precompute import photo_features
@@ -172,10 +172,10 @@ def mask_loss(
 
     The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights, hence constant and left out.
     """
-    pull = config.lambda_pull * math.exp(-nominal / config.beta)
+    vjp = config.lambda_pull * math.exp(-nominal / config.beta)
     bounds = (F.relu(mask - upper) + F.relu(lower - mask)).mean()
     agreement = config.lambda_cosine * (mask - target).abs().mean()
-    return agreement + config.lambda_residual * bounds + pull * (1.0 - mask).mean()
+    return agreement + config.lambda_residual * bounds + vjp * (1.0 - mask).mean()
 
 
 class RobustSplatMask(PausingMask):

@@ -22,11 +22,11 @@ from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import EffectMask, enlarged
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.effects.placing import directions, harmonics, ray_directions
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.geometry import directions, harmonics, ray_directions
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MethodHooks, Schedule
+from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
@@ -107,27 +107,29 @@ class SplatfactoColours(Learnt):
             )
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.means), PHOTO)
         feature = visible.attributes["splatfacto_feature"]
         hidden = F.relu(mlp(torch.cat([photo, feature], dim=1), leaf, "net"))
-        basis = _up_to(harmonics(directions(visible.means.detach(), shot.camera), 3), shot.nominal // 2000)
+        basis = _up_to(
+            harmonics(directions(visible.means.detach(), context.camera), 3), context.nominal // 2000
+        )
         rest = mlp(hidden, leaf, "rest").reshape(-1, 15, 3)
         return 0.5 + basis[:, :1] * mlp(hidden, leaf, "dc") + (basis[:, 1:, None] * rest).sum(dim=1)
 
-    def background(self, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def background(self, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         """Return the background [H, W, 3] of the shot's photo, without an offset."""
-        height, width = shot.camera.height, shot.camera.width
+        height, width = context.camera.height, context.camera.width
         small = (max(height // 4, 1), max(width // 4, 1))
-        rays = ray_directions(shot.camera, *small, leaf["photo"])
+        rays = ray_directions(context.camera, *small, leaf["photo"])
         hidden = F.relu(mlp(leaf["photo"][None], leaf, "sky"))
         rest = mlp(hidden, leaf, "sky_rest").reshape(24, 3)
-        basis = _up_to(harmonics(rays, 4), shot.nominal // 1000)
+        basis = _up_to(harmonics(rays, 4), context.nominal // 1000)
         colours = basis @ torch.cat([mlp(hidden, leaf, "sky_dc"), rest])
         return enlarged(colours.reshape(*small, 3), height, width)
 
-    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
-        return (image + (1.0 - alpha)[..., None] * self.background(leaf, shot)).clamp(0.0, 1.0)
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+        return (image + (1.0 - alpha)[..., None] * self.background(leaf, context)).clamp(0.0, 1.0)
 
 
 def _up_to(basis: Tensor, degree: float) -> Tensor:

@@ -36,8 +36,8 @@ from ambiguous_wild.methods.masking_common import (
 )
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features
@@ -68,7 +68,7 @@ class SpotLessDensity(DensityControl):
         gaussians, events = super().refine(step, gaussians, optimiser)
         if self._cut_due(step):
             optimiser.bind(gaussians)
-            optimiser.reset_moments(["sh_rest"])  # takes postponed steps first
+            optimiser.reset_moments(["sh_rest"])  # takes pending steps first
             gaussians.sh_rest.clamp_(max=self.config.most_colour)
             self.cut = True
         return gaussians, events

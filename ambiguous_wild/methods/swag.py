@@ -24,10 +24,10 @@ from ambiguous_wild.methods.masking_common import hashed_uniform
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.effects.placing import SceneNormaliser, in_picture, mean_of_seen, with_penalty
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.geometry import SceneNormaliser, in_picture, mean_of_seen, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData, ViewContext
 
 PARTS = 8  # parallel parts of the positions
@@ -214,45 +214,45 @@ class GatedColours(Learnt):
         photo = leaf["photo"].expand(len(places), PHOTO)
         return mlp(torch.cat([places, photo, colours], dim=1), leaf, "net")
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         outputs = self._net(self.encoded(visible.means, leaf), visible.base, leaf)
         return visible.base + 2.0 * torch.sigmoid(outputs[:, :3]) - 1.0
 
     def change(
-        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext
+        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], context: ViewContext
     ) -> Mapping[str, Tensor]:
         logits = gaussians.opacity_logits
-        if shot.nominal < self.config.gate_start or shot.other_gaussians:
+        if context.nominal < self.config.gate_start or context.other_gaussians:
             return {}
-        if shot.view is None:
-            return {"opacity_logits": torch.where(self._transient(gaussians, leaf, shot), CLOSED, logits)}
+        if context.view is None:
+            return {"opacity_logits": torch.where(self._transient(gaussians, leaf, context), CLOSED, logits)}
         means = gaussians.means.detach()
-        seen: Any = backend_of(logits.device).rows(lambda: in_picture(means, shot.camera))
+        seen: Any = backend_of(logits.device).rows(lambda: in_picture(means, context.camera))
         colours = gaussians.sh0[seen] * SH_C0 + 0.5
         a = self._net(self.encoded(gaussians.means[seen], leaf), colours, leaf)[:, 3]
-        u = hashed_uniform(len(logits), (self.seed, shot.iteration, 0x5A), logits.device)[seen]
+        u = hashed_uniform(len(logits), (self.seed, context.iteration, 0x5A), logits.device)[seen]
         z = torch.sigmoid((a + torch.logit(u)) / self.config.temperature)
         opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(LEAST, 1.0 - 1e-6)
         opened = logits.clone()
         opened[seen] = torch.logit(opacity)
-        gate = mean_of_seen(z, means[seen], shot.camera)
+        gate = mean_of_seen(z, means[seen], context.camera)
         return {"opacity_logits": with_penalty(opened, self.config.off * gate)}
 
     @torch.no_grad()
-    def _transient(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def _transient(self, gaussians: Gaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         """Return Gaussians that are off, without noise, in most photos that show them, [N] bool."""
         cached = self._left_out
-        if cached is None or cached[:2] != (shot.nominal, len(gaussians)):
+        if cached is None or cached[:2] != (context.nominal, len(gaussians)):
             places, colours = self.encoded(gaussians.means, leaf), gaussians.sh0 * SH_C0 + 0.5
             on, seen = torch.zeros_like(gaussians.opacity_logits), torch.zeros_like(gaussians.opacity_logits)
             for row, camera in zip(self._adam["photo"].values, self.cameras):
                 inside = in_picture(gaussians.means, camera, margin=0.0).float()
                 a = self._net(places, colours, {**leaf, "photo": row})[:, 3]
                 on, seen = on + inside * (a <= 0.0), seen + inside
-            cached = (shot.nominal, len(gaussians), on < self.config.transient * seen)
+            cached = (context.nominal, len(gaussians), on < self.config.transient * seen)
             self._left_out = cached
         return cached[2]
 
-    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
+    def step(self, own: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None) -> None:
         self._left_out = None
-        super().step(own, shot, called_off)
+        super().step(own, context, skip_step)

@@ -32,7 +32,7 @@ from ambiguous_wild.methods.masking_common import (
 )
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
-from ambiguous_wild.splat.parts import MethodHooks, Schedule
+from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_features, make_features

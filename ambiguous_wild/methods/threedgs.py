@@ -6,7 +6,7 @@ Source: 3D Gaussian Splatting for Real-Time Radiance Field Rendering, Kerbl et a
 from __future__ import annotations
 
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 
 
 def build(options: NoOptions) -> MethodHooks:

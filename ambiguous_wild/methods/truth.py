@@ -21,7 +21,7 @@ from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.methods.entry import NoOptions
 from ambiguous_wild.splat.data import read_photos, shrink_keep
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step
 

@@ -37,11 +37,11 @@ from ambiguous_wild.methods.masking_common import (
     load_adam_state,
     resized,
 )
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.base import rate_for_run_length
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import check_features, make_features
 from ambiguous_wild.vision.precompute import photo_features
@@ -145,7 +145,7 @@ class WildAppearance(Learnt):
         start += torch.from_numpy(noise.astype(np.float32)).to(start.device)
         return {"wild_embedding": GaussianAttribute(start, self.config.lr_gaussian)}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.base), PHOTO)
         inputs = torch.cat([visible.base, visible.attributes["wild_embedding"], photo], dim=1)
         offset, gain = (self.config.scale * mlp(inputs, leaf, "net")).split(3, dim=1)

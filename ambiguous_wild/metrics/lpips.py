@@ -99,7 +99,7 @@ def too_small(name: str, height: int, width: int) -> str | None:
 
 
 def missing_weights(name: str) -> list[str]:
-    """Return the names of weights (see `vision.weights`) that a variant of `VARIANTS` lacks."""
+    """Return the names of weights (see `vision.weight_registry`) that a variant of `VARIANTS` lacks."""
     return [weight for weight, files in _files(VARIANTS[name][0]) if find_file(weight, files) is None]
 
 

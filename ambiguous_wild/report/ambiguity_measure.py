@@ -19,7 +19,7 @@ from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
 from ambiguous_wild.report.ambiguity_sources import Background, DistractorMasks, load_mask, stem
-from ambiguous_wild.vision.moving import MOVES, moving_map
+from ambiguous_wild.vision.motion_maps import MOVES, moving_map
 
 KINDS = ("colour", "structure", "features", "motion")
 REVEALED_FROM = 0.5  # share of a distractor's pixels at which a kind of evidence reveals it

@@ -38,7 +38,7 @@ from ambiguous_wild.report.ambiguity_summary import (
     row,
 )
 from ambiguous_wild.report.plain_formats import to_csv
-from ambiguous_wild.report.table import text_table
+from ambiguous_wild.report.table_layout import text_table
 from ambiguous_wild.report.typeset import html_table
 
 PHOTOS = 4

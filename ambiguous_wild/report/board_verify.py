@@ -14,6 +14,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.cell import config_identity
+from ambiguous_wild.harness.cell_run import EFFECTS, ENVIRONMENT
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.measures import ImageRow, Metric, measure, measure_images, metrics
 from ambiguous_wild.harness.result_file import (
@@ -28,7 +29,6 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.run import EFFECTS, ENVIRONMENT
 from ambiguous_wild.harness.store import impossible_values, read_config
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io.files import own_json, sha256_file

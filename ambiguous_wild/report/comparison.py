@@ -24,7 +24,7 @@ from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.notes import incomparable, notes, untimed
 from ambiguous_wild.report.plain_formats import to_text
-from ambiguous_wild.report.table import Column, Row, State, Table, TableCell, ranks
+from ambiguous_wild.report.table_layout import Column, Row, State, Table, TableCell, ranks
 from ambiguous_wild.report.typeset import to_html
 
 MASK_COLUMNS = ("mask_iou", "mask_precision")

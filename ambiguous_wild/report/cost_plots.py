@@ -13,7 +13,6 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
 from ambiguous_wild.methods.registry import knows_truth
-from ambiguous_wild.report.cost import PLOTS, CostReport, TimeUnit, per_minute, time_unit
 from ambiguous_wild.report.cost_curves import KINDS as CHANGES
 from ambiguous_wild.report.cost_curves import (
     Change,
@@ -24,6 +23,7 @@ from ambiguous_wild.report.cost_curves import (
     summary,
     timeline,
 )
+from ambiguous_wild.report.cost_report import PLOTS, CostReport, TimeUnit, per_minute, time_unit
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))  # when colours run out
 GREY = "0.45"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.scene import NO_PHOTO
-from ambiguous_wild.harness.bench import BenchReport, bench
+from ambiguous_wild.harness.benchmark import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
 from ambiguous_wild.harness.trained_models import find_models, open_scene, read_files, read_models
 from ambiguous_wild.io.files import check_output, refuse_files_there

@@ -14,7 +14,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.store import Runs, check_names
 from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, PrintedNumber, read_tables
 from ambiguous_wild.report.comparison import comparison
-from ambiguous_wild.report.table import BLANK, Column, Row, Table, TableCell
+from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell
 
 PER_TABLE = 6  # scenes side by side, as in the papers
 LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")

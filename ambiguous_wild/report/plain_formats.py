@@ -19,7 +19,7 @@ from typing import Any
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES, Measure
-from ambiguous_wild.report.table import ARROWS, TIE, Column, Row, Table, TableCell
+from ambiguous_wild.report.table_layout import ARROWS, TIE, Column, Row, Table, TableCell
 
 RANKS = "(1) (2) (3): first, second and third in the column"
 COLORS = {1: "green", 2: "cyan", 3: "yellow"}  # of the terminal

@@ -13,7 +13,7 @@ from ambiguous_wild.datasets.foreign import plain
 from ambiguous_wild.datasets.suites import Suite, find_scenes, scene_id
 
 if TYPE_CHECKING:
-    from ambiguous_wild.report.table import Table
+    from ambiguous_wild.report.table_layout import Table
 
 SCENES = ".scenes"  # below the runs: imported scenes
 
@@ -131,7 +131,7 @@ def suite_tables(prepared: PreparedSuite, runs: Path) -> list[Table]:
 
 
 def _without_reported_mean(table: Table) -> Table:
-    from ambiguous_wild.report.table import BLANK
+    from ambiguous_wild.report.table_layout import BLANK
 
     rows = [
         row

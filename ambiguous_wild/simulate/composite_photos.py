@@ -39,8 +39,8 @@ from ambiguous_wild.simulate.cutouts import (
 )
 from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
 from ambiguous_wild.simulate.placement import CompositeConfig, natural_heights
-from ambiguous_wild.simulate.records import Spread, spread
 from ambiguous_wild.simulate.tracer import srgb_to_linear
+from ambiguous_wild.simulate.truth_records import Spread, spread
 
 _TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos
 _MOST_PIECES = 3  # largest number of pieces in a photo

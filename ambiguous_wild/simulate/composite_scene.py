@@ -45,7 +45,7 @@ from ambiguous_wild.simulate.placement import (
     solve_heights,
     visible_points,
 )
-from ambiguous_wild.simulate.records import Spread, spread
+from ambiguous_wild.simulate.truth_records import Spread, spread
 
 
 class PlacedCutout(TypedDict):

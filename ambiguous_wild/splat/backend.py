@@ -46,7 +46,7 @@ class Backend:
 
     def render(self, gaussians: Gaussians, camera: Camera, **options: Any) -> Rendered:
         """Draw a picture that has a backward pass: `render.render` with every option given."""
-        from ambiguous_wild.splat.cpu.render import render_cpu
+        from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 
         return render_cpu(gaussians, camera, **options)
 
@@ -79,7 +79,7 @@ class Backend:
         moments: tuple[Tensor, Tensor],
         rate: float,
         steps: int | Tensor,
-        called_off: Tensor | None,
+        skip_step: Tensor | None,
     ) -> None:
         """One step of Adam (0.9, 0.999, 1e-15) on a tensor and its moments, float32, contiguous, in place.
 
@@ -88,7 +88,7 @@ class Backend:
             moments: mean and mean square.
             rate: learning rate.
             steps: number of steps, this one included; on a GPU a 0-d tensor.
-            called_off: on a GPU a tensor [1] float32: 1 = change nothing.
+            skip_step: on a GPU a tensor [1] float32: 1 = change nothing.
         """
         from ambiguous_wild.splat.cpu import adam
 
@@ -185,13 +185,13 @@ class GpuBackend(Backend):
         moments: tuple[Tensor, Tensor],
         rate: float,
         steps: int | Tensor,
-        called_off: Tensor | None,
+        skip_step: Tensor | None,
     ) -> None:
         assert isinstance(steps, Tensor)
         torch._fused_adam_(
             [parameter], [gradient], [moments[0]], [moments[1]], [], [steps],
             lr=rate, beta1=0.9, beta2=0.999, weight_decay=0.0, eps=1e-15,
-            amsgrad=False, maximize=False, grad_scale=None, found_inf=called_off,
+            amsgrad=False, maximize=False, grad_scale=None, found_inf=skip_step,
         )  # fmt: skip
 
     def all_finite(self, tensors: Sequence[Tensor]) -> bool:

@@ -152,7 +152,7 @@ def warm_up(announce: Callable[[str], None] = lambda text: None, helper: bool = 
         announce: gets a message before the compilation, if the compiled kernels are not on disk yet.
         helper: compile half of them in another process meanwhile.
     """
-    from ambiguous_wild.splat.cpu.render import render_cpu
+    from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 
     begin = time.perf_counter()
     with ExitStack() as stack:
@@ -175,7 +175,7 @@ def warm_up(announce: Callable[[str], None] = lambda text: None, helper: bool = 
 
 def warm_backward(pictures: Collection[str], needs: frozenset[str]) -> None:
     """Run the backward pass with cotangents of these pictures, and these statistics."""
-    from ambiguous_wild.splat.cpu.render import render_cpu
+    from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 
     gaussians, camera = _tiny_scene()
     rendered = render_cpu(gaussians, camera)

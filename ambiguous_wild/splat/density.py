@@ -17,9 +17,9 @@ from torch import Tensor
 from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.gaussians import rotation_matrices as rotation_matrices
-from ambiguous_wild.splat.records import DensityLog
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
+from ambiguous_wild.splat.training_records import DensityLog
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.optim import SplatAdam
@@ -141,7 +141,7 @@ class DensityControl:
         events: list[str] = []
         if self._growth_due(step):
             self._match(gaussians)
-            # Bring postponed rows up to date first: growth copies parameters.
+            # Bring pending rows up to date first: growth copies parameters.
             optimiser.flush()
             self.log.begin(step.iteration)
             self._ignore_protected(gaussians)

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import State
-from ambiguous_wild.splat.effects.chain import EffectPipeline
+from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.field import Field
 from ambiguous_wild.splat.fields import STATIC, Composite, FieldStart, renders_of
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Gradients, Rendered, Shade, check_needs, with_visible
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
@@ -58,51 +58,53 @@ class SceneRenderer:
 
     # -- pictures ---------------------------------------------------------------------------------
 
-    def __call__(self, gaussians: Gaussians, shot: ViewContext, without: Collection[str] = ()) -> Rendered:
+    def __call__(self, gaussians: Gaussians, context: ViewContext, without: Collection[str] = ()) -> Rendered:
         """Draw the model; effects have already changed the shot's camera."""
-        return self.effects.render(gaussians, shot, self._compose, without)
+        return self.effects.render(gaussians, context, self._compose, without)
 
-    def again(self, gaussians: Gaussians, shot: ViewContext, without: Collection[str] = ()) -> Rendered:
+    def again(self, gaussians: Gaussians, context: ViewContext, without: Collection[str] = ()) -> Rendered:
         """Draw another picture of a step, see `Step.draw`."""
         if gaussians is self.static.gaussians:
-            return self(gaussians, shot, without)
-        shot = replace(shot, other_gaussians=True)
-        return self.effects.render(gaussians, shot, self._draw, without)
+            return self(gaussians, context, without)
+        context = replace(context, other_gaussians=True)
+        return self.effects.render(gaussians, context, self._draw, without)
 
-    def fit(self, gaussians: Gaussians, shot: ViewContext, photo: Tensor, keep: Tensor) -> Tensor:
+    def fit(self, gaussians: Gaussians, context: ViewContext, photo: Tensor, keep: Tensor) -> Tensor:
         """Draw a picture in the colours of its photo, see `EffectPipeline.fit_view`."""
-        return self.effects.fit_view(gaussians, shot, photo, keep, self._draw)
+        return self.effects.fit_view(gaussians, context, photo, keep, self._draw)
 
     def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
         """Return the Gaussians as they are drawn when the picture belongs to no photo."""
         return self.effects.neutral_model(gaussians, iteration)
 
-    def _draw(self, gaussians: Gaussians, shot: ViewContext, shade: Shade | None) -> Rendered:
+    def _draw(self, gaussians: Gaussians, context: ViewContext, shade: Shade | None) -> Rendered:
         parts = self.parts
         return render(
             gaussians,
-            shot.camera,
-            sh_degree=min(int(shot.nominal // parts.schedule.sh_every), parts.sh_degree, gaussians.sh_degree),
+            context.camera,
+            sh_degree=min(
+                int(context.nominal // parts.schedule.sh_every), parts.sh_degree, gaussians.sh_degree
+            ),
             background=parts.background,
             antialias=parts.antialias,
             blur=parts.blur,
             shade=shade,
         )
 
-    def _compose(self, gaussians: Gaussians, shot: ViewContext, shade: Shade | None) -> Rendered:
-        rendered = self._draw(gaussians, shot, shade)
+    def _compose(self, gaussians: Gaussians, context: ViewContext, shade: Shade | None) -> Rendered:
+        rendered = self._draw(gaussians, context, shade)
         fields = self.parts.fields
-        if fields is None or shot.view is None:
+        if fields is None or context.view is None:
             return rendered
-        names = fields.drawn(shot)
-        deformed = {name: fields.deform(name, self.others[name].gaussians, shot) for name in names}
+        names = fields.drawn(context)
+        deformed = {name: fields.deform(name, self.others[name].gaussians, context) for name in names}
         drawn = {
-            name: self._draw(gaussians.share_pending_updates(self.others[name].gaussians), shot, None)
+            name: self._draw(gaussians.share_pending_updates(self.others[name].gaussians), context, None)
             for name, (gaussians, _) in deformed.items()
         }
-        pulls = {name: pull for name, (_, pull) in deformed.items()}
+        vjps = {name: vjp for name, (_, vjp) in deformed.items()}
         needs = {name: control.needs for name in drawn if (control := self.others[name].density) is not None}
-        return Composite(fields, {STATIC: rendered, **drawn}, needs, shot, pulls)
+        return Composite(fields, {STATIC: rendered, **drawn}, needs, context, vjps)
 
     # -- the other fields -------------------------------------------------------------------------
 
@@ -119,14 +121,14 @@ class SceneRenderer:
         return replace(gradients, fields={**present, **summed})
 
     def learn(
-        self, step: Step, gradients: Mapping[str, Gradients], progress: float, called_off: Tensor | None
+        self, step: Step, gradients: Mapping[str, Gradients], progress: float, skip_step: Tensor | None
     ) -> None:
         """Run the optimiser and density control of every other field that has gradients."""
         for name, own in gradients.items():
             field = self.others[name]
             most = self._most[name]
-            if called_off is not None and own.visible is not None:
-                own = replace(own, visible=own.visible & (called_off == 0))
+            if skip_step is not None and own.visible is not None:
+                own = replace(own, visible=own.visible & (skip_step == 0))
             # density control takes the visible rows from the field's own render
             rendered = renders_of(step.rendered).get(name, step.rendered)
             if own.visible is not None and rendered is not step.rendered:
@@ -137,7 +139,7 @@ class SceneRenderer:
                 ceiling=step.ceiling if most is None else most,
                 rendered=rendered,
             )
-            field.learn(own, progress, called_off)
+            field.learn(own, progress, skip_step)
             field.refine(seen, own, None)
 
     def state_dict(self) -> State:

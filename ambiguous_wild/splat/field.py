@@ -49,12 +49,12 @@ class Field:
         self.gaussians = gaussians
         self.optimiser = SplatAdam(gaussians, self.rates(0.0))
 
-    def learn(self, gradients: Gradients, progress: float, called_off: Tensor | None = None) -> None:
-        """Take one step of Adam; `called_off` as in `SplatAdam.step`."""
+    def learn(self, gradients: Gradients, progress: float, skip_step: Tensor | None = None) -> None:
+        """Take one step of Adam; `skip_step` as in `SplatAdam.step`."""
         visible = gradients.visible
         if visible is None:
             visible = torch.ones(len(self.gaussians), dtype=torch.bool, device=self.gaussians.device)
-        self.optimiser.step(gradients, visible, self.rates(progress), called_off=called_off)
+        self.optimiser.step(gradients, visible, self.rates(progress), skip_step=skip_step)
 
     def refine(self, step: Step, gradients: Gradients, keep: Tensor | None) -> list[str]:
         """Run density control after one view; returns its events, see `DensityControl.refine`."""

@@ -23,17 +23,17 @@ from ambiguous_wild.splat.rendered import (
     Cotangents,
     Frame,
     Gradients,
-    Pull,
     Rendered,
+    Vjp,
     as_cotangents,
     frame_of,
-    sum_own,
+    sum_effect_grads,
 )
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 STATIC = "static"  # name of the first field, the one that is the result
 # from dL/d(composed pictures) to dL/d(pictures of every field), by field
-ComposePull = Callable[[Cotangents], Mapping[str, Cotangents]]
+ComposeVjp = Callable[[Cotangents], Mapping[str, Cotangents]]
 
 
 @dataclass(frozen=True)
@@ -63,19 +63,19 @@ class Fields(ABC):
         """Return the effect that the fields need to work; a graft without it is refused."""
         return None
 
-    def drawn(self, shot: ViewContext) -> Sequence[str]:
+    def drawn(self, context: ViewContext) -> Sequence[str]:
         """Return the names of the other fields in this picture; only called for train photos."""
         return ()
 
-    def deform(self, name: str, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
-        """Return a field's Gaussians as they are drawn for this picture, and the pull to its parameters."""
+    def deform(self, name: str, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
+        """Return a field's Gaussians as they are drawn for this picture, and the vjp to its parameters."""
         return gaussians, lambda gradients: gradients
 
-    def compose(self, frames: Mapping[str, Frame], shot: ViewContext) -> tuple[Frame, ComposePull]:
-        """Compose the frames of `STATIC` and of the fields in `drawn` to one; also returns the pull."""
+    def compose(self, frames: Mapping[str, Frame], context: ViewContext) -> tuple[Frame, ComposeVjp]:
+        """Compose the frames of `STATIC` and of the fields in `drawn` to one; also returns the vjp."""
         return frames[STATIC], lambda cotangents: {STATIC: cotangents}
 
-    def regularise(self, frames: Mapping[str, Frame], shot: ViewContext) -> Mapping[str, Cotangents]:
+    def regularise(self, frames: Mapping[str, Frame], context: ViewContext) -> Mapping[str, Cotangents]:
         """Return gradients of losses on the fields' own pictures, for example on their coverage, by field."""
         return {}
 
@@ -96,21 +96,21 @@ class Composite:
         fields: Fields,
         drawn: Mapping[str, Rendered],
         needs: Mapping[str, frozenset[str]],
-        shot: ViewContext,
-        pulls: Mapping[str, Pull],
+        context: ViewContext,
+        vjps: Mapping[str, Vjp],
     ) -> None:
         """
         Args:
             fields: the method's fields, which compose.
             drawn: renders of `STATIC` and of the other fields.
             needs: statistics of the backward pass that each other field asks for.
-            shot: the shot that was drawn.
-            pulls: pulls of `Fields.deform`, by field.
+            context: the shot that was drawn.
+            vjps: vjps of `Fields.deform`, by field.
         """
-        self._deform_pulls = pulls
+        self._deform_vjps = vjps
         frames = {name: frame_of(rendered) for name, rendered in drawn.items()}
-        frame, self._pull = fields.compose(frames, shot)
-        self._own = fields.regularise(frames, shot)
+        frame, self._vjp = fields.compose(frames, context)
+        self._own = fields.regularise(frames, context)
         self.renders, self._needs, self._frame, self.frames = drawn, needs, frame, frames
         self.image, self.alpha = frame.image, frame.alpha
         self.visible = drawn[STATIC].visible
@@ -126,7 +126,7 @@ class Composite:
     @torch.no_grad()
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
         """Return the gradients of the static field; those of the others are in `Gradients.fields`."""
-        given = dict(self._pull(as_cotangents(cotangents)))
+        given = dict(self._vjp(as_cotangents(cotangents)))
         for name, more in self._own.items():
             given[name] = given[name] + more if name in given else more
         by_field = {
@@ -135,12 +135,12 @@ class Composite:
             if name in given or name == STATIC
         }
         static = by_field.pop(STATIC)
-        by_field = {name: self._deform_pulls[name](gradients) if name in self._deform_pulls else gradients
+        by_field = {name: self._deform_vjps[name](gradients) if name in self._deform_vjps else gradients
                  for name, gradients in by_field.items()}  # fmt: skip
-        own = static.own
+        effect_grads = static.effect_grads
         for gradients in by_field.values():
-            own = sum_own(own, gradients.own)
-        return replace(static, fields=by_field, own=own)
+            effect_grads = sum_effect_grads(effect_grads, gradients.effect_grads)
+        return replace(static, fields=by_field, effect_grads=effect_grads)
 
 
 def frames_of(rendered: Rendered) -> Mapping[str, Frame]:
@@ -159,13 +159,13 @@ def over(front: Frame, back: Frame) -> tuple[Frame, Callable[[Cotangents], tuple
     """Blend `front` over `back`, both premultiplied by alpha: C = C_f + (1 - A_f) C_b, A likewise.
 
     Returns:
-        The frame, with the depth of `back`, and the pull to the cotangents of front and back.
+        The frame, with the depth of `back`, and the vjp to the cotangents of front and back.
     """
     through = 1.0 - front.alpha
     image = front.image + through[..., None] * back.image
     frame = Frame(image, front.alpha + through * back.alpha, lambda: back.depth)
 
-    def pull(c: Cotangents) -> tuple[Cotangents, Cotangents]:
+    def vjp(c: Cotangents) -> tuple[Cotangents, Cotangents]:
         hidden = torch.zeros_like(front.alpha)
         below: dict[str, Tensor | None] = {"depth": c.depth}
         for name in ("image", "extra"):
@@ -176,6 +176,6 @@ def over(front: Frame, back: Frame) -> tuple[Frame, Callable[[Cotangents], tuple
         if c.alpha is not None:
             below["alpha"] = through * c.alpha
             hidden = hidden + c.alpha * (1.0 - back.alpha)
-        return Cotangents(c.image, c.extra, hidden), Cotangents(**below, own=c.own)
+        return Cotangents(c.image, c.extra, hidden), Cotangents(**below, effect_grads=c.effect_grads)
 
-    return frame, pull
+    return frame, vjp

@@ -17,8 +17,8 @@ PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest"
 SH_C0 = 0.28209479177387814  # zeroth real spherical harmonic, 1 / (2 sqrt(pi))
 
 
-class Postponed:
-    """Updates of rows of `sh_rest` that an optimiser has put off until they are read.
+class PendingSteps:
+    """Updates of rows of `sh_rest` that an optimiser has pending until they are read.
 
     All Gaussians with the optimiser's `sh_rest` share one object, so that each can ask for the updates.
     """
@@ -59,10 +59,10 @@ class Gaussians:
     # [N, ...] further tensors of a method, by name; density control copies and drops their rows too
     attributes: Mapping[str, Tensor] = field(default_factory=dict)
 
-    # Updates that an optimiser has put off for rows that no view saw; None = `sh_rest` is up to date. The
+    # Updates that an optimiser has pending for rows that no view saw; None = `sh_rest` is up to date. The
     # renderer applies them to the rows that it is about to draw. `dataclasses.replace` keeps them; copies are
     # up to date.
-    postponed: Postponed | None = field(default=None, repr=False, compare=False)
+    pending_steps: PendingSteps | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -108,14 +108,14 @@ class Gaussians:
         yield from self.attributes.items()
 
     def settle(self) -> None:
-        """Make the updates that an optimiser has put off, so that `sh_rest` may be read."""
-        if self.postponed is not None:
-            self.postponed.make()
+        """Make the updates that an optimiser has pending, so that `sh_rest` may be read."""
+        if self.pending_steps is not None:
+            self.pending_steps.make()
 
     def share_pending_updates(self, source: Gaussians) -> Gaussians:
         """Let these Gaussians, made of `source` with its `sh_rest`, ask for its updates; returns them."""
-        if self.postponed is None:
-            self.postponed = source.postponed
+        if self.pending_steps is None:
+            self.pending_steps = source.pending_steps
         return self
 
     def select(self, rows: Tensor) -> Gaussians:
@@ -158,7 +158,9 @@ class Gaussians:
         changed = [change(name, tensor) for name, tensor in self.items()]
         attributes = {name: change(name, tensor) for name, tensor in self.attributes.items()}
         shared = changed[-1] is self.sh_rest  # it lay on that device already: no copy was made
-        return Gaussians(*changed, attributes=attributes, postponed=self.postponed if shared else None)
+        return Gaussians(
+            *changed, attributes=attributes, pending_steps=self.pending_steps if shared else None
+        )
 
     @classmethod
     def from_points(

@@ -305,20 +305,20 @@ def _ratio(
     return (sharp / blurred).clamp(min=_SMALLEST).sqrt()
 
 
-def _pull(
+def _vjp(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, intrinsics: Tensor, size: Tensor,
     cotangent: Tensor, blur: float,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     def ratio(m: Tensor, q: Tensor, s: Tensor) -> Tensor:
         return _ratio(m, q, s, viewmat, intrinsics, size, blur)
 
-    pull = torch.func.vjp(ratio, means, quats, scales)[1]
-    gradients: tuple[Tensor, Tensor, Tensor] = pull(cotangent)
+    vjp = torch.func.vjp(ratio, means, quats, scales)[1]
+    gradients: tuple[Tensor, Tensor, Tensor] = vjp(cotangent)
     return gradients
 
 
 _compiled_ratio = compiled(_ratio, "antialiasing")
-_compiled_pull = compiled(_pull, "antialiasing's backward pass")
+_compiled_vjp = compiled(_vjp, "antialiasing's backward pass")
 
 
 class _Compensation(torch.autograd.Function):
@@ -331,7 +331,7 @@ class _Compensation(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> Any:
-        return None, *_compiled_pull(*ctx.saved_tensors, cotangent, ctx.blur), None, None, None
+        return None, *_compiled_vjp(*ctx.saved_tensors, cotangent, ctx.blur), None, None, None
 
 
 def compensation(

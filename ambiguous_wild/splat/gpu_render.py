@@ -19,7 +19,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.splat import gsplat_seam as seam
 from ambiguous_wild.splat import readiness
-from ambiguous_wild.splat.effects.posed import on_device
+from ambiguous_wild.splat.effects.device_cameras import on_device
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu_kernels import visible
 from ambiguous_wild.splat.rendered import (
@@ -28,7 +28,7 @@ from ambiguous_wild.splat.rendered import (
     Cotangents,
     Gradients,
     Shade,
-    ShadePull,
+    ShadeVjp,
     as_cotangents,
     check_needs,
     spread,
@@ -42,7 +42,7 @@ class Shaded:
     gaussians: Gaussians
     base: Tensor  # [N, 3] SH + 0.5, part of the graph of the parameters
     colours: Tensor  # [N, 3] from the function, not clamped
-    pull: ShadePull
+    vjp: ShadeVjp
 
 
 class RenderedCuda:
@@ -125,7 +125,7 @@ class RenderedCuda:
                 image, alpha, batch = self._blend(cut, absolute=True)
             if d_image is None and cotangent.alpha is None:
                 d_image = torch.zeros_like(self.image)
-        at_cut = _pull(image, alpha, cut, d_image, cotangent.alpha, keep=d_extra is not None)
+        at_cut = _vjp(image, alpha, cut, d_image, cotangent.alpha, keep=d_extra is not None)
         screen = at_cut[0]
         screen_abs = None if batch is None else seam.absolute_gradient(batch)
         depths = None
@@ -135,7 +135,7 @@ class RenderedCuda:
             screen = at_cut[0]
         screen_extra = None
         if d_extra is not None:
-            second = _pull(image, alpha, cut, d_extra, None, keep=False)
+            second = _vjp(image, alpha, cut, d_extra, None, keep=False)
             screen_extra = second[0]
             at_cut = _add(at_cut, second)
         return self._gradients(
@@ -150,7 +150,7 @@ class RenderedCuda:
         colours, through = self._colours, None
         if shaded is not None:  # 0 where colours were clamped at 0, then through the function
             d_colours = torch.where(shaded.colours > 0, at_cut[2], 0.0)
-            through = shaded.pull(d_colours)
+            through = shaded.vjp(d_colours)
             colours, at_cut = shaded.base, [at_cut[0], at_cut[1], through.base, at_cut[3]]
         outputs, cotangents = [s.means2d, s.conics, colours, s.opacities], list(at_cut)
         if depths is not None:
@@ -159,7 +159,7 @@ class RenderedCuda:
         values = torch.autograd.grad(
             outputs, list(self._leaves.values()), cotangents, allow_unused=True, materialize_grads=True
         )
-        gradients = Gradients(*values, **screens, visible=self.visible, own=given.own)
+        gradients = Gradients(*values, **screens, visible=self.visible, effect_grads=given.effect_grads)
         if shaded is not None and through is not None:
             gradients = spread(gradients, through, slice(None), shaded.gaussians)
         return gradients
@@ -255,10 +255,10 @@ def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.Proje
     visible = (splats.radii > 0).all(dim=1)
     # a net must not see what gsplat left in rows that it did not compute: 0 times NaN is NaN in its gradients
     base = torch.where(visible[:, None], base, 0.0)
-    colours, pull = shade(base.detach(), slice(None))
+    colours, vjp = shade(base.detach(), slice(None))
     if colours.shape != base.shape:
         raise AwError(f"a shading function must give colours {list(base.shape)}, got {list(colours.shape)}")
-    return Shaded(gaussians, base, colours.detach(), pull)
+    return Shaded(gaussians, base, colours.detach(), vjp)
 
 
 @functools.cache
@@ -267,7 +267,7 @@ def _background_on(background: tuple[float, float, float], device: torch.device)
     return torch.tensor([background], dtype=torch.float32).to(device)
 
 
-def _pull(
+def _vjp(
     image: Tensor,
     alpha: Tensor,
     cut: list[Tensor],

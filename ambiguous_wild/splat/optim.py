@@ -2,8 +2,8 @@
 
 Means, quats, scales and opacity are read by culling, and sh0 by every view: these 14 floats of a Gaussian are
 stepped at once, seen or not. The higher harmonics, 45 floats, are read only when a Gaussian is drawn. Steps
-of a row that no view sees are put off; it takes them, with gradient zero, when the renderer is about to draw
-it (`Gaussians.postponed`), or at `flush`. On an accelerator torch's fused kernel steps every row, one launch
+of a row that no view sees are pending; it takes them, with gradient zero, when the renderer is about to draw
+it (`Gaussians.pending_steps`), or at `flush`. On an accelerator torch's fused kernel steps every row, one launch
 a tensor; there a flag on the device can call off the step without the host's knowledge.
 """
 
@@ -19,7 +19,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import State
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians, Postponed
+from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians, PendingSteps
 from ambiguous_wild.splat.rendered import Gradients
 
 _LAZY = "sh_rest"
@@ -54,7 +54,9 @@ class SplatAdam:
         self._history = np.zeros((2, 256), np.float32)  # a step's lr / bias1 of sh_rest, and 1 / sqrt(bias2)
         self._rows = len(gaussians)
         self._bound: Gaussians | None = None
-        self._postponed: Postponed | None = None  # that of the Gaussians bound now, if rows are put off
+        self._pending_steps: PendingSteps | None = (
+            None  # that of the Gaussians bound now, if rows are pending
+        )
         self.bind(gaussians)
         self._set_rates(learning_rates)
 
@@ -84,7 +86,7 @@ class SplatAdam:
         self._unbind()
         self._bound = gaussians
         if self._lazy:
-            self._postponed = gaussians.postponed = Postponed(self.catch_up)
+            self._pending_steps = gaussians.pending_steps = PendingSteps(self.catch_up)
 
     def select(self, rows: Tensor) -> None:
         """Keep the moments of these rows (bool mask [N] or indices), in that order; `bind` comes next."""
@@ -125,9 +127,9 @@ class SplatAdam:
                     moment[rows] = 0.0
 
     def _unbind(self) -> None:
-        if self._postponed is not None:
-            self._postponed.end()
-        self._bound = self._postponed = None
+        if self._pending_steps is not None:
+            self._pending_steps.end()
+        self._bound = self._pending_steps = None
 
     # -- steps ------------------------------------------------------------------------------------
 
@@ -137,7 +139,7 @@ class SplatAdam:
         visible: Tensor,  # [N] bool; rows of sh_rest outside have gradient zero
         learning_rates: Mapping[str, float] | None = None,  # from this step on; None keeps the last
         *,
-        called_off: Tensor | None = None,  # on an accelerator, [1] float32 there: 1 = change nothing
+        skip_step: Tensor | None = None,  # on an accelerator, [1] float32 there: 1 = change nothing
     ) -> None:
         """Step every row once.
 
@@ -154,13 +156,13 @@ class SplatAdam:
                 self._step_visible(tensor, gradient, visible)
             elif tensor.numel():
                 self._backend.adam_step(
-                    tensor, gradient, self._moments[name], self._rates[name], self.steps, called_off
+                    tensor, gradient, self._moments[name], self._rates[name], self.steps, skip_step
                 )
-        if called_off is not None:
-            self.steps -= called_off.reshape(())
+        if skip_step is not None:
+            self.steps -= skip_step.reshape(())
 
     def _step_visible(self, parameter: Tensor, gradient: Tensor, visible: Tensor) -> None:
-        """Step the visible rows of sh_rest; steps of the others are put off."""
+        """Step the visible rows of sh_rest; steps of the others are pending."""
         from ambiguous_wild.splat.cpu import adam
         from ambiguous_wild.splat.cpu.compile import threads
 
@@ -175,7 +177,7 @@ class SplatAdam:
             )  # fmt: skip
 
     def catch_up(self, rows: np.ndarray | None = None) -> None:
-        """Take the steps of these rows of sh_rest (indices; None = all) that were put off."""
+        """Take the steps of these rows of sh_rest (indices; None = all) that are pending."""
         if not self._lazy or self.steps == 0 or self.gaussians.sh_rest.shape[1] == 0:
             return
         from ambiguous_wild.splat.cpu import adam
@@ -200,7 +202,7 @@ class SplatAdam:
         return torch.full((), float(steps), device=gaussians.device)
 
     def _mark_up_to_date(self) -> None:
-        """Note that no row of sh_rest has steps that were put off."""
+        """Note that no row of sh_rest has steps that are pending."""
         self._taken = np.full(self._rows, self.steps if self._lazy else 0, np.int64)
 
     def _learnt(self, gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.parts import Schedule
+from ambiguous_wild.splat.method_hooks import Schedule
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData
 from ambiguous_wild.splat.watchdog import OnNonFinite
 
@@ -94,7 +94,7 @@ def _spectrum_share(photo: np.ndarray, divisor: int) -> float:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Length, resolution and checkpointing of a run; the method (`Parts`) sets the rest."""
+    """Length, resolution and checkpointing of a run; the method (`MethodHooks`) sets the rest."""
 
     iterations: int = NOMINAL_ITERATIONS
     budget_s: float | None = None  # seconds of training instead of a number of iterations

@@ -1,6 +1,6 @@
 """What every back end of `render` returns, and the values that its backward pass takes and gives.
 
-A *cotangent* is the gradient of the loss with respect to an output of a call; a *pull* is a function that
+A *cotangent* is the gradient of the loss with respect to an output of a call; a *vjp* is a function that
 turns it into the gradient with respect to the inputs. Both are plain values: no object stores anything
 between the forward and the backward pass, so that two pictures of one step cannot be mixed up.
 """
@@ -20,7 +20,7 @@ from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.gaussians import Gaussians
 
 # Gradients of an effect's own parameters, by the effect's name and the parameter's.
-Own = Mapping[str, Mapping[str, Tensor]]
+EffectGrads = Mapping[str, Mapping[str, Tensor]]
 # Statistics that density control can ask for beyond the signed sums, see `Gradients`.
 NEEDS = ("absolute", "squared", "count")
 GSPLAT_SUMS = ("absolute",)  # those that gsplat offers
@@ -36,7 +36,7 @@ class Cotangents:
     alpha: Tensor | None = None  # [H, W]
     depth: Tensor | None = None  # [H, W]
     _: KW_ONLY
-    own: Own = field(default_factory=dict)  # collected by effects that act on pictures
+    effect_grads: EffectGrads = field(default_factory=dict)  # collected by effects that act on pictures
 
     def pictures(self) -> frozenset[str]:
         """Return the names of the pictures that have one."""
@@ -44,7 +44,7 @@ class Cotangents:
 
     def __add__(self, other: Cotangents) -> Cotangents:
         sums = {name: sum_where(getattr(self, name), getattr(other, name)) for name in _PICTURES}
-        return Cotangents(**sums, own=sum_own(self.own, other.own))
+        return Cotangents(**sums, effect_grads=sum_effect_grads(self.effect_grads, other.effect_grads))
 
 
 _PICTURES = ("image", "extra", "alpha", "depth")
@@ -80,12 +80,12 @@ class Gradients:
     count: Tensor | None = None  # [N] "count": pixels in which the Gaussian was drawn
     visible: Tensor | None = None  # [N] bool, rows that were drawn; the others' gradients are zero
     attributes: Mapping[str, Tensor] = field(default_factory=dict)  # [N, ...] of `Gaussians.attributes`
-    own: Own = field(default_factory=dict)  # gradients of the effects' own parameters
+    effect_grads: EffectGrads = field(default_factory=dict)  # gradients of the effects' own parameters
     fields: Mapping[str, Gradients] = field(default_factory=dict)  # those of other fields in the picture
 
     def __add__(self, other: Gradients) -> Gradients:
         """Return the gradients of the sum of two losses, for the same Gaussians and camera."""
-        plain = {f.name for f in fields(self)} - {"visible", "attributes", "own", "fields"}
+        plain = {f.name for f in fields(self)} - {"visible", "attributes", "effect_grads", "fields"}
         sums: dict[str, Any] = {name: sum_where(getattr(self, name), getattr(other, name)) for name in plain}
         seen = [g.visible for g in (self, other) if g.visible is not None]
         shared = self.fields.keys() & other.fields.keys()
@@ -93,17 +93,17 @@ class Gradients:
             **sums,
             visible=torch.stack(seen).any(dim=0) if seen else None,
             attributes=sum_named(self.attributes, other.attributes),
-            own=sum_own(self.own, other.own),
+            effect_grads=sum_effect_grads(self.effect_grads, other.effect_grads),
             fields={**self.fields, **other.fields, **{k: self.fields[k] + other.fields[k] for k in shared}},
         )
 
-    def with_own(self, effect: str, own: Mapping[str, Tensor]) -> Gradients:
+    def with_effect_grads(self, effect: str, effect_grads: Mapping[str, Tensor]) -> Gradients:
         """Return these gradients with those of an effect's own parameters added."""
-        return replace(self, own=sum_own(self.own, {effect: own}))
+        return replace(self, effect_grads=sum_effect_grads(self.effect_grads, {effect: effect_grads}))
 
 
-Pull = Callable[[Gradients], Gradients]  # through a change of Gaussians
-FramePull = Callable[[Cotangents], Cotangents]  # through a change of pictures
+Vjp = Callable[[Gradients], Gradients]  # through a change of Gaussians
+FrameVjp = Callable[[Cotangents], Cotangents]  # through a change of pictures
 
 
 @dataclass(frozen=True)
@@ -169,22 +169,22 @@ class Shade(Protocol):
         self,
         base: Tensor,  # [M, 3] SH(direction) + 0.5 of the rows, not clamped
         rows: Tensor | slice,  # [M] int64, visible Gaussians; on an accelerator all of them, a slice
-    ) -> tuple[Tensor, ShadePull]:
-        """Return colours [M, 3], which the renderer clamps at 0, and their pull."""
+    ) -> tuple[Tensor, ShadeVjp]:
+        """Return colours [M, 3], which the renderer clamps at 0, and their vjp."""
         ...
 
 
 @dataclass(frozen=True)
 class ShadeGradients:
-    """The gradients that the pull of shaded colours returns."""
+    """The gradients that the vjp of shaded colours returns."""
 
     base: Tensor  # [M, 3] dL/d(base), which goes on to harmonics and means
     attributes: Mapping[str, Tensor] = field(default_factory=dict)  # [M, ...] of `Gaussians.attributes`
     means: Tensor | None = None  # [M, 3] dL/d(positions), if the function read them
-    own: Own = field(default_factory=dict)
+    effect_grads: EffectGrads = field(default_factory=dict)
 
 
-ShadePull = Callable[[Tensor], ShadeGradients]  # from dL/dcolours [M, 3]
+ShadeVjp = Callable[[Tensor], ShadeGradients]  # from dL/dcolours [M, 3]
 
 
 def spread(gradients: Gradients, shading: ShadeGradients, rows: Tensor | slice, g: Gaussians) -> Gradients:
@@ -194,7 +194,7 @@ def spread(gradients: Gradients, shading: ShadeGradients, rows: Tensor | slice, 
     gradients.attributes = {name: torch.zeros_like(g.attributes[name]) for name in shading.attributes}
     for name, value in shading.attributes.items():
         gradients.attributes[name][rows] = value
-    gradients.own = sum_own(gradients.own, shading.own)
+    gradients.effect_grads = sum_effect_grads(gradients.effect_grads, shading.effect_grads)
     return gradients
 
 
@@ -214,7 +214,7 @@ def check_needs(needs: frozenset[str], offered: Sequence[str] = NEEDS) -> None:
             )
 
 
-def sum_own(a: Own, b: Own) -> Own:
+def sum_effect_grads(a: EffectGrads, b: EffectGrads) -> EffectGrads:
     """Merge gradients of effects' parameters; entries in both are summed."""
     if not a or not b:
         return a or b

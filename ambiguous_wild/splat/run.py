@@ -21,9 +21,9 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
-from ambiguous_wild.splat.records import ROWS, Clock, Timeline, clock_for
 from ambiguous_wild.splat.rendered import Rendered
 from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.training_records import ROWS, Clock, Timeline, clock_for
 from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, NonFinite, Watchdog
 
 LOG = logging.getLogger(__name__)
@@ -212,7 +212,7 @@ class Run(ABC):
     def _advance(self, tick: Callable[[Any], None] | None) -> None:
         """Run one iteration with its bookkeeping, or roll back if a value is not finite."""
         if self._marks is None:
-            self._marks = self._marks_due()
+            self._marks = self._checkpoint_counts()
         self.clock.start()
         try:
             loss = self.step()
@@ -224,12 +224,12 @@ class Run(ABC):
         self.timeline.loss(loss)
         # Marks are compared with those of the last step, not with the clock before this one: under a budget
         # the clock may pass a mark between two steps.
-        before, passed = self._marks, self._marks_due()
+        before, passed = self._marks, self._checkpoint_counts()
         done, meter = self.progress(self.iteration), self.meter
         calibrating = meter is not None and meter.due(self.clock.now(), done)
         if passed != before or calibrating:
             self.clock.settle_stopped()
-            passed = self._marks_due()
+            passed = self._checkpoint_counts()
         self._marks = passed
         if passed != before:
             self._log(passed[0] > before[0])
@@ -238,7 +238,7 @@ class Run(ABC):
         if meter is not None and calibrating:
             meter.look(self.clock.now())
 
-    def _marks_due(self) -> tuple[int, int]:
+    def _checkpoint_counts(self) -> tuple[int, int]:
         """Return how many probes and timeline rows are due since the start of the run."""
         now = (self.iteration, self.clock.now())
         return self.pace.marks(self.config.probes, *now), self.pace.marks(ROWS, *now)
@@ -284,11 +284,11 @@ class Run(ABC):
     def picture(self, camera: Camera) -> Tensor:
         """Draw a picture [H, W, 3] between two steps; the run has the same bits as without it.
 
-        Rows that the optimiser has put off are brought up to date, as a later step would have done.
+        Rows that are pending in the optimiser are brought up to date, as a later step would have done.
         """
         return self.render(camera).image
 
-    def check_taught(self) -> None:
+    def check_photos_used(self) -> None:
         """Raise AwError if nothing was learnt: the loss was 0 in every row of the timeline."""
         rows = self.timeline.rows
         if rows and all(row["loss"] == 0.0 for row in rows):

@@ -113,5 +113,5 @@ class Step(ViewContext):
         """
         if self.drawer is None:
             raise RuntimeError("this step belongs to no trainer: it cannot draw")
-        shot: Any = self if camera is None else replace(self, camera=camera)
-        return self.drawer(self.gaussians if gaussians is None else gaussians, shot, without)
+        context: Any = self if camera is None else replace(self, camera=camera)
+        return self.drawer(self.gaussians if gaussians is None else gaussians, context, without)

@@ -1,4 +1,4 @@
-"""The training loop. Methods fill its places (`parts.py`); nothing here knows a method by name."""
+"""The training loop. Methods fill its places (`method_hooks.py`); nothing here knows a method by name."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ambiguous_wild.splat.calibration import warm_backward
 from ambiguous_wild.splat.data import Pyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import SceneRenderer
-from ambiguous_wild.splat.effects.chain import EffectPipeline
+from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.field import Field, rates_with
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
-from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import (
     Cotangents,
     Gradients,
@@ -117,7 +117,7 @@ class Trainer(Run):
         self.effects.load_state_dict(state.get("effects", {}))
         super().load_state(state)
 
-    def shot(self, camera: Camera, *, fitting: bool = False) -> ViewContext:
+    def context(self, camera: Camera, *, fitting: bool = False) -> ViewContext:
         """Return the shot of a camera that belongs to no train photo, at the present time of the run."""
         progress = self.progress(self.iteration)
         nominal = progress * NOMINAL_ITERATIONS
@@ -132,7 +132,7 @@ class Trainer(Run):
 
     def render(self, camera: Camera) -> Rendered:
         """Draw the static field for any camera, in its present state, without the light of a photo."""
-        return self.drawing(self.gaussians, self.shot(camera))
+        return self.drawing(self.gaussians, self.context(camera))
 
     def neutral_model(self) -> Gaussians:
         """Return the Gaussians for viewers, changed as the effects change them for every camera."""
@@ -148,13 +148,13 @@ class Trainer(Run):
         """
         self.optimiser.flush()
         photo, keep = photo.to(self.data.device), keep.to(self.data.device)
-        return self.drawing.fit(self.gaussians, self.shot(camera, fitting=True), photo, keep)
+        return self.drawing.fit(self.gaussians, self.context(camera, fitting=True), photo, keep)
 
     def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
         """Draw a train view as the loop does; also used to predict masks after the training."""
         progress = self.progress(iteration)
         divisor = self.pace.divisor(progress) if divisor is None else divisor
-        shot = ViewContext(
+        context = ViewContext(
             iteration=iteration,
             nominal=progress * NOMINAL_ITERATIONS,
             progress=progress,
@@ -163,10 +163,10 @@ class Trainer(Run):
             photo=self.pyramid.photo(view, divisor),
             camera=self.pyramid.camera(view, divisor),
         )
-        shot = replace(shot, camera=self.effects.camera(shot))
+        context = replace(context, camera=self.effects.camera(context))
         with self.clock.part("render"):
-            rendered = self.drawing(self.gaussians, shot)
-        of_shot = {f.name: getattr(shot, f.name) for f in fields(ViewContext)}
+            rendered = self.drawing(self.gaussians, context)
+        of_shot = {f.name: getattr(context, f.name) for f in fields(ViewContext)}
         return Step(
             **of_shot,
             ceiling=self.pace.ceiling(divisor, progress),
@@ -230,7 +230,7 @@ class Trainer(Run):
         with part("loss"):
             loss = self._photometric(step, keep)
         if self.sentinel is None:
-            self.watchdog.look_at_loss(step, keep, loss)
+            self.watchdog.check_loss(step, keep, loss)
         with part("mask loss"):
             method_cotangents = self.parts.mask.cotangent(step, keep)
             _refuse_a_loss(method_cotangents, step)
@@ -248,14 +248,14 @@ class Trainer(Run):
         self._compile_backward(cotangents.pictures())
         with part("backward"):
             gradients = self._gradients(step, keep, cotangents)
-        called_off = None
+        skip_step = None
         with part("watchdog"):
             if self.sentinel is None:
-                self.watchdog.look_at_gradients(step, keep, loss, gradients)
+                self.watchdog.check_gradients(step, keep, loss, gradients)
             else:
-                called_off = self._watch(step, keep, method_cotangents, loss, gradients)
-                step, gradients = _for_statistics(step, gradients, called_off)
-        events = self._learn(step, keep, gradients, called_off)
+                skip_step = self._watch(step, keep, method_cotangents, loss, gradients)
+                step, gradients = _for_statistics(step, gradients, skip_step)
+        events = self._learn(step, keep, gradients, skip_step)
         if "reset" in events:
             self.parts.mask.on_opacity_reset(step)
         if self.pyramid.prefetch is not None:
@@ -263,7 +263,7 @@ class Trainer(Run):
         if events or self.watchdog.due(iteration):
             with part("watchdog"):
                 self._look_back()
-                self.watchdog.look_at_parameters(iteration, view, self.gaussians)
+                self.watchdog.check_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
 
@@ -293,13 +293,13 @@ class Trainer(Run):
     ) -> Tensor:
         """Let the sentinel check the step; returns [1] on the device, 1 = skip the optimiser's step."""
         assert self.sentinel is not None
-        checked = list(self.watchdog.looked_at(gradients).values())
+        checked = list(self.watchdog.checked_gradients(gradients).values())
         value = torch.as_tensor(loss.value)
         self._divisors[step.iteration] = step.divisor
         return self.sentinel.watch(step.iteration, step.view, value, checked, keep, method_cotangents)
 
     def _learn(
-        self, step: Step, keep: Tensor | None, gradients: Gradients, called_off: Tensor | None
+        self, step: Step, keep: Tensor | None, gradients: Gradients, skip_step: Tensor | None
     ) -> list[str]:
         """Run the optimiser, density control and effects; returns the events of density control."""
         part, progress = self.clock.part, self.progress(step.iteration)
@@ -308,23 +308,23 @@ class Trainer(Run):
         if self.density.reads_keep and (composed := self.parts.mask.composed_keep(step)) is not None:
             density_keep = self.combine_user_keep(step, composed)
         # as on the CPU, a fully masked photo changes nothing; only before growth does the host read the flag
-        if called_off is not None and keep is not None and self.density.due(step) and bool(called_off):
+        if skip_step is not None and keep is not None and self.density.due(step) and bool(skip_step):
             return events
         if self.density.before_optimiser:
             with part("density"):
                 events = self.field.refine(step, gradients, density_keep)
         if not events:  # rows that have just changed have no gradients
             with part("optimiser"):
-                self.field.learn(gradients, progress, called_off)
+                self.field.learn(gradients, progress, skip_step)
         if not self.density.before_optimiser:
             with part("density"):
                 events = self.field.refine(step, gradients, density_keep)
         if gradients.fields:
             with part("fields"):
-                self.drawing.learn(step, gradients.fields, progress, called_off)
+                self.drawing.learn(step, gradients.fields, progress, skip_step)
         if self.parts.effects:
             with part("effects"):
-                self.effects.step(gradients, replace(step, progress=progress), called_off)
+                self.effects.step(gradients, replace(step, progress=progress), skip_step)
                 if events:
                     self.effects.rows_changed()
                 self.effects.after_step(step, self.gaussians)
@@ -345,16 +345,16 @@ class Trainer(Run):
         step = self.make_step(broken.iteration, view, divisor)
         keep = broken.keep
         loss = self._photometric(step, keep)
-        self.watchdog.look_at_loss(step, keep, loss)
+        self.watchdog.check_loss(step, keep, loss)
         gradients = step.rendered.backward(as_cotangents(loss.d_image, broken.method_cotangents))
-        self.watchdog.look_at_gradients(step, keep, loss, gradients)
-        raise self.watchdog.not_seen_again(step, keep, loss)
+        self.watchdog.check_gradients(step, keep, loss, gradients)
+        raise self.watchdog.nonreproducible(step, keep, loss)
 
     def check_parameters(self) -> None:
         """Raise NonFinite for the last step if a parameter is not finite."""
         self._look_back()
         view = self.pace.view(max(self.iteration, 1))
-        self.watchdog.look_at_parameters(self.iteration, view, self.gaussians)
+        self.watchdog.check_parameters(self.iteration, view, self.gaussians)
 
 
 def _refuse_a_loss(value: object, step: Step) -> None:
@@ -380,12 +380,12 @@ def _refuse_a_loss(value: object, step: Step) -> None:
         )
 
 
-def _for_statistics(step: Step, gradients: Gradients, called_off: Tensor) -> tuple[Step, Gradients]:
-    """Return step and gradients for statistics of growth: in a step called off no Gaussian was drawn.
+def _for_statistics(step: Step, gradients: Gradients, skip_step: Tensor) -> tuple[Step, Gradients]:
+    """Return step and gradients for the densification statistics: a skipped step marks every Gaussian invisible.
 
     So neither its zeros nor its NaN are added.
     """
-    going = called_off == 0
+    going = skip_step == 0
     step = replace(step, rendered=with_visible(step.rendered, step.rendered.visible & going))
     if gradients.visible is not None:
         gradients = replace(gradients, visible=gradients.visible & going)

@@ -90,19 +90,19 @@ class Watchdog:
 
     # -- looking ----------------------------------------------------------------------------------
 
-    def look_at_loss(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> None:
+    def check_loss(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> None:
         """Raise NonFinite if the loss of this step is not finite."""
         if not math.isfinite(float(loss.value)):
             raise self._found("loss", step.iteration, step.view, {}, _seen(step, keep, loss))
 
-    def look_at_gradients(
+    def check_gradients(
         self, step: Step, keep: Tensor | None, loss: PhotometricLoss, gradients: Gradients
     ) -> None:
         """Raise NonFinite if a gradient of this step is not finite: nothing has been changed yet.
 
         Adam would hide it: its kernel sets a moment that is NaN to 0, like one that is too small.
         """
-        named = self.looked_at(gradients)
+        named = self.checked_gradients(gradients)
         if not _finite(named):
             bad = _bad_rows(named)
             if bad:
@@ -111,11 +111,11 @@ class Watchdog:
                     "gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | broken
                 )
 
-    def looked_at(self, gradients: Gradients) -> dict[str, Tensor]:
+    def checked_gradients(self, gradients: Gradients) -> dict[str, Tensor]:
         """Return the gradients that are checked in every step."""
         return {name: getattr(gradients, name) for name in _LOOKED_AT} | dict(gradients.attributes)
 
-    def not_seen_again(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> NonFinite:
+    def nonreproducible(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> NonFinite:
         """Return the finding of a step that is finite when repeated: a GPU sums in another order."""
         return self._found("gradient", step.iteration, step.view, {}, _seen(step, keep, loss))
 
@@ -123,7 +123,7 @@ class Watchdog:
         """Whether parameters are checked after this iteration in any case."""
         return iteration % self.every == 0
 
-    def look_at_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
+    def check_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
         """Raise NonFinite if a parameter is not finite."""
         named = dict(gaussians.rows())
         if not _finite(named):
@@ -334,7 +334,7 @@ class DeviceFiniteCheck:
         iteration, shapes = watched[int(sound)]
         inputs = {name: self._kept[name][: shape.numel()].reshape(shape) for name, shape in shapes.items()}
         keep = inputs.pop("keep", None)
-        return NonFiniteStep(iteration, keep, Cotangents(**inputs, own={}) if inputs else None)
+        return NonFiniteStep(iteration, keep, Cotangents(**inputs, effect_grads={}) if inputs else None)
 
     def empty_views(self) -> set[int]:
         """Return the photos that were fully masked at some step. The host waits."""

@@ -25,7 +25,7 @@ from ambiguous_wild.methods.refinesplat.recipe import consistency_loss
 from ambiguous_wild.methods.refinesplat.threshold import Variant, entropy, learnt, objective, pool_of, t_ent
 from ambiguous_wild.metrics import ambiguity
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
-from ambiguous_wild.metrics.masks import confusion, psnr_valid
+from ambiguous_wild.metrics.mask_scores import confusion, psnr_valid
 from ambiguous_wild.metrics.stats import bootstrap_interval, mean
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.stress.case import UNIT, CaseResult, case, cloud, failed_checks, worst

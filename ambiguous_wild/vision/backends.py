@@ -14,9 +14,9 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.weight_files import expanded
 from ambiguous_wild.vision.protocols import Features, Instances
-from ambiguous_wild.vision.weights import find, named
+from ambiguous_wild.vision.weight_registry import find, named
 
-# name in a spec -> name of the weights, see vision/weights.py
+# name in a spec -> name of the weights, see vision/weight_registry.py
 DINO = {
     "dinov2-small": "dinov2-small",
     "dinov2-base": "dinov2-base",

@@ -18,10 +18,10 @@ from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.weight_files import expanded, read_tensors
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.vision import weights
+from ambiguous_wild.vision import weight_registry
 from ambiguous_wild.vision.dino import normalised
 from ambiguous_wild.vision.protocols import FittedByDistance, cell_grid, check_image, check_sizes, whole_cells
-from ambiguous_wild.vision.weight_files import check_published, used_tensors
+from ambiguous_wild.vision.weight_conversion import check_published, used_tensors
 
 _EPS = 1e-3  # of the batch norms
 _BATCH_NORM = ("weight", "bias", "running_mean", "running_var")
@@ -208,7 +208,7 @@ class ConvFeatures(FittedByDistance):
                 values than those published.
         """
         if self._model is None:
-            command = weights.get_command(self._what)
+            command = weight_registry.get_command(self._what)
             advice = f"run: {command}" if self._registered else f"replace it by the file of: {command}"
             tensors = read_tensors(self.path, advice)
             try:
@@ -219,7 +219,7 @@ class ConvFeatures(FittedByDistance):
                 line = " ".join(str(error).split())
                 raise AwError(f"{self.path} is not {self._what} ({line}); {advice}") from None
             if self._registered:
-                weight = weights.named(self._what)
+                weight = weight_registry.named(self._what)
                 arrays = used_tensors(weight, {key: value.numpy() for key, value in tensors.items()})
                 check_published(weight, self.path, arrays, advice, self._sha256)
             self._model = net.eval().requires_grad_(False)
@@ -253,11 +253,11 @@ class ConvFeatures(FittedByDistance):
 
 def _file(name: str, folder: str | Path | None) -> Path:
     """Find the file of the weights, in the folder if the user names one."""
-    weight = weights.named(name)
+    weight = weight_registry.named(name)
     if folder is None:
-        path = weights.where(weight)
+        path = weight_registry.where(weight)
         if path is None:
-            raise AwError(weights.missing(weight))
+            raise AwError(weight_registry.missing(weight))
         return path
     place = expanded(folder, "the folder of weights")
     files = [place / file for file in weight.files if (place / file).is_file()]

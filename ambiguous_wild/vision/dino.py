@@ -62,7 +62,7 @@ class DinoFeatures(FittedByDistance):
         """Find and check the weights; they are loaded at the first call.
 
         Args:
-            name: of the weights, see `vision.weights`; any label if `folder` is given.
+            name: of the weights, see `vision.weight_registry`; any label if `folder` is given.
             config: see `DinoConfig`.
             folder: holds the weights; without it they are searched.
 

@@ -18,9 +18,9 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import install_command, shortlist
 from ambiguous_wild.core.weight_files import expanded, not_finite
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.vision import fetch, weights
+from ambiguous_wild.vision import weight_download, weight_registry
 
-TENSORS = weights.TENSORS
+TENSORS = weight_registry.TENSORS
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class Pretrained:
 def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = None) -> Pretrained:
     """Find the model's folder and check it without loading it.
 
-    Uses the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it (`vision.fetch`).
+    Uses the explicit folder, else AW_WEIGHTS/name, else the hub's cache, else downloads it
+    (`vision.weight_download`).
 
     Args:
         name: name of the weights, e.g. ``"dinov2-small"``.
@@ -58,8 +59,8 @@ def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = 
         )
     if explicit is not None:
         return _inspect(name, expanded(explicit, "the folder of weights"), model_types)
-    weight = weights.named(name)
-    folder, reason = weights.find(weight)
+    weight = weight_registry.named(name)
+    folder, reason = weight_registry.find(weight)
     return _inspect(name, folder or _download(weight, reason), model_types)
 
 
@@ -177,9 +178,9 @@ def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
 
 def _advice(name: str, folder: Path) -> str:
     """Say what to do about unusable files; the command replaces only a folder that it finds itself."""
-    registered = {weight.name: weight for weight in weights.KNOWN + weights.OTHER_SIZES}
-    if name in registered and weights.where(registered[name]) == folder:
-        return f"run: {weights.get_command(name, again=True)}"
+    registered = {weight.name: weight for weight in weight_registry.KNOWN + weight_registry.OTHER_SIZES}
+    if name in registered and weight_registry.where(registered[name]) == folder:
+        return f"run: {weight_registry.get_command(name, again=True)}"
     return "replace this folder by a complete one"
 
 
@@ -193,12 +194,12 @@ def _file_digest(path: str, changed_ns: int) -> str:
     return sha256_file(path)
 
 
-def _download(weight: weights.Weight, reason: str) -> Path:
+def _download(weight: weight_registry.Weight, reason: str) -> Path:
     """Download the weights into the weights folder, unless the hub is switched off."""
     try:
-        if fetch.offline():
-            raise fetch.not_from_hub(weight, fetch.switched_off())
-        return fetch.get([weight], lambda line: print(line, file=sys.stderr, flush=True))[0]
+        if weight_download.offline():
+            raise weight_download.not_from_hub(weight, weight_download.switched_off())
+        return weight_download.get([weight], lambda line: print(line, file=sys.stderr, flush=True))[0]
     except AwError as error:
         raise AwError(f"the weights of {weight.name} are missing ({reason}); {error}") from None
 

@@ -51,7 +51,7 @@ class SamVideoInstances:
         """Find and check the weights; they are loaded at first use.
 
         Args:
-            name: name of the weights, see `vision.weights`; any label if `folder` is given.
+            name: name of the weights, see `vision.weight_registry`; any label if `folder` is given.
             config: see `SamVideoConfig`.
             folder: holds the weights; without it they are searched.
             single: detects the instances to track; by default SAM 2, all instances.

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder import report
+from ambiguous_wild.builder import scene_record
 from ambiguous_wild.builder.checks import fixed_to_camera
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
 from ambiguous_wild.builder.photo_comparison import compare_photos, photo_features
@@ -202,7 +202,7 @@ def test_a_scene_is_built_past_a_bonnet(tmp_path: Path):
     assert sorted(fact["photos"]) == ["test/p01.jpg", *(f"train/p{i:02d}.jpg" for i in (0, 2, 3, 5))]
     assert (fact["width"], fact["height"], fact["where"]) == (320, 240, "lower")
     assert fact["share"] == pytest.approx(0.25, abs=0.03)
-    [line] = report.fixed_lines([fact])
+    [line] = scene_record.fixed_lines([fact])
     assert line.startswith(f"the lower {100 * fact['share']:.0f} % of every photo") and "5 photos" in line
     assert result.info["counts"]["registered"] == COUNT
     for name, hidden in {"train/p00": True, "test/p01": True, "test/p04": False}.items():

@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.builder.joining import Similarity, join
 from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.motions import Motion
-from ambiguous_wild.builder.placing import Placement, PoseHypothesis, _cells, centre_of
+from ambiguous_wild.builder.placement import Placement, PoseHypothesis, _cells, centre_of
 from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 

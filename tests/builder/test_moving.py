@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.builder.moving import Votes, _number_motions, seen_through
+from ambiguous_wild.builder.moving_features import Votes, _number_motions, seen_through
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -22,11 +22,11 @@ from ambiguous_wild.io.motion_points import FILE, MotionPoints, read_motion_poin
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.motion import MotionConfig, MotionMask
-from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.vision.moving import moving_labels, moving_map
+from ambiguous_wild.vision.motion_maps import moving_labels, moving_map
 from tests.builder import capture_maker
 from tests.builder.capture_maker import HEIGHT, WIDTH, eyes, render
 

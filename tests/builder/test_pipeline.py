@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder import report
+from ambiguous_wild.builder import scene_record
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.records import SceneRecord
 from ambiguous_wild.builder.settings import BuildSettings
@@ -91,8 +91,8 @@ def test_scene_json_tells_what_was_done(scene):
     assert set(info["files"]) | {"scene.json"} == set(hashes(scene))
     assert info["photos"]["p01.png"]["source"] == "test/p01.jpg"
     assert set(info["seconds"]) >= {"screen", "features", "matches", "mapping", "undistort", "package"}
-    assert 0 < report.sfm_share(info) < 1
-    assert "6 of 6" in report.verdict(info, (160, 120), scene)
+    assert 0 < scene_record.sfm_share(info) < 1
+    assert "6 of 6" in scene_record.verdict(info, (160, 120), scene)
 
 
 def test_scene_json_keeps_its_keys_and_their_order(scene):

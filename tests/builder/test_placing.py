@@ -15,14 +15,14 @@ from ambiguous_wild.builder.adjustment import adjustment_options
 from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placing import Placement, PoseHypothesis, _reason
+from ambiguous_wild.builder.placement import Placement, PoseHypothesis, _reason
 from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.safe_pycolmap import pycolmap
-from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from tests.builder.capture_maker import FOCAL, eyes, texture, write_capture
 

@@ -5,7 +5,7 @@ import pytest
 
 from ambiguous_wild.builder import diagnosis
 from ambiguous_wild.builder.diagnosis import PairFacts, check_registered
-from ambiguous_wild.builder.report import _lost_photos, _parallax_warnings, parallax_deg, part_lines
+from ambiguous_wild.builder.scene_record import _lost_photos, _parallax_warnings, parallax_deg, part_lines
 from ambiguous_wild.core import AwError
 from tests.io.model_maker import make_model
 

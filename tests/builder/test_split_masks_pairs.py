@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from ambiguous_wild.builder.collect import read_test_list, split_photos
-from ambiguous_wild.builder.masks import find_masks, lay_out_masks, mask_warnings
+from ambiguous_wild.builder.keep_masks import find_masks, lay_out_masks, mask_warnings
 from ambiguous_wild.builder.retrieval import sequential_pairs
 from ambiguous_wild.builder.settings import BuildSettings, plans
 from ambiguous_wild.builder.sfm import camera_groups, choose_camera

@@ -6,7 +6,7 @@ import pytest
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.undistort import make_lens, undistort
 from ambiguous_wild.core import AwError
-from ambiguous_wild.datasets.photos import resized
+from ambiguous_wild.datasets.imported_photos import resized
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png

@@ -10,13 +10,13 @@ import pytest
 from tests.command_line import aw
 
 PLUGIN = """
-from ambiguous_wild.methods.ablation import Group, Variant
+from ambiguous_wild.methods.ablation_groups import Group, Variant
 from ambiguous_wild.methods.registry import MethodEntry, register
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.method_hooks import MethodHooks
 
 register(MethodEntry(
-    "mine", "3dgs", lambda options: Parts(density_config=options), config=DensityConfig,
+    "mine", "3dgs", lambda options: MethodHooks(density_config=options), config=DensityConfig,
     ablations=(Group("size", "how large", (
         Variant("few", ("max_gaussians=450",)), Variant("peer", method="not-here"),
     )), Group("length", "how long it grows", (Variant("brief", ("stop=600.0",)),)),),

@@ -11,7 +11,7 @@ import pytest
 
 from ambiguous_wild.cli.bench import parse_budget
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.bench import find_methods
+from ambiguous_wild.harness.benchmark import find_methods
 from tests.command_line import ROOT, aw
 from tests.tiny_scene import write_tiny_scene
 
@@ -59,8 +59,10 @@ def test_mistakes_get_one_line_and_exit_code_2(scene, tmp_path, arguments, messa
 
 
 def test_a_file_without_a_recipe_names_its_recipes(scene, tmp_path):
-    own = "from dataclasses import dataclass\nfrom ambiguous_wild.splat.parts import Parts\n"
-    (tmp_path / "own.py").write_text(own + "def helper(x): ...\ndef chroma() -> Parts: return Parts()\n")
+    own = "from dataclasses import dataclass\nfrom ambiguous_wild.splat.method_hooks import MethodHooks\n"
+    (tmp_path / "own.py").write_text(
+        own + "def helper(x): ...\ndef chroma() -> MethodHooks: return MethodHooks()\n"
+    )
     done = aw("bench", "--scene", scene, "--method", "own.py", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr == "error: own.py is a file: add the name of a recipe in it: own.py:chroma\n"

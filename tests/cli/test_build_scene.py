@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.report import verdict
+from ambiguous_wild.builder.scene_record import verdict
 from ambiguous_wild.cli.main import main
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.builder.capture_maker import HEIGHT, WIDTH, write_capture

@@ -86,7 +86,7 @@ def test_options_of_refinesplats_masks_are_explained_however_their_lines_are_wra
 def test_the_table_agrees_with_what_recipes_build() -> None:
     from ambiguous_wild.methods.describe import BUILTIN_TRAITS
     from ambiguous_wild.splat.density import DensityControl
-    from ambiguous_wild.splat.parts import MaskPolicy
+    from ambiguous_wild.splat.method_hooks import MaskPolicy
     from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
 
     assert set(BUILTIN_TRAITS) == {entry.name for entry in registry.BUILTIN}

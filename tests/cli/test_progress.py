@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ambiguous_wild.cli import main, progress
+from ambiguous_wild.cli import main, run_progress
 from tests.command_line import aw
 from tests.tiny_scene import write_tiny_scene
 
@@ -64,14 +64,14 @@ def test_ctrl_c_is_answered_at_once_and_leaves_no_bar(
     words: list[str], monkeypatch: pytest.MonkeyPatch, terminal: bool
 ) -> None:
     monkeypatch.setattr(Terminal, "isatty", lambda self: terminal)
-    tick = progress.ProgressBar.tick
+    tick = run_progress.ProgressBar.tick
 
     def pressing(self, trainer):
         tick(self, trainer)
         if trainer.iteration == 12:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(progress.ProgressBar, "tick", pressing)
+    monkeypatch.setattr(run_progress.ProgressBar, "tick", pressing)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         shown = seen([*words, "--effects", "none"], monkeypatch)

@@ -77,6 +77,8 @@ def test_an_output_that_cannot_be_is_found_before_the_work(
     out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("x")
-    monkeypatch.setattr("ambiguous_wild.simulate.capture.simulate", lambda *_: pytest.fail("worked first"))
+    monkeypatch.setattr(
+        "ambiguous_wild.simulate.capture_writer.simulate", lambda *_: pytest.fail("worked first")
+    )
     error = CliRunner().invoke(command, ["tiny", "-o", out.format(tmp_path)]).exception
     assert isinstance(error, AwError) and "cannot write" in str(error)

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.main import cli
 from ambiguous_wild.core import AwError
-from ambiguous_wild.stress import table
+from ambiguous_wild.stress import stress_table
 from ambiguous_wild.stress.case import CaseResult, case, run
 
 
@@ -16,7 +16,7 @@ def aw(*words):
 
 
 def test_the_list_has_every_case_or_those_chosen():
-    assert aw("--list").output.split() == [c.key for c in table.CASES]
+    assert aw("--list").output.split() == [c.key for c in stress_table.CASES]
     chosen = aw("--list", "--only", "24", "--only", "needle").output.split()
     assert chosen
     assert all(key.startswith("24-") or "needle" in key for key in chosen)
@@ -31,14 +31,14 @@ def test_json_holds_what_the_table_shows():
     done = aw("--only", "24", "--json", "--device", "cpu")
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)
-    assert [row["key"] for row in rows] == [c.key for c in table.CASES if c.row == 24]
+    assert [row["key"] for row in rows] == [c.key for c in stress_table.CASES if c.row == 24]
     assert all(row["passed"] and row["error"] <= row["tolerance"] for row in rows)
 
 
 @pytest.mark.parametrize("error", [2.0, float("nan")])
 def test_a_case_that_fails_is_said_and_exits_with_1(monkeypatch, error):
     bad = case(1, "made to fail")(lambda device: CaseResult(error, 1.0, "by hand", "nothing"))
-    monkeypatch.setattr(table, "CASES", (bad,))
+    monkeypatch.setattr(stress_table, "CASES", (bad,))
     done = aw("--device", "cpu")
     assert done.exit_code == 1
     assert "FAILED" in done.stdout
@@ -50,7 +50,7 @@ def test_a_case_that_fails_is_said_and_exits_with_1(monkeypatch, error):
 FAULTY = """
 import torch
 from ambiguous_wild.splat.density import DensityControl
-from ambiguous_wild.splat.parts import MaskPolicy, Parts
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 
 class Mean(MaskPolicy):
     mean = None
@@ -92,12 +92,12 @@ class Turns(DensityControl):
             gradients.means.zero_()
         return gradients
 
-def lost(): return Parts(mask=Lost())
-def learns(): return Parts(mask=Learns())
-def unseeded(): return Parts(mask=Unseeded())
-def brighter(): return Parts(mask=Brighter())
-def breaks(): return Parts(mask=Breaks())
-def turns(): return Parts(density=Turns)
+def lost(): return MethodHooks(mask=Lost())
+def learns(): return MethodHooks(mask=Learns())
+def unseeded(): return MethodHooks(mask=Unseeded())
+def brighter(): return MethodHooks(mask=Brighter())
+def breaks(): return MethodHooks(mask=Breaks())
+def turns(): return MethodHooks(density=Turns)
 """
 
 

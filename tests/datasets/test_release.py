@@ -15,9 +15,9 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.package import package_scenes
+from ambiguous_wild.datasets.package_check import verify
 from ambiguous_wild.datasets.privacy import strip_metadata
 from ambiguous_wild.datasets.release_facts import TEMPLATE, ReleaseInfo, read_release_info
-from ambiguous_wild.datasets.verify import verify
 from ambiguous_wild.datasets.write import import_scene
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.command_line import aw

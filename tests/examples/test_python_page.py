@@ -9,7 +9,7 @@ import pytest
 
 from ambiguous_wild.builder.records import SceneRecord
 from ambiguous_wild.core.scene import SceneInfo
-from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.presets import preset
 
 DOCS = Path(__file__).parents[2] / "docs"

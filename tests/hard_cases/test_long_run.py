@@ -21,7 +21,7 @@ from ambiguous_wild.harness import evaluate
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.calibration import warm_up
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.pace import TrainConfig

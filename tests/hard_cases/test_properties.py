@@ -17,7 +17,7 @@ from ambiguous_wild.methods.refinesplat.recipe import consistency_loss
 from ambiguous_wild.methods.refinesplat.threshold import contrast, entropy, learnt, pool_of, surprise, t_ent
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.stats import bootstrap_interval, mean, paired_interval, spread
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam

@@ -3,7 +3,7 @@
 import pytest
 
 from ambiguous_wild.stress.case import run
-from ambiguous_wild.stress.table import CASES
+from ambiguous_wild.stress.stress_table import CASES
 from tests.splat import fake_gsplat
 
 

@@ -9,17 +9,17 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.harness.ablation import plan_study, read_outcomes
+from ambiguous_wild.harness.ablation_study import plan_study, read_outcomes
 from ambiguous_wild.harness.cell import reproduce
 from ambiguous_wild.harness.grid import cell_folder, run_cells
 from ambiguous_wild.harness.result_file import write_result
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
-from ambiguous_wild.methods.ablation import Group, Variant, check_groups, choose_groups
-from ambiguous_wild.report.ablation import markdown_of, report, write_report
+from ambiguous_wild.methods.ablation_groups import Group, Variant, check_groups, choose_groups
+from ambiguous_wild.report.ablation_report import markdown_of, report, write_report
 from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MethodHooks
 from tests.command_line import aw
 from tests.harness.fake_runs import fake_result
 
@@ -250,9 +250,9 @@ def _at(options, key):
 def test_values_of_an_option_of_a_method_in_a_file_are_swept_without_a_registry_entry(scene, tmp_path):
     own = tmp_path / "my.py"
     own.write_text(
-        "from dataclasses import dataclass\nfrom ambiguous_wild.splat.parts import Parts\n"
+        "from dataclasses import dataclass\nfrom ambiguous_wild.splat.method_hooks import MethodHooks\n"
         "@dataclass(frozen=True)\nclass Config:\n    sh_degree: int = 2\n"
-        "def mine(config: Config): return Parts(sh_degree=config.sh_degree)\n"
+        "def mine(config: Config): return MethodHooks(sh_degree=config.sh_degree)\n"
     )
     words = ["ablate", "--method", f"{own}:mine", "--scene", scene, "--iterations", "3", "--device", "cpu"]
     done = aw(*words, "--sweep", "sh_degree=0,2,1", "-o", tmp_path / "ablation")

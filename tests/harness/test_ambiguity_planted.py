@@ -15,7 +15,7 @@ from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_poi
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
 from ambiguous_wild.report import ambiguity_measure, ambiguity_sources, ambiguity_summary
-from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.presets import preset
 from ambiguous_wild.vision.labhog import LabHog
 from ambiguous_wild.vision.segments import GraphSegments

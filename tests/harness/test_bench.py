@@ -8,7 +8,7 @@ import pytest
 
 from ambiguous_wild import bench
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.bench import Callbacks, Engine, Lines
+from ambiguous_wild.harness.benchmark import Callbacks, Engine, Lines
 from ambiguous_wild.splat.trainer import Trainer
 
 

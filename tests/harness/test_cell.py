@@ -140,12 +140,12 @@ def test_the_command_of_a_result_makes_the_same_cell(
 RECIPE = """
 from dataclasses import dataclass
 from ambiguous_wild.methods import MethodEntry, register
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.method_hooks import MethodHooks
 @dataclass(frozen=True)
 class Config:
     sh_degree: int = 2
 def build(config: Config):
-    return Parts(sh_degree=config.sh_degree)
+    return MethodHooks(sh_degree=config.sh_degree)
 """
 PROGRAM = """
 name: copycat

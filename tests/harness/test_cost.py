@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.report.cost import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_curves import (
     Curve,
     MeanAndDeviation,
@@ -27,6 +26,7 @@ from ambiguous_wild.report.cost_curves import (
     timeline,
 )
 from ambiguous_wild.report.cost_plots import draw_all, spread_out
+from ambiguous_wild.report.cost_report import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, read_cost_runs
 from ambiguous_wild.report.cost_targets import first_time, times_to_reach
 from tests.harness.fake_cost import cost_run

@@ -14,9 +14,9 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.report import cost_recommend as advice
-from ambiguous_wild.report.cost import cost_report, plain_data, to_text
 from ambiguous_wild.report.cost_curves import changes, curves_of
 from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, value_at, words_of
+from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text
 from ambiguous_wild.report.cost_runs import CostRuns, read_cost_runs
 from ambiguous_wild.report.cost_targets import answers
 from tests.harness.fake_cost import cost_run

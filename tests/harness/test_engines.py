@@ -14,10 +14,10 @@ from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import job as jobs
 from ambiguous_wild.harness.cell import RunOptions
+from ambiguous_wild.harness.cell_run import left_alone
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.ray_cluster import receive, run_sent, send_scene
 from ambiguous_wild.harness.result_file import read_result
-from ambiguous_wild.harness.run import left_alone
 from ambiguous_wild.harness.session import run_in_processes
 from ambiguous_wild.methods import registry
 from ambiguous_wild.splat.pace import TrainConfig
@@ -152,7 +152,9 @@ def test_a_job_makes_the_same_cell_without_the_files_of_its_method(cell, scene, 
     with pytest.raises(AwError, match="a file of the method differs there"):  # frail.py does not travel
         elsewhere(cell[1])
     own = tmp_path / "own.py"
-    own.write_text("from ambiguous_wild.splat.parts import Parts\ndef own(): return Parts()\n")
+    own.write_text(
+        "from ambiguous_wild.splat.method_hooks import MethodHooks\ndef own(): return MethodHooks()\n"
+    )
     (cell,) = plan_cells([f"{own}:own"], [scene], [0], SHORT)
     again = elsewhere(job_of(cell, f"{own}:own", tmp_path))
     assert again.identity == cell.identity

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.harness import grid as expected
-from ambiguous_wild.harness.bench import Callbacks, bench
+from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.splat import calibration
 from tests.tiny_scene import write_tiny_scene
 
@@ -56,7 +56,7 @@ def test_only_runs_whose_length_nobody_chose_are_told_of(
 
 def test_finished_runs_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = write_tiny_scene(tmp_path / "wall")
-    name = "ambiguous_wild.harness.run.is_finished"
+    name = "ambiguous_wild.harness.cell_run.is_finished"
     monkeypatch.setattr(name, lambda folder: "absgs" in folder.parts)
     assert "1 run of 30000 iterations" in said_by(scene, tmp_path / "a")
     assert "2 runs of 30000" in said_by(scene, tmp_path / "a", overwrite="always")

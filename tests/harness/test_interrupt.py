@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.cli import main
-from ambiguous_wild.harness.bench import Callbacks, bench
+from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.splat.run import Stopped, deferred

@@ -23,7 +23,7 @@ from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.harness.store import Runs, read_runs
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report import papers, plain_formats
-from ambiguous_wild.report.ablation import ablation
+from ambiguous_wild.report.ablation_report import ablation
 from ambiguous_wild.report.papers import (
     datasets_of,
     difference_interval,
@@ -31,7 +31,7 @@ from ambiguous_wild.report.papers import (
     with_reported,
 )
 from ambiguous_wild.report.plain_formats import divided
-from ambiguous_wild.report.table import Column, Table, TableCell
+from ambiguous_wild.report.table_layout import Column, Table, TableCell
 from ambiguous_wild.report.typeset import latex_text, to_html, to_latex
 from tests.harness.fake_runs import failed, fake_result, save
 

@@ -97,8 +97,9 @@ def test_an_own_method_is_named_as_it_was_given(
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text(
         "from ambiguous_wild.methods import MethodEntry, register\n"
-        "from ambiguous_wild.splat.parts import Parts\n\n"
-        "def b(): return Parts()\n\nregister(MethodEntry('plugged', '', lambda options: Parts()))\n"
+        "from ambiguous_wild.splat.method_hooks import MethodHooks\n\n"
+        "def b(): return MethodHooks()\n\n"
+        "register(MethodEntry('plugged', '', lambda options: MethodHooks()))\n"
     )
     Path("own.yaml").write_text("{name: other, train: aw, render: aw, renders: '{output}/{stem}.png'}")
     monkeypatch.setattr(registry, "registered", {})

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import yaml
 
-from ambiguous_wild.harness.ablation import plan_study
+from ambiguous_wild.harness.ablation_study import plan_study
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.methods import MethodEntry, register, registry
-from ambiguous_wild.report.ablation import markdown_of, report
+from ambiguous_wild.report.ablation_report import markdown_of, report
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.harness.fake_runs import fake_result, save

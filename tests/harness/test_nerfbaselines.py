@@ -14,7 +14,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb
-from ambiguous_wild.methods import nerfbaselines, registry
+from ambiguous_wild.methods import nerfbaselines_methods, registry
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
@@ -67,7 +67,7 @@ def calls(tmp_path, monkeypatch):
     program, log = tmp_path / "nerfbaselines", tmp_path / "calls"
     program.write_text(STAND_IN.format(python=sys.executable, calls=str(log)))
     program.chmod(0o755)
-    monkeypatch.setenv(nerfbaselines.PROGRAM, str(program))
+    monkeypatch.setenv(nerfbaselines_methods.PROGRAM, str(program))
     return lambda: [json.loads(line) for line in log.read_text().splitlines()]
 
 
@@ -143,12 +143,12 @@ def test_a_factor_that_it_would_not_load_is_refused(calls, tmp_path):
 
 
 def test_where_it_is_not_there_the_commands_are_said(monkeypatch):
-    monkeypatch.setenv(nerfbaselines.PROGRAM, "")
+    monkeypatch.setenv(nerfbaselines_methods.PROGRAM, "")
     monkeypatch.setenv("PATH", "")
     with pytest.raises(AwError, match=r"numpy<2.*export AW_NERFBASELINES=") as error:
         registry.get_method("nerfbaselines:splat")
     assert "\n" not in str(error.value)
-    monkeypatch.setenv(nerfbaselines.PROGRAM, "/nowhere/nerfbaselines")
+    monkeypatch.setenv(nerfbaselines_methods.PROGRAM, "/nowhere/nerfbaselines")
     with pytest.raises(AwError, match="which is no program"):
         registry.get_method("nerfbaselines:splat")
 
@@ -196,7 +196,7 @@ register(dict(id="nearest-photo", method_class="nearest_photo:Nearest", backends
 """
 
 
-@pytest.mark.skipif(nerfbaselines.PROGRAM not in os.environ, reason="NerfBaselines is not installed")
+@pytest.mark.skipif(nerfbaselines_methods.PROGRAM not in os.environ, reason="NerfBaselines is not installed")
 def test_the_real_one_with_a_method_of_its_own(scene, tmp_path, monkeypatch):
     (tmp_path / "nearest_photo.py").write_text(textwrap.dedent(NEAREST))
     (tmp_path / "nearest_spec.py").write_text(textwrap.dedent(SPEC))

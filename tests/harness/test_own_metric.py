@@ -10,7 +10,7 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import measures
-from ambiguous_wild.harness.bench import bench
+from ambiguous_wild.harness.benchmark import bench
 from ambiguous_wild.harness.measures import Metric, load_metrics, measure, metrics
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_png_rgb

@@ -25,8 +25,8 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH, write_tiny_scene
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from ambiguous_wild import bench
-from ambiguous_wild.harness.ablation import plan_study
+from ambiguous_wild.harness.ablation_study import plan_study
 from ambiguous_wild.harness.store import Runs, read_runs
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.report.notes import _fitted

@@ -12,7 +12,7 @@ from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.harness.measures import measure_images, metrics
 from ambiguous_wild.harness.regions import find_regions
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.metrics.masks import psnr_valid
+from ambiguous_wild.metrics.mask_scores import psnr_valid
 from ambiguous_wild.vision.sparse_surface import inverse_depth
 from tests.tiny_scene import HEIGHT, TEST, TRAIN, WALL_Z, WIDTH, write_tiny_scene
 

@@ -17,8 +17,8 @@ from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.splat.density import DensityControl
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from tests.tiny_scene import write_tiny_scene
 
 

@@ -13,9 +13,9 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.table import rescore_command as command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness import bench as bench_module
+from ambiguous_wild.harness import benchmark as bench_module
 from ambiguous_wild.harness import evaluate
-from ambiguous_wild.harness.bench import Callbacks, bench
+from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
 from ambiguous_wild.harness.result_file import metrics_of, read_result
 from ambiguous_wild.harness.store import could_be_measured

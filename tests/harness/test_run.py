@@ -13,16 +13,16 @@ import yaml
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import RunOptions
+from ambiguous_wild.harness.cell_run import refuse_other_config
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells, try_recipes
 from ambiguous_wild.harness.result_file import check_model, read_result
-from ambiguous_wild.harness.run import refuse_other_config
 from ambiguous_wild.io.files import folder_lock, sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.image import flip, psnr, psnr_affine
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 SHORT = TrainConfig(iterations=60, probes=2)
@@ -239,7 +239,7 @@ def test_a_fault_of_a_method_of_ones_own_is_told_with_its_line(scene, tmp_path, 
 def test_a_changed_file_is_named_and_trained_again_alone(scene, tmp_path):
     own, code = (
         tmp_path / "my.py",
-        "from ambiguous_wild.splat.parts import Parts\ndef mine(): return Parts({})",
+        "from ambiguous_wild.splat.method_hooks import MethodHooks\ndef mine(): return MethodHooks({})",
     )
     methods = (f"{own}:mine", "3dgs")
     own.write_text(code.format(""))

@@ -10,7 +10,7 @@ import pytest
 
 from ambiguous_wild import bench
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.bench import Callbacks
+from ambiguous_wild.harness.benchmark import Callbacks
 from ambiguous_wild.harness.cell import RunOptions, reproduce
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.job import make_cell, make_job
@@ -21,8 +21,8 @@ from ambiguous_wild.io.spz import write_spz
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.report.notes import unequal
 from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.method_hooks import START_SHARE, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import START_SHARE, MethodHooks
 from ambiguous_wild.viewing.model import Renderer, RenderSettings
 from tests.io.test_place import UTM, moved
 from tests.viewing.wall_runs import wall_model

@@ -26,7 +26,7 @@ from ambiguous_wild.report.plain_formats import (
     to_text,
     to_wide_csv,
 )
-from ambiguous_wild.report.table import Table, TableCell
+from ambiguous_wild.report.table_layout import Table, TableCell
 from ambiguous_wild.report.typeset import to_html as html_of
 from ambiguous_wild.report.typeset import to_latex as latex_of
 from tests.harness.fake_runs import failed, fake_result, save, start

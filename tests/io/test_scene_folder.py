@@ -19,7 +19,7 @@ NAMES = [f"p{i}.png" for i in range(10)]
 
 def mark_as_ours(root, factor=2):
     """A scene.json with the true hashes of what lies there."""
-    from ambiguous_wild.builder.package import list_files
+    from ambiguous_wild.builder.scene_package import list_files
 
     info = {"schema_version": 1, "factor": factor, "name": "tiny", "files": list_files(root, 1)}
     (root / "scene.json").write_text(json.dumps(info))

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import torch
 
-from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat import backend
 from tests.methods.test_refinesplat_policy import (

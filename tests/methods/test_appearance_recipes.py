@@ -12,8 +12,8 @@ from ambiguous_wild.methods.gsw import GswAppearance, GswConfig, Visibility
 from ambiguous_wild.methods.masking_common import d_keep
 from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.learnt import Visible
-from ambiguous_wild.splat.effects.placing import (
+from ambiguous_wild.splat.effects.autograd_effect import Visible
+from ambiguous_wild.splat.effects.geometry import (
     directions,
     frequencies,
     harmonics,
@@ -134,12 +134,12 @@ def visible_of(effect, n=5):
 
 def test_colours_by_a_second_implementation(gsw):
     data, effect = gsw
-    visible, shot = visible_of(effect), shot_of(data)
-    leaf = effect._leaf(shot)
-    found = effect.forward(visible, leaf, shot)
+    visible, context = visible_of(effect), shot_of(data)
+    leaf = effect._leaf(context)
+    found = effect.forward(visible, leaf, context)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(effect, "config", replace(effect.config, residual=False))
-        published = effect.forward(visible, leaf, shot)
+        published = effect.forward(visible, leaf, context)
     maps = gs_w.maps_of(data.photos[0], leaf, 32).numpy()
     assert maps.shape[:2] == (3, 16)
 
@@ -180,9 +180,13 @@ def test_colours_by_a_second_implementation(gsw):
 
 def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show_it(gsw):
     data, effect = gsw
-    visible, shot = visible_of(effect), shot_of(data, view=None, photo=None)
-    leaf, box = effect._leaf(shot), visible.attributes["gsw_box"]
-    found, total, count = effect._usual(shot, leaf, visible.means, box), torch.zeros(5, 16), torch.zeros(5, 1)
+    visible, context = visible_of(effect), shot_of(data, view=None, photo=None)
+    leaf, box = effect._leaf(context), visible.attributes["gsw_box"]
+    found, total, count = (
+        effect._usual(context, leaf, visible.means, box),
+        torch.zeros(5, 16),
+        torch.zeros(5, 1),
+    )
     for photo, view in zip(data.photos, data.cameras):
         pixels, z = projected(visible.means, view)
         at = pixels / torch.tensor([view.width, view.height])
@@ -274,12 +278,12 @@ def test_the_background_fills_what_is_open_and_its_alpha_term_acts_there(scene, 
     parts, data = parts_of("splatfacto-w", alpha="0.15"), data_of(scene, tmp_path)
     effect = parts.effects[0]
     effect.setup(data)
-    shot = shot_of(data, nominal=5000.0)
-    leaf = effect._leaf(shot)
-    sky = effect.background(leaf, shot)
+    context = shot_of(data, nominal=5000.0)
+    leaf = effect._leaf(context)
+    sky = effect.background(leaf, context)
     assert sky.shape == (48, 64, 3)
     alpha = random(48, 64)
-    toned = effect.tone(torch.zeros(48, 64, 3), alpha, leaf, shot)
+    toned = effect.tone(torch.zeros(48, 64, 3), alpha, leaf, context)
     torch.testing.assert_close(toned, ((1 - alpha)[..., None] * sky).clamp(0, 1))
     # the photo is the background in its left half
     photo = sky.clone()
@@ -293,14 +297,14 @@ def test_the_background_fills_what_is_open_and_its_alpha_term_acts_there(scene, 
 def test_colours_start_at_degree_zero(scene, tmp_path):
     trainer = trainer_of(scene, tmp_path, parts_of("splatfacto-w", width="8"))
     effect = trainer.effects.effects[0]
-    shot = shot_of(trainer.data)
-    leaf = {**effect._leaf(shot), "rest_bias0": torch.ones(45)}
+    context = shot_of(trainer.data)
+    leaf = {**effect._leaf(context), "rest_bias0": torch.ones(45)}
     g = trainer.gaussians
     visible = Visible(torch.zeros(len(g), 3), g.means, g.attributes)
-    early, late = (effect.forward(visible, leaf, replace(shot, nominal=n)) for n in (1000.0, 2000.0))
+    early, late = (effect.forward(visible, leaf, replace(context, nominal=n)) for n in (1000.0, 2000.0))
     # features are zero: every Gaussian has the photo's one colour, until directions count
     torch.testing.assert_close(early, early[:1].expand_as(early))
-    towards = directions(g.means, shot.camera)
+    towards = directions(g.means, context.camera)
     want = early + 0.4886025119 * (towards[:, 2] - towards[:, 1] - towards[:, 0])[:, None]
     torch.testing.assert_close(late, want, rtol=1e-4, atol=1e-5)
 
@@ -329,11 +333,11 @@ def swag(scene, tmp_path_factory):
 
 def test_it_starts_as_3dgs_but_for_little(swag):
     trainer, effect = swag
-    shot = shot_of(trainer.data)
+    context = shot_of(trainer.data)
     base = random(len(trainer.gaussians), 3)
-    colours = effect.forward(Visible(base, trainer.gaussians.means), effect._leaf(shot), shot)
+    colours = effect.forward(Visible(base, trainer.gaussians.means), effect._leaf(context), context)
     assert float((colours - base).abs().max()) < 0.1
-    assert effect.change(trainer.gaussians, effect._leaf(shot), shot) == {}  # gates have not begun
+    assert effect.change(trainer.gaussians, effect._leaf(context), context) == {}  # gates have not begun
 
 
 def test_means_over_what_is_seen_are_the_same_on_an_accelerator(swag, monkeypatch):
@@ -351,11 +355,11 @@ def test_means_over_what_is_seen_are_the_same_on_an_accelerator(swag, monkeypatc
 
 def test_gates_close_by_their_logit_and_only_in_photos(swag):
     trainer, effect = swag
-    g, shot = trainer.gaussians, shot_of(trainer.data, nominal=5000.0)
-    leaf = effect._leaf(shot)
-    seen = in_picture(g.means, shot.camera)
+    g, context = trainer.gaussians, shot_of(trainer.data, nominal=5000.0)
+    leaf = effect._leaf(context)
+    seen = in_picture(g.means, context.camera)
 
-    def opacity(bias, at=shot):
+    def opacity(bias, at=context):
         moved = {**leaf, "net_bias3": torch.tensor([0.0, 0.0, 0.0, bias])}
         moved["net_weight3"] = torch.zeros_like(leaf["net_weight3"])
         found = effect.change(g, moved, at)
@@ -368,7 +372,7 @@ def test_gates_close_by_their_logit_and_only_in_photos(swag):
     closed = (opacity(0.5)[seen] < 0.5 * before[seen]).double().mean()
     assert float(closed) == pytest.approx(1 / (1 + np.exp(-0.5)), abs=0.08)
     # pictures without a photo leave out what is off in most photos
-    other = replace(shot, view=None, photo=None)
+    other = replace(context, view=None, photo=None)
     effect._left_out = None
     assert torch.equal(opacity(-1.0, other), before)
     effect._left_out = None
@@ -379,11 +383,11 @@ def test_gates_close_by_their_logit_and_only_in_photos(swag):
 
 def test_gates_are_pulled_open_by_their_penalty(swag):
     trainer, effect = swag
-    g, shot = trainer.gaussians, shot_of(trainer.data, nominal=5000.0)
+    g, context = trainer.gaussians, shot_of(trainer.data, nominal=5000.0)
     with torch.enable_grad():
-        drawn, pull = effect.model(g, shot)
-    zero = trainer.drawing(g, shot).backward(torch.zeros(48, 64, 3))
-    gradient = pull(replace(zero, own={})).own["swag"]["net_bias3"]
+        drawn, vjp = effect.model(g, context)
+    zero = trainer.drawing(g, context).backward(torch.zeros(48, 64, 3))
+    gradient = vjp(replace(zero, effect_grads={})).effect_grads["swag"]["net_bias3"]
     # nothing pulls on the picture: what is left is d(0.01 mean z)/d(logit of being off), which is positive
     assert not gradient[:3].any() and 0.0 < float(gradient[3]) < 0.01 * 0.25 / 0.1
     assert drawn.opacity_logits.shape == g.opacity_logits.shape

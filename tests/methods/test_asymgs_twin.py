@@ -32,13 +32,13 @@ def test_pictures_are_drawn_to_each_other_after_the_warm_up(twin):
     first = torch.full_like(twin.data.photos[0], 0.5)
     second = first.clone()
     second[:, :32] += 0.1
-    shot = SimpleNamespace(nominal=1001.0, camera=twin.data.cameras[0], divisor=1)
-    found = twin.regularise(frames(first, second), shot)
+    context = SimpleNamespace(nominal=1001.0, camera=twin.data.cameras[0], divisor=1)
+    found = twin.regularise(frames(first, second), context)
     each = 1.0 / first.numel()
     assert found[STATIC].image[:, :32].unique().tolist() == pytest.approx([-each])
     assert found[TWIN].image[:, :32].unique().tolist() == pytest.approx([each])
     assert not found[STATIC].image[:, 32:].any() and not found[TWIN].image[:, 32:].any()
-    early = twin.regularise(frames(first, second), SimpleNamespace(**vars(shot) | {"nominal": 1000.0}))
+    early = twin.regularise(frames(first, second), SimpleNamespace(**vars(context) | {"nominal": 1000.0}))
     assert not early[STATIC].image.any() and not early[TWIN].image.any()
 
 
@@ -47,8 +47,8 @@ def test_the_second_model_learns_its_own_photo_under_its_own_mask(twin):
     soft = torch.sigmoid(8 * twin.masks.soft[view].values[0]).clone()
     camera = twin.data.cameras[view]
     twin._second = view, camera
-    shot = SimpleNamespace(nominal=500.0, camera=camera, divisor=1)
-    found = twin.regularise(frames(first, first), shot)
+    context = SimpleNamespace(nominal=500.0, camera=camera, divisor=1)
+    found = twin.regularise(frames(first, first), context)
     keep = torch.nn.functional.interpolate(soft[None, None], size=first.shape[:2], mode="bilinear")[0, 0]
     wanted = photometric(first, twin.data.photos[view], keep).d_image
     assert torch.allclose(found[TWIN].image, wanted, atol=1e-9) and wanted.abs().sum() > 0
@@ -78,8 +78,8 @@ def test_both_models_learn_and_grow_and_differ(scene, tmp_path):
     assert sum(r.split for r in other.density.log.rounds) > 0
     assert len(other.gaussians) == other.density.log.rounds[-1].count
     camera = trainer.data.cameras[0]
-    first = trainer.drawing._draw(trainer.gaussians, trainer.shot(camera), None).image
-    second = trainer.drawing._draw(other.gaussians, trainer.shot(camera), None).image
+    first = trainer.drawing._draw(trainer.gaussians, trainer.context(camera), None).image
+    second = trainer.drawing._draw(other.gaussians, trainer.context(camera), None).image
     assert 0.0 < float((first - second).abs().mean()) < 0.1
     assert torch.equal(trainer.render(camera).image, first)  # the result is the first model
 

@@ -21,7 +21,7 @@ def starts(scene, tmp_path_factory):
     )
 
 
-def shot(view=0, iteration=300):
+def context(view=0, iteration=300):
     return ViewContext(iteration=iteration, nominal=1.0, view=view, camera=SimpleNamespace())
 
 
@@ -54,10 +54,10 @@ def test_learning_rates_are_the_released_ones_times_the_speed(starts):
 def test_the_composite_by_hand():
     layers = Layers(DeSplatConfig())
     frames = {STATIC: frame(0.8, 0.9), str(0): frame(0.3, 0.4)}
-    made, pull = layers.compose(frames, shot())
+    made, vjp = layers.compose(frames, context())
     assert made.image[0, 0].tolist() == pytest.approx([0.3 + 0.6 * 0.8] * 3)
     assert made.alpha[0, 0].item() == pytest.approx(0.4 + 0.6 * 0.9)
-    back = pull(Cotangents(image=torch.ones(2, 3, 3)))
+    back = vjp(Cotangents(image=torch.ones(2, 3, 3)))
     assert back[STATIC].image[0, 0].tolist() == pytest.approx([0.6] * 3)
     assert back[str(0)].image[0, 0].tolist() == [1.0] * 3
     assert back[str(0)].alpha[0, 0].item() == pytest.approx(-3 * 0.8)
@@ -65,17 +65,17 @@ def test_the_composite_by_hand():
 
 def test_layers_are_not_drawn_before_their_start():
     layers = Layers(DeSplatConfig(min_start=300))
-    assert layers.drawn(shot(4)) == ("4",) and layers.drawn(shot(4, 299)) == ()
-    assert layers.drawn(shot(None)) == ()
+    assert layers.drawn(context(4)) == ("4",) and layers.drawn(context(4, 299)) == ()
+    assert layers.drawn(context(None)) == ()
     static, given = frame(0.8, 0.9), Cotangents(image=torch.ones(2, 3, 3))
-    made, pull = layers.compose({STATIC: static}, shot(4, 299))
-    assert made is static and pull(given) == {STATIC: given}
-    assert set(layers.regularise({STATIC: static}, shot(4, 299))) == {STATIC}
+    made, vjp = layers.compose({STATIC: static}, context(4, 299))
+    assert made is static and vjp(given) == {STATIC: given}
+    assert set(layers.regularise({STATIC: static}, context(4, 299))) == {STATIC}
 
 
 def test_the_alpha_terms_pull_static_up_and_the_layer_down():
     layers = Layers(DeSplatConfig(alpha_static=0.6, alpha_own=0.3))
-    terms = layers.regularise({STATIC: frame(0.8, 0.9), str(2): frame(0.3, 0.4)}, shot(2))
+    terms = layers.regularise({STATIC: frame(0.8, 0.9), str(2): frame(0.3, 0.4)}, context(2))
     assert terms[STATIC].alpha.tolist() == [[pytest.approx(-0.1)] * 3] * 2  # 0.6 over 6 pixels
     assert terms[str(2)].alpha.tolist() == [[pytest.approx(0.05)] * 3] * 2
 

@@ -7,8 +7,8 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.uad import UncertaintyAware
-from ambiguous_wild.splat.effects import chain
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.effects import effect_pipeline
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from tests.host_reads import moved, no_transfers
 from tests.methods.baselines import parts_of, same, trained, trainer_of
@@ -99,7 +99,7 @@ def test_resuming_gives_the_same_bits(scene, tmp_path, method):
 
 @pytest.mark.parametrize("method", RECIPES)
 def test_a_test_photo_is_fitted_by_its_left_half(scene, tmp_path, monkeypatch, method):
-    monkeypatch.setattr(chain, "FIT_STEPS", 12)
+    monkeypatch.setattr(effect_pipeline, "FIT_STEPS", 12)
     trainer = trained(scene, tmp_path / "run", parts_of(method, **RECIPES[method]), iterations=20)
     camera, photo = trainer.data.cameras[0], trainer.data.photos[0]
     left = torch.zeros(photo.shape[:2])

@@ -15,15 +15,15 @@ from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
 from ambiguous_wild.methods.given_masks import GraftedPolicy
 from ambiguous_wild.methods.graft import check_graft, compose, graft_name
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
+from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.methods.robustsplat import RobustSplatConfig, RobustSplatMask
 from ambiguous_wild.methods.truth import TruthMask
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.colour import AffineExposure
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from tests.methods.baselines import bits, parts_of, trained
 
 TRUE_3DGS = "3dgs@mask=truth"

@@ -13,7 +13,7 @@ from ambiguous_wild.methods.references import import_file
 CODE = r'''
 from dataclasses import dataclass
 from ambiguous_wild.methods import MethodEntry
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.method_hooks import MethodHooks
 
 @dataclass(frozen=True)
 class Config:
@@ -23,22 +23,22 @@ def plain():
     """As it comes.
 
     More of it."""
-    return Parts()
+    return MethodHooks()
 
 def tuned(config: Config):
-    return Parts(sh_degree=config.sh_degree)
+    return MethodHooks(sh_degree=config.sh_degree)
 
 def untyped(config):
-    return Parts()
+    return MethodHooks()
 
 def wrong(config: "Nowhere"):
-    return Parts()
+    return MethodHooks()
 
 def three():
     return 3
 
 def nothing():
-    Parts()
+    MethodHooks()
 
 entry = MethodEntry("its-own-name", "made by hand", tuned, config=Config)
 annotated = MethodEntry("annotated", "made by hand", tuned)
@@ -137,7 +137,7 @@ def test_an_at_in_a_path_is_no_graft(tmp_path):
 @pytest.mark.parametrize(("name", "what"), [("three", "int"), ("nothing", "None")])
 def test_what_returns_no_parts_is_said_so(recipe, name, what):
     entry = registry.get_method(f"{recipe}:{name}")
-    with pytest.raises(AwError, match=f"{name} returned {what}, it must return Parts"):
+    with pytest.raises(AwError, match=f"{name} returned {what}, it must return MethodHooks"):
         entry.build(entry.options())
 
 

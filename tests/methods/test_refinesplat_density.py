@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
+from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity, EntropyDensityConfig
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat import maps, merging, pixels, structure
-from ambiguous_wild.methods.refinesplat.density import (
+from ambiguous_wild.methods.refinesplat.density_control import (
     EntropyAwareDensity,
     EntropyDensityConfig,
     Support,

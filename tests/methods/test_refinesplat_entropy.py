@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.refinesplat import evidence as maps_of
 from ambiguous_wild.methods.refinesplat import masks, pixels
-from ambiguous_wild.methods.refinesplat.config import MaskConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.threshold import (
     TEMPERATURE,
     contrast,
@@ -160,7 +160,7 @@ def test_a_majority_is_never_flagged():
     assert cut_of(values, gate=5.0)[1].mean() < 0.1
 
 
-def taught(visits, cost: float, floor: float, form: str = "kapur") -> torch.Tensor:
+def coverage(visits, cost: float, floor: float, form: str = "kapur") -> torch.Tensor:
     theta = torch.zeros((), dtype=torch.float64)
     for values in visits:
         one = torch.ones(len(values), dtype=torch.float64)
@@ -171,7 +171,7 @@ def taught(visits, cost: float, floor: float, form: str = "kapur") -> torch.Tens
 @pytest.mark.parametrize("cost", [0.0, 10.0])
 def test_learnt_weight_stays_inside(cost):
     rng = np.random.default_rng(0)
-    theta = taught((rng.gamma(2.0, 1.0, 40) for _ in range(500)), cost, 0.5)
+    theta = coverage((rng.gamma(2.0, 1.0, 40) for _ in range(500)), cost, 0.5)
     assert torch.isfinite(theta)
     assert 0.0 < float(torch.sigmoid(theta.float())) < 1.0
 
@@ -182,7 +182,7 @@ def test_learnt_weight_follows_the_residuals(form):
     values = np.sort(np.random.default_rng(1).gamma(2.0, 1.0, 60))
     values = np.linspace(0.02, 0.3, 30) if form == "literal" else values
     floor = -math.inf if form == "literal" else 1.0
-    dear, cheap = (float(torch.sigmoid(taught([values] * 50, cost, floor, form))) for cost in (5.0, 0.0))
+    dear, cheap = (float(torch.sigmoid(coverage([values] * 50, cost, floor, form))) for cost in (5.0, 0.0))
     assert dear < 0.5 < cheap
     assert cut_of(values, dear, form)[0] <= cut_of(values, cheap, form)[0]
     if form == "literal":

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig, first_look
+from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig, first_look
 from ambiguous_wild.vision.sparse_surface import static_surfaces
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0

@@ -7,8 +7,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ambiguous_wild.methods.refinesplat.config import MaskConfig
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity, EntropyDensityConfig
+from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity, EntropyDensityConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.masks import MaskStore
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat import backend

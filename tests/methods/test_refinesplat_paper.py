@@ -11,7 +11,7 @@ import torch
 
 from ambiguous_wild.core.config import flatten, from_plain, to_plain, with_options
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.inputs import untracked
 from ambiguous_wild.methods.refinesplat.paper import PaperConfig, PrintedConfig

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.config import MaskConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.maps import Ranks, agree, agreement_weight, common_offset
 from ambiguous_wild.methods.refinesplat.masks import Labels, PhotoMasks, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import (
@@ -47,7 +47,7 @@ def store(others: OtherViews, view: int, evidence: np.ndarray, depth: np.ndarray
 def asked(others: OtherViews, view: int) -> MultiViewEvidence:
     """What the others say about the surface that the view stored, as arrays."""
     found = others.ask(view, others.depth.of(view)[0])
-    return MultiViewEvidence(*(x.numpy() for x in (found.evidence, found.weight, found.taught)))
+    return MultiViewEvidence(*(x.numpy() for x in (found.evidence, found.weight, found.coverage)))
 
 
 def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
@@ -124,7 +124,7 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     assert np.isnan(asked(other_views, 0).evidence).all()
     store(other_views, 1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
     assert np.nanmin(asked(other_views, 0).evidence) == pytest.approx(1.0)
-    assert (asked(other_views, 0).taught == np.isfinite(asked(other_views, 0).evidence)).all()
+    assert (asked(other_views, 0).coverage == np.isfinite(asked(other_views, 0).evidence)).all()
     far = others_of([camera(0.0), camera(1000.0)], plain(2))
     store(far, 0, np.ones((H, W)), np.full((H, W), PLANE))
     store(far, 1, np.ones((H, W)), np.full((H, W), PLANE))
@@ -148,8 +148,8 @@ def test_discount_by_hand():
     evidence = torch.full((4, 6), 10.0)
     said, whole = torch.full((2, 3), 0.6), torch.ones(2, 3)  # 6 units: 4 above what is free
 
-    def left(said, weight, taught=whole):
-        return discount(evidence, MultiViewEvidence(said, weight, taught), number(0.1), config)
+    def left(said, weight, coverage=whole):
+        return discount(evidence, MultiViewEvidence(said, weight, coverage), number(0.1), config)
 
     assert np.allclose(left(said, whole), 10.0 / np.sqrt(1 + 2 * 4))
     assert np.allclose(left(said, 0.5 * whole), 10.0 / np.sqrt(1 + 2 * 2))

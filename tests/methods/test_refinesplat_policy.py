@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera, Scene, SparsePoints, View
-from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.checkpoint import load, save

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.config import MaskConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.vision.sparse_surface import seldom_seen, static_surfaces
 from tests.methods.on_device import noise

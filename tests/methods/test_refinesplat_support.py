@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.density import (
+from ambiguous_wild.methods.refinesplat.density_control import (
     EntropyAwareDensity,
     EntropyDensityConfig,
     Support,

@@ -6,7 +6,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods import MethodEntry, all_methods, get_method, load_plugin, register, registry
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 
 
 @pytest.fixture(autouse=True)

@@ -79,7 +79,7 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
         code = codes[row : row + 1].clone().requires_grad_()
         (through,) = torch.autograd.grad(policy.effect.doubts(code, leaf).sum(), code)
     torch.testing.assert_close(found[row], (slope_of_doubt * through[0]).float(), rtol=0.03, atol=1e-7)
-    assert gradients.own["nexussplats"].keys() >= {"transient", "doubt_weight0", "doubt_bias2"}
+    assert gradients.effect_grads["nexussplats"].keys() >= {"transient", "doubt_weight0", "doubt_bias2"}
     assert not gradients.sh0.any() and not gradients.screen.any()
     assert torch.equal(kept(keep), policy.predict(step))
     assert kept(torch.tensor([1.5, 0.9])).tolist() == [1.0, 0.0] and kept(torch.tensor([0.9])).item() == 1.0
@@ -100,8 +100,8 @@ def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
     monkeypatch.setattr(policy.effect, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
     monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
     weight, gradients = policy._weight(step, learn=True)
-    pull = gradients.attributes["nexus_doubt"][:, 0]
-    assert weight.max() > 3.0 and pull.min() < 0.0 and pull.max() <= 1e-9  # a step against it raises sigma
+    vjp = gradients.attributes["nexus_doubt"][:, 0]
+    assert weight.max() > 3.0 and vjp.min() < 0.0 and vjp.max() <= 1e-9  # a step against it raises sigma
 
 
 def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch):
@@ -196,7 +196,7 @@ def test_stages_share_the_loss_as_described(scene, tmp_path):
         picture = composed(t, m, apart.rendered.image)
         return photometric(picture, apart.photo).value + 0.05 * m.mean()
 
-    planar, gradient = effect._leaf(apart)["planar"], found.own["hybridgs"]["planar"]
+    planar, gradient = effect._leaf(apart)["planar"], found.effect_grads["hybridgs"]["planar"]
     at = divmod(int(gradient[:, 2:5].abs().argmax()), 3)
     at = (at[0], at[1] + 2)
     assert gradient[at].item() == pytest.approx(slope(loss, planar, at, 2e-3), rel=0.05)
@@ -313,13 +313,13 @@ def test_the_mixture_and_where_its_gradient_goes(forest):
     assert torch.equal(forest.render(step.camera).image, frames[STATIC].image)
     gradients = step.rendered.backward(torch.ones_like(step.photo))
     assert gradients.fields["transient"].means.any() and gradients.means.any()
-    assert {"bend0_weight0", "moved_bias0", "stem_weight0"} <= gradients.own["forestsplats"].keys()
+    assert {"bend0_weight0", "moved_bias0", "stem_weight0"} <= gradients.effect_grads["forestsplats"].keys()
 
 
 def test_the_mask_learns_from_its_three_losses(forest):
     nets, step = forest.effects.effects[0], forest.make_step(10, 2)
     frames = frames_of(step.rendered)
-    found = forest.parts.fields.regularise(frames, step)[STATIC].own["forestsplats"]["last_bias0"]
+    found = forest.parts.fields.regularise(frames, step)[STATIC].effect_grads["forestsplats"]["last_bias0"]
     leaf, area = nets._leaf(step), max(0.006, 0.05 * math.exp(-0.001 * step.nominal))
 
     def loss(bias):

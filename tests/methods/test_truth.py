@@ -13,7 +13,7 @@ from scipy import ndimage
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.truth import TruthConfig, TruthMask, clean_data, keep_outside
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from tests.methods.baselines import bits, data_of, parts_of, step_of, trained
 from tests.tiny_scene import TRAIN, write_tiny_scene
 

@@ -16,7 +16,7 @@ from ambiguous_wild.methods.wildgaussians import (
     uncertainty_loss,
 )
 from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.effects.learnt import Visible
+from ambiguous_wild.splat.effects.autograd_effect import Visible
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import ViewContext
 from ambiguous_wild.splat.trainer import Trainer
@@ -48,8 +48,8 @@ def test_the_formula_by_hand():
         "net_weight2": torch.tensor([[1.0, 0.0, 0.0, 0.0, 1.0, 0.0]]), "net_bias2": torch.zeros(6),
     }  # fmt: skip
     hidden = 2.0 * (1.2 + 24 * 0.1 + 32 * 0.2 + 0.5) - 1.0  # both layers are positive
-    shot = ViewContext(iteration=1, nominal=0, view=0, camera=camera())
-    found = effect.forward(Visible(base, torch.zeros(1, 3), {"wild_embedding": code}), leaf, shot)
+    context = ViewContext(iteration=1, nominal=0, view=0, camera=camera())
+    found = effect.forward(Visible(base, torch.zeros(1, 3), {"wild_embedding": code}), leaf, context)
     # offset on red, gain on green, blue as it was
     expected = torch.tensor([[0.2 + 0.5 * hidden, (1 + 0.5 * hidden) * 0.4, 0.6]])
     torch.testing.assert_close(found, expected)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.metrics.masks import Confusion, confusion, pooled, psnr_valid
+from ambiguous_wild.metrics.mask_scores import Confusion, confusion, pooled, psnr_valid
 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 1.0))

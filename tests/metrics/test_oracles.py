@@ -15,7 +15,7 @@ from torchmetrics.functional.image import (
 )
 
 from ambiguous_wild.metrics.image import flip, flip_map, psnr, ssim, ssim_inria
-from ambiguous_wild.metrics.masks import psnr_valid
+from ambiguous_wild.metrics.mask_scores import psnr_valid
 from tests.metrics.pairs import Pair, pairs
 
 ANY_SIZE, WINDOWED = pairs(1), pairs(11)

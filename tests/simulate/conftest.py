@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ambiguous_wild.simulate import capture, world
+from ambiguous_wild.simulate import capture_writer, world
 
 _built: dict[str, world.World] = {}
 
@@ -16,7 +16,7 @@ _built: dict[str, world.World] = {}
 def worlds_are_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Captures of module fixtures are made before this and so from a world of their own."""
 
-    original = capture.build_world
+    original = capture_writer.build_world
 
     def build_world(rng: np.random.Generator, *what: Any) -> world.World:
         bits: Any = rng.bit_generator
@@ -25,4 +25,4 @@ def worlds_are_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
             _built[key] = original(rng, *what)
         return _built[key]
 
-    monkeypatch.setattr(capture, "build_world", build_world)
+    monkeypatch.setattr(capture_writer, "build_world", build_world)

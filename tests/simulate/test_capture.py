@@ -15,7 +15,7 @@ from PIL import Image
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.simulate import capture
+from ambiguous_wild.simulate import capture_writer
 from ambiguous_wild.simulate import world as world_module
 from ambiguous_wild.simulate.distractors import DistractorPose, shapes_of
 from ambiguous_wild.simulate.presets import PRESETS, preset, resized
@@ -31,7 +31,7 @@ LITTLE = replace(
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("capture") / "raw"
-    capture.simulate(SMALL, out, seed=4, depth=True)
+    capture_writer.simulate(SMALL, out, seed=4, depth=True)
     return out
 
 
@@ -39,7 +39,7 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def little(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small capture, to be copied."""
     out = tmp_path_factory.mktemp("little") / "raw"
-    capture.simulate(LITTLE, out)
+    capture_writer.simulate(LITTLE, out)
     return out
 
 
@@ -80,7 +80,7 @@ def test_same_seed_same_bytes_on_any_number_of_threads(raw: Path, tmp_path: Path
     before = numba.get_num_threads()
     numba.set_num_threads(1 if before > 1 else numba.config.NUMBA_NUM_THREADS)
     try:
-        again = capture.simulate(SMALL, tmp_path / "again", seed=4, depth=True)
+        again = capture_writer.simulate(SMALL, tmp_path / "again", seed=4, depth=True)
     finally:
         numba.set_num_threads(before)
     assert again["files"] == facts(raw)["files"]
@@ -89,7 +89,7 @@ def test_same_seed_same_bytes_on_any_number_of_threads(raw: Path, tmp_path: Path
 
 def test_another_seed_moves_distractors_cameras_and_paint(raw: Path) -> None:
     spec = replace(SMALL, detail_px_per_m=COARSE)
-    one, two = capture.plan(spec, 4), capture.plan(spec, 5)
+    one, two = capture_writer.plan(spec, 4), capture_writer.plan(spec, 5)
     for a, b in zip(one[1], two[1]):
         assert not np.allclose(a.camera.cam_from_world, b.camera.cam_from_world, atol=1e-3)
         assert a.placements != b.placements or a.split == "test"
@@ -153,7 +153,7 @@ def test_exif_states_the_true_focal_length(raw: Path) -> None:
 
 def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
     for seed in range(2):
-        world, shots = capture.plan(replace(SMALL, distractors=(), detail_px_per_m=COARSE), seed)
+        world, shots = capture_writer.plan(replace(SMALL, distractors=(), detail_px_per_m=COARSE), seed)
         hub = np.array([world.hub[0], world.hub[1] - 0.3])
         around = {"train": [], "test": []}
         for shot in shots:
@@ -171,7 +171,7 @@ def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
 def test_no_distractor_keeps_its_place_and_none_stands_in_the_scenery() -> None:
     twin = preset("courtyard-twin").distractors[:1]
     spec = replace(resized(preset("tiny"), views=14, width=96), detail_px_per_m=COARSE, distractors=twin)
-    world, shots = capture.plan(spec, 1)
+    world, shots = capture_writer.plan(spec, 1)
     spots = np.array([(p.x_m, p.y_m) for s in shots for p in s.placements])
     assert len(spots) > 7
     near = (np.linalg.norm(spots[:, None] - spots[None], axis=2) < 0.3).sum(1)
@@ -182,28 +182,28 @@ def test_no_distractor_keeps_its_place_and_none_stands_in_the_scenery() -> None:
 
 def test_an_identical_capture_is_left_alone_and_another_is_refused(raw: Path) -> None:
     stamp = (raw / "truth/cameras.json").stat().st_mtime_ns
-    assert capture.simulate(SMALL, raw, seed=4, depth=True)["reused"]
+    assert capture_writer.simulate(SMALL, raw, seed=4, depth=True)["reused"]
     assert (raw / "truth/cameras.json").stat().st_mtime_ns == stamp
     with pytest.raises(AwError, match="--overwrite"):
-        capture.simulate(SMALL, raw, seed=9, depth=True)
+        capture_writer.simulate(SMALL, raw, seed=9, depth=True)
 
 
 def test_overwrite_replaces_captures_only(little: Path, tmp_path: Path) -> None:
     shutil.copytree(little, tmp_path / "raw")
     (tmp_path / "raw/train/mine.jpg").write_bytes(b"x")
     with pytest.raises(AwError, match=r"also holds train/mine\.jpg"):
-        capture.simulate(LITTLE, tmp_path / "raw", seed=1, overwrite=True)
+        capture_writer.simulate(LITTLE, tmp_path / "raw", seed=1, overwrite=True)
     (tmp_path / "raw/train/mine.jpg").unlink()
     (tmp_path / "raw/train/IMG_0001.jpg").write_bytes(b"spoilt")
     with pytest.raises(AwError, match="changed since"):
-        capture.simulate(LITTLE, tmp_path / "raw")
-    made = capture.simulate(LITTLE, tmp_path / "raw", overwrite=True)
+        capture_writer.simulate(LITTLE, tmp_path / "raw")
+    made = capture_writer.simulate(LITTLE, tmp_path / "raw", overwrite=True)
     assert sha256_file(tmp_path / "raw/train/IMG_0001.jpg") == made["files"]["train/IMG_0001.jpg"]
     foreign = tmp_path / "holiday"
     foreign.mkdir()
     (foreign / "me.jpg").write_bytes(b"x")
     with pytest.raises(AwError, match="not a simulated capture"):
-        capture.simulate(LITTLE, foreign, overwrite=True)
+        capture_writer.simulate(LITTLE, foreign, overwrite=True)
     assert (foreign / "me.jpg").read_bytes() == b"x"
 
 
@@ -213,13 +213,13 @@ def test_a_run_that_breaks_leaves_nothing(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        capture.simulate(LITTLE, tmp_path / "raw", progress=breaks)
+        capture_writer.simulate(LITTLE, tmp_path / "raw", progress=breaks)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("detail", [3.0, 12.0])
 def test_textures_are_finite_and_never_flat_at_any_resolution(detail: float) -> None:
-    world, _ = capture.plan(replace(SMALL, detail_px_per_m=detail, distractors=()), 0)
+    world, _ = capture_writer.plan(replace(SMALL, detail_px_per_m=detail, distractors=()), 0)
     atlas = world.atlas
     assert np.isfinite(atlas.texels).all() and (atlas.texels >= 0).all()
     for name, t in atlas.index.items():
@@ -253,9 +253,9 @@ def test_size_and_lift_move_a_ball_off_the_ground() -> None:
 def test_a_sheet_that_came_later_changes_no_earlier_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """World of the same seed with and without it: the same light, the same texels under the same names."""
     spec = replace(SMALL, detail_px_per_m=COARSE, distractors=())
-    now, _ = capture.plan(spec, 5)
+    now, _ = capture_writer.plan(spec, 5)
     monkeypatch.delitem(world_module.SHEETS, "cloth")
-    before, _ = capture.plan(spec, 5)
+    before, _ = capture_writer.plan(spec, 5)
     assert np.array_equal(now.light.sun, before.light.sun)
     for name, old in before.atlas.index.items():
         new = now.atlas.index[name]
@@ -271,4 +271,4 @@ def test_a_record_nested_without_end_is_named(tmp_path: Path) -> None:
     (tmp_path / "raw/truth").mkdir(parents=True)
     (tmp_path / "raw/truth/capture.json").write_text("[" * 100_000)
     with pytest.raises(AwError, match="an unreadable truth"):
-        capture.simulate(SMALL, tmp_path / "raw")
+        capture_writer.simulate(SMALL, tmp_path / "raw")

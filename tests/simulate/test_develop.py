@@ -8,17 +8,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ambiguous_wild.simulate import capture
+from ambiguous_wild.simulate import capture_writer
 from ambiguous_wild.simulate import image_effects as fx
 from ambiguous_wild.simulate.image_effects import PhotoRandom
-from ambiguous_wild.simulate.presets import PRESETS, preset, resized
-from ambiguous_wild.simulate.render import (
+from ambiguous_wild.simulate.photo_render import (
     PlannedPhoto,
     RenderedPhoto,
     finish_photo,
     prepare_photo,
     trace_photo,
 )
+from ambiguous_wild.simulate.presets import PRESETS, preset, resized
 from ambiguous_wild.simulate.spec import KINDS, CaptureSpec, Defocus, Effects
 from ambiguous_wild.simulate.world import World
 
@@ -38,7 +38,7 @@ def small(**effects: object) -> CaptureSpec:
 
 @cache
 def planned() -> tuple[World, list[PlannedPhoto]]:
-    return capture.plan(small(), 3)
+    return capture_writer.plan(small(), 3)
 
 
 def taken(spec: CaptureSpec, k: int, seed: int = 3) -> RenderedPhoto:

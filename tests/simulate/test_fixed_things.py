@@ -12,7 +12,7 @@ from PIL import Image
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.photos import Exif
-from ambiguous_wild.simulate.capture import simulate
+from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.composite_photos import _write_jpeg, composite_photos
 from ambiguous_wild.simulate.composite_scene import composite
 from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over

@@ -9,8 +9,8 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate import capture
-from ambiguous_wild.simulate.capture import look_at
+from ambiguous_wild.simulate import capture_writer
+from ambiguous_wild.simulate.capture_writer import look_at
 from ambiguous_wild.simulate.distractors import movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import PLANS, CaptureSpec
@@ -42,7 +42,7 @@ def test_a_wall_is_whole_but_for_its_openings(place):
 
 
 def test_one_looks_out_of_the_windows_and_not_through_the_walls():
-    world = capture.plan(small("room-clean", views=3), 0)[0]
+    world = capture_writer.plan(small("room-clean", views=3), 0)[0]
     plan = PLANS["room"]
 
     def depth(along: float, height: float) -> float:
@@ -60,7 +60,7 @@ def test_one_looks_out_of_the_windows_and_not_through_the_walls():
 def test_cameras_are_inside_and_look_where_the_walk_says(name):
     spec = small(name, views=12)
     for seed in range(3):
-        world, shots = capture.plan(spec, seed)
+        world, shots = capture_writer.plan(spec, seed)
         for shot in shots:
             out = shot.camera.center[:2] - np.array(world.hub[:2])
             ahead = shot.camera.cam_from_world[2, :2]
@@ -74,7 +74,7 @@ def test_cameras_are_inside_and_look_where_the_walk_says(name):
 @pytest.mark.parametrize("name", PLACES)
 def test_distractors_stand_clear_and_cover_what_the_preset_says(name):
     spec = small(name)
-    world, shots = capture.plan(spec, 1)
+    world, shots = capture_writer.plan(spec, 1)
     static = world.table()
     shares = []
     for shot in shots:
@@ -103,4 +103,4 @@ def test_a_place_is_named_in_the_file_and_has_limits_of_its_own():
     with pytest.raises(AwError, match="place"):
         parse_spec("world: {place: beach}")
     with pytest.raises(AwError, match="into a wall of the room"):
-        capture.plan(parse_spec("world: {place: room}\ndetail_px_per_m: 5"), 0)
+        capture_writer.plan(parse_spec("world: {place: room}\ndetail_px_per_m: 5"), 0)

@@ -10,8 +10,8 @@ import pytest
 from scipy import ndimage
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate import capture
-from ambiguous_wild.simulate.capture import look_at
+from ambiguous_wild.simulate import capture_writer
+from ambiguous_wild.simulate.capture_writer import look_at
 from ambiguous_wild.simulate.distractors import DistractorPose, movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import CaptureSpec, Distractor
@@ -35,7 +35,7 @@ def small(name: str, views: int = 8, width: int = 128) -> CaptureSpec:
 
 def masks(spec: CaptureSpec, seed: int) -> np.ndarray:
     """Owner of every pixel of every train photo, [N, H, W]."""
-    world, shots = capture.plan(spec, seed)
+    world, shots = capture_writer.plan(spec, seed)
     static = world.table()
     seen = [
         trace(s.camera, static, movers(spec, s.placements, world), world.atlas, world.light).owner
@@ -63,7 +63,7 @@ def test_a_seed_repeats_and_another_does_not() -> None:
 @cache
 def empty() -> tuple[CaptureSpec, World]:
     spec = small("courtyard-clean", views=3)
-    return spec, capture.plan(spec, 0)[0]
+    return spec, capture_writer.plan(spec, 0)[0]
 
 
 @cache
@@ -107,7 +107,7 @@ def test_a_thin_one_reaches_far_across_the_photo() -> None:
 def test_plain_colours_are_nothing_elses() -> None:
     """In the picture, the visitor's and the ball's pixels lie far from every colour of the courtyard."""
     spec = small("courtyard-plain")
-    world, shots = capture.plan(spec, 2)
+    world, shots = capture_writer.plan(spec, 2)
     static = world.table()
     share = []
     for shot in shots[: spec.train_views]:

@@ -9,7 +9,7 @@ from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.simulate import simulate_command as command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.simulate.capture import plan
+from ambiguous_wild.simulate.capture_writer import plan
 from ambiguous_wild.simulate.presets import PRESETS
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec, read_spec
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate import capture, shapes
-from ambiguous_wild.simulate.capture import look_at
+from ambiguous_wild.simulate import capture_writer, shapes
+from ambiguous_wild.simulate.capture_writer import look_at
 from ambiguous_wild.simulate.distractors import lay_out
 from ambiguous_wild.simulate.kernels import QUAD, VOLUME
 from ambiguous_wild.simulate.presets import preset, resized
@@ -106,7 +106,7 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
     spec = replace(
         resized(preset("walkers"), views=9, width=64), distractors=(walker,), detail_px_per_m=6.0, samples=1
     )
-    world, shots = capture.plan(spec, 0)
+    world, shots = capture_writer.plan(spec, 0)
     x = [s.placements[0].x_m for s in shots[:9]]
     assert x == pytest.approx([-3, -1.5, 0, 1.5, 3, 1.5, 0, -1.5, -3], abs=1e-9)
     assert {round(s.placements[0].y_m, 6) for s in shots[:9]} == {-2.0}
@@ -128,9 +128,9 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
 def test_zoom_varies_the_focal_length_in_photo_truth_and_exif(tmp_path) -> None:
     spec = replace(resized(preset("zoom"), views=6, width=64), detail_px_per_m=6.0, samples=1, distractors=())
     spec = replace(spec, occlusion=(0.0, 0.0))
-    capture.simulate(spec, tmp_path / "raw")
-    _, shots = capture.plan(spec, 0)
-    base = capture.plan(replace(spec, zoom=(1.0, 1.0)), 0)[1]
+    capture_writer.simulate(spec, tmp_path / "raw")
+    _, shots = capture_writer.plan(spec, 0)
+    base = capture_writer.plan(replace(spec, zoom=(1.0, 1.0)), 0)[1]
     factors = [s.camera.fx / b.camera.fx for s, b in zip(shots, base)]
     assert min(factors) < 1.0 and max(factors) > 1.6 and all(0.85 <= f <= 1.9 for f in factors)
     for shot in shots:

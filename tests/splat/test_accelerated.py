@@ -11,10 +11,10 @@ import torch
 from ambiguous_wild.splat import gpu_kernels
 from ambiguous_wild.splat.gpu_kernels import compiled
 from ambiguous_wild.splat.losses import photometric, ssim_map
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.records import SAMPLED, Clock, GpuClock, clock_for
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.reference import photometric_reference, ssim_map_reference
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.training_records import SAMPLED, Clock, GpuClock, clock_for
 from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, NonFinite
 from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import with_points

@@ -6,7 +6,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat import gsplat_seam
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.gpu_render import on_device
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render

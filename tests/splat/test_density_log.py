@@ -5,8 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ambiguous_wild.splat import checkpoint, records
-from ambiguous_wild.splat.records import DensityLog, Places
+from ambiguous_wild.splat import checkpoint, training_records
+from ambiguous_wild.splat.training_records import DensityLog, Places
 
 
 def numbered(start: int, count: int) -> torch.Tensor:
@@ -16,13 +16,13 @@ def numbered(start: int, count: int) -> torch.Tensor:
 
 @given(st.lists(st.integers(0, 70), max_size=12))
 def test_what_is_kept_is_every_so_many_th_of_all(sizes):
-    most, records.MOST = records.MOST, 16
+    most, training_records.MOST = training_records.MOST, 16
     try:
         places = Places()
         for size in sizes:
             places.add(numbered(places.passed, size))
     finally:
-        records.MOST = most
+        training_records.MOST = most
     total = sum(sizes)
     assert places.passed == total
     assert len(places.xyz) <= 16

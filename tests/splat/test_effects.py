@@ -10,12 +10,12 @@ from ambiguous_wild.core import AwError, Scene, SparsePoints, View
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import ALL, EFFECTS, check_effects, dense, with_effects
 from ambiguous_wild.splat.effects.base import Effect, RowAdam
-from ambiguous_wild.splat.effects.chain import EffectPipeline
 from ambiguous_wild.splat.effects.colour import AffineExposure, AppearanceEmbedding
+from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.effects.poses import PoseRefinement
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import START_SHARE, MethodHooks
+from ambiguous_wild.splat.method_hooks import START_SHARE, MethodHooks
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import TrainData, ViewContext
@@ -192,9 +192,9 @@ def test_exposure_gradients_and_closure():
     def toned(x):
         return effect.image(replace(frame, image=x), shot_of(1))[0].image
 
-    _, pull = effect.image(frame, shot_of(1))
+    _, vjp = effect.image(frame, shot_of(1))
     effect.image(replace(frame, image=2 * image), shot_of(0))  # another picture in between changes nothing
-    found = pull(Cotangents(weight, extra=2 * weight))
+    found = vjp(Cotangents(weight, extra=2 * weight))
     torch.testing.assert_close(found.image, numeric(lambda x: (toned(x) * weight).sum(), image))
     torch.testing.assert_close(found.extra, 2 * found.image)  # and effects learn from the image's alone
     row = effect.adam.values[1].clone()
@@ -203,9 +203,9 @@ def test_exposure_gradients_and_closure():
         effect.adam.values[1] = values
         return (toned(image) * weight).sum()
 
-    torch.testing.assert_close(found.own["exposure"]["affine"], numeric(of_row, row))
+    torch.testing.assert_close(found.effect_grads["exposure"]["affine"], numeric(of_row, row))
     effect.adam.values[1] = row
-    effect.step(found.own["exposure"], shot_of(1))
+    effect.step(found.effect_grads["exposure"], shot_of(1))
     assert effect.adam.values[:3].sum(dim=0).abs().max() < 1e-12
 
 
@@ -240,9 +240,9 @@ def test_gradients_of_the_model_effects(kind):
         effect.net = {name: w.double() for name, w in effect.net.items()}
         effect.unit.centre, effect.unit.spread = effect.unit.centre.double(), effect.unit.spread.double()
     weights = {name: torch.from_numpy(rng.normal(size=tuple(t.shape))) for name, t in g.items()}
-    _, pull = effect.model(g, shot_of(1))
+    _, vjp = effect.model(g, shot_of(1))
     effect.model(g, shot_of(0))  # another picture in between changes nothing
-    found = pull(as_gradients(g, weights))
+    found = vjp(as_gradients(g, weights))
     for name in ("log_scales", "opacity_logits") if kind == "antialias" else ("sh0",):
 
         def of(values, name=name):
@@ -256,7 +256,7 @@ def test_gradients_of_the_model_effects(kind):
             effect.rows_of_photos.values[1] = values
             return linear(effect.model(g, shot_of(1))[0], weights)
 
-        torch.testing.assert_close(found.own["appearance"]["row"], numeric(of_row, row))
+        torch.testing.assert_close(found.effect_grads["appearance"]["row"], numeric(of_row, row))
         effect.rows_of_photos.values[1] = row
         last = effect.net["last"]
 
@@ -266,7 +266,8 @@ def test_gradients_of_the_model_effects(kind):
             effect.net["last"] = changed
             return linear(effect.model(g, shot_of(1))[0], weights)
 
-        torch.testing.assert_close(found.own["appearance"]["last"][:, 0], numeric(of_net, last[:, 0].clone()))
+        gradient = found.effect_grads["appearance"]["last"][:, 0]
+        torch.testing.assert_close(gradient, numeric(of_net, last[:, 0].clone()))
 
 
 def test_the_filter_is_mip_splattings():

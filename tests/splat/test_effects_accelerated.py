@@ -13,11 +13,11 @@ from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import RowAdam
-from ambiguous_wild.splat.effects.chain import EffectPipeline
-from ambiguous_wild.splat.effects.posed import PosedCamera
+from ambiguous_wild.splat.effects.device_cameras import PosedCamera
+from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.effects.poses import PoseRefinement, left_jacobian, turned
 from ambiguous_wild.splat.effects.smoothing import filter_sizes
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import NOTHING, Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import TrainData, ViewContext
 from tests.host_reads import READ, moved, no_transfers
@@ -73,11 +73,12 @@ class Painted:
     def backward(self, cotangents, needs=NOTHING):
         given = as_cotangents(cotangents)
         found = torch.autograd.grad(self.drawn, list(self.leaves.values()), given.image)
-        return Gradients(**dict(zip(self.leaves, found)), screen=found[0][:, :2], own=given.own)
+        leaves = dict(zip(self.leaves, found))
+        return Gradients(**leaves, screen=found[0][:, :2], effect_grads=given.effect_grads)
 
 
-def paint(gaussians, shot, shade):
-    return Painted(gaussians, shot.camera)
+def paint(gaussians, context, shade):
+    return Painted(gaussians, context.camera)
 
 
 def shot_of(camera, view=None, iteration=0, progress=0.5):
@@ -86,15 +87,15 @@ def shot_of(camera, view=None, iteration=0, progress=0.5):
     )
 
 
-def visit(chain, data, gaussians, iteration, divisor=1, called_off=None, targets=None):
+def visit(chain, data, gaussians, iteration, divisor=1, skip_step=None, targets=None):
     """One step of training, but for the Gaussians."""
     view = iteration % len(data.photos)
-    shot = shot_of(shrink_camera(data.cameras[view], divisor), view, iteration, 0.1 + 0.01 * iteration)
-    shot = replace(shot, camera=chain.camera(shot))
-    rendered = chain.render(gaussians, shot, paint)
+    context = shot_of(shrink_camera(data.cameras[view], divisor), view, iteration, 0.1 + 0.01 * iteration)
+    context = replace(context, camera=chain.camera(context))
+    rendered = chain.render(gaussians, context, paint)
     target = 0.2 if targets is None else targets[view]
     gradients = rendered.backward((rendered.image - target) / rendered.image.numel())
-    chain.step(gradients, shot, called_off)
+    chain.step(gradients, context, skip_step)
     if iteration % 3 == 0:
         chain.rows_changed()
     return rendered.image, gradients
@@ -216,7 +217,7 @@ def test_a_run_that_is_called_off_stays_where_it_is(monkeypatch):
     before = {k: t.clone() for k, t in tensors(chain.state_dict()).items() if "steps" not in k}
     nan = [torch.full((SIZE[1], SIZE[0], 3), torch.nan)] * 3
     for iteration in (6, 7, 8):
-        visit(chain, data, g, iteration, called_off=torch.ones(1), targets=nan)
+        visit(chain, data, g, iteration, skip_step=torch.ones(1), targets=nan)
     after = tensors(chain.state_dict())
     for name, tensor in before.items():  # the rows' sum is brought back to zero, which is rounding
         torch.testing.assert_close(after[name], tensor, rtol=0, atol=1e-9)
@@ -251,8 +252,8 @@ def test_a_step_leaves_the_host_alone(monkeypatch, names):
     chain, data, g, off, known = moved([chain, data, g, off, {}])
     assert data.device.type == "meta"
 
-    def draw(gaussians, shot, shade):
-        camera = shot.camera
+    def draw(gaussians, context, shade):
+        camera = context.camera
         if not isinstance(camera, PosedCamera):  # a plain camera is copied where the renderer first meets it
             if id(camera) not in known:
                 pose, centre = (torch.zeros(s, dtype=torch.float64).to("meta") for s in ((4, 4), 3))
@@ -261,18 +262,18 @@ def test_a_step_leaves_the_host_alone(monkeypatch, names):
             camera = known[id(camera)][1]
         return Painted(gaussians, camera)
 
-    def step(iteration, divisor, called_off):
+    def step(iteration, divisor, skip_step):
         view = iteration % len(data.photos)
-        shot = shot_of(cameras[view, divisor], view, iteration)
-        camera = chain.camera(shot)
+        context = shot_of(cameras[view, divisor], view, iteration)
+        camera = chain.camera(context)
         assert isinstance(camera, PosedCamera) == ("poses" in names)
         if "poses" in names:
             camera = shrink_camera(camera, 2)  # as a policy's coarse render does
-        shot = replace(shot, camera=camera)
-        rendered = chain.render(g, shot, draw)
+        context = replace(context, camera=camera)
+        rendered = chain.render(g, context, draw)
         extra = torch.zeros_like(rendered.image)
         gradients = rendered.backward(Cotangents(rendered.image - 0.5, extra))
-        chain.step(gradients, shot, called_off)
+        chain.step(gradients, context, skip_step)
         chain.rows_changed()
         assert gradients.means.device.type == "meta"
 

@@ -10,7 +10,7 @@ from ambiguous_wild.core import Scene, SparsePoints, View
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.tracks import photo_gains
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import ViewContext
 from tests.splat.scenes import bits, disturbed, trainer_for
 from tests.splat.scenes import camera as make_camera

@@ -10,7 +10,7 @@ import torch
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import gsplat_seam
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.pace import TrainConfig

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from ambiguous_wild.stress import table
+from ambiguous_wild.stress import stress_table
 from ambiguous_wild.stress.case import Case, CaseResult
 from tests.benchmark_scripts import benchmark
 from tests.tiny_scene import write_tiny_scene
@@ -25,7 +25,7 @@ def case(name, error):
 
 @pytest.mark.parametrize(("errors", "code"), [([0.5], 0), ([0.5, float("nan")], 1)])
 def test_every_measurement_is_in_the_results(gpu, tmp_path, monkeypatch, errors, code):
-    monkeypatch.setattr(table, "CASES", tuple(case(f"case {k}", e) for k, e in enumerate(errors)))
+    monkeypatch.setattr(stress_table, "CASES", tuple(case(f"case {k}", e) for k, e in enumerate(errors)))
     monkeypatch.setattr(gpu, "BLOCK", 2)
     monkeypatch.setattr("ambiguous_wild.harness.evaluate.FPS_SECONDS", 0.01)
     scene, results = write_tiny_scene(tmp_path / "scene"), tmp_path / "gpu.json"

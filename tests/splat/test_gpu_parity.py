@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ambiguous_wild.splat import gpu_kernels
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.render import render
 from tests.tiny_scene import with_points

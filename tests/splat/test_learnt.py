@@ -10,11 +10,11 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.base import rate_for_run_length
-from ambiguous_wild.splat.effects.chain import EffectPipeline
-from ambiguous_wild.splat.effects.learnt import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.field import GaussianAttribute
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.step import ViewContext
 from tests.splat.scenes import camera, gaussians
@@ -38,14 +38,14 @@ class Everything(Learnt):
     def rows(self, gaussians):
         return {"code": GaussianAttribute(0.1 * torch.ones(len(gaussians), 3), rate=0.01)}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, torch.Tensor], shot: ViewContext):
+    def forward(self, visible: Visible, leaf: Mapping[str, torch.Tensor], context: ViewContext):
         inputs = torch.cat([visible.base, visible.attributes["code"] * leaf["tint"]], dim=1)
         return visible.base * (1 + leaf["tint"]) + 0.1 * mlp(inputs, leaf, "net") + 0.01 * visible.means
 
-    def change(self, gaussians, leaf, shot):
+    def change(self, gaussians, leaf, context):
         return {"opacity_logits": gaussians.opacity_logits + leaf["fade"] * gaussians.means[:, 0]}
 
-    def tone(self, image, alpha, leaf, shot):
+    def tone(self, image, alpha, leaf, context):
         return image + (1 - alpha)[..., None] * leaf["glow"]
 
 
@@ -61,8 +61,8 @@ def drawn_with(effect, g, values=None):
             g = replace(g, attributes={**g.attributes, name: value})
         else:
             g = replace(g, **{name: value})
-    shot = ViewContext(iteration=1, nominal=1e4, view=1, camera=camera())
-    rendered = chain.render(g, shot, lambda g, s, shade: render(g, s.camera, shade=shade))
+    context = ViewContext(iteration=1, nominal=1e4, view=1, camera=camera())
+    rendered = chain.render(g, context, lambda g, s, shade: render(g, s.camera, shade=shade))
     for name, value in kept.items():
         effect._adam[name].values.copy_(value)
     return rendered
@@ -78,15 +78,15 @@ def test_all_three_places_against_finite_differences(scene, tmp_path):
     weight = torch.tensor(np.random.default_rng(2).normal(size=(29, 37, 3)), dtype=torch.float32)
     rendered = drawn_with(effect, g)
     found = rendered.backward(weight)
-    own = found.own["everything"]
+    own = found.effect_grads["everything"]
     assert set(own) == {"tint", "fade", "glow", "net_weight0", "net_bias0", "net_weight1", "net_bias1"}
 
     def loss(name, value):
         return float((drawn_with(effect, g, {name: value}).image.double() * weight.double()).sum())
 
     rng = np.random.default_rng(3)
-    shot = ViewContext(iteration=1, nominal=0, view=1, camera=camera())
-    starts = {name: (effect._row(name, shot), own[name]) for name in own}
+    context = ViewContext(iteration=1, nominal=0, view=1, camera=camera())
+    starts = {name: (effect._row(name, context), own[name]) for name in own}
     starts |= {"code": (g.attributes["code"], found.attributes["code"])}
     starts |= {name: (getattr(g, name), getattr(found, name)) for name in ("means", "opacity_logits", "sh0")}
     for name, (start, gradient) in starts.items():
@@ -144,8 +144,10 @@ def test_names_are_told_apart(scene, tmp_path):
 )
 def test_rates_rise_with_the_root_of_how_much_shorter_a_run_is(length, factor):
     for iteration in (1, length // 2, length):
-        shot = ViewContext(iteration=iteration, nominal=iteration / length * 30_000, view=0, camera=camera())
-        assert rate_for_run_length(0.002, 70_000, shot) == pytest.approx(0.002 * factor)
+        context = ViewContext(
+            iteration=iteration, nominal=iteration / length * 30_000, view=0, camera=camera()
+        )
+        assert rate_for_run_length(0.002, 70_000, context) == pytest.approx(0.002 * factor)
     assert (
         rate_for_run_length(0.002, 70_000, ViewContext(iteration=1, nominal=0.0, view=0, camera=camera()))
         == 0.002

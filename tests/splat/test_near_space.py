@@ -11,7 +11,7 @@ from ambiguous_wild.core.scene import SparsePoints
 from ambiguous_wild.splat.effects import skybox, with_effects
 from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from tests.splat.scenes import trainer_for
 
 

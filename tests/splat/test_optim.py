@@ -8,7 +8,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat import backend
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients
@@ -143,7 +143,7 @@ COPIES = {
 def test_copies_are_up_to_date_and_belong_to_no_optimiser(copied):
     lazy, dense, a, _ = stepped()
     copy = copied(lazy)
-    assert equal(copy, dense) and copy.postponed is None
+    assert equal(copy, dense) and copy.pending_steps is None
     a.step(*gradients_at(lazy, 12))
     copy.settle()
     assert equal(copy, dense)
@@ -296,11 +296,11 @@ def test_a_step_called_off_on_the_device_never_was(accelerated):
     a, b = accelerated(g), accelerated(other)
     for step in range(6):
         grads, visible = gradients_at(g, step)
-        a.step(grads, visible, called_off=torch.zeros(1))
+        a.step(grads, visible, skip_step=torch.zeros(1))
         b.step(grads, visible)
         before = other.clone()
         grads.means[:] = torch.nan
-        b.step(grads, visible, called_off=torch.ones(1))
+        b.step(grads, visible, skip_step=torch.ones(1))
         assert equal(other, before)
     assert equal(g, other)
     assert b.state_dict()["steps"] == 6

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from ambiguous_wild.splat.method_hooks import Schedule
 from ambiguous_wild.splat.pace import Pace, TrainConfig
-from ambiguous_wild.splat.parts import Schedule
-from ambiguous_wild.splat.records import ROWS
 from ambiguous_wild.splat.run import Run
+from ambiguous_wild.splat.training_records import ROWS
 
 COUNTS = (1, 3, 7, 8, 16)
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents
@@ -234,7 +234,7 @@ _BITS = """
 import dataclasses, hashlib
 import torch
 from ambiguous_wild.splat.cpu import set_threads
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import NEEDS

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.splat.effects.placing import higher_harmonics
+from ambiguous_wild.splat.effects.geometry import higher_harmonics
 from ambiguous_wild.splat.reference import harmonics, render_reference, rotations
 
 from .scenes import camera, doubles, gaussians

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients, with_visible
 from tests.splat.scenes import camera, cotangents, doubles, gaussians, given, trained, trainer_for
@@ -48,8 +48,10 @@ def test_gradients_of_two_losses_add():
     for name in PARAMETERS:
         torch.testing.assert_close(getattr(summed, name), getattr(both, name), rtol=1e-4, atol=1e-4)
     assert torch.equal(summed.visible, rendered.visible)
-    with_own = first.with_own("a", {"x": torch.ones(2)}) + first.with_own("a", {"x": torch.ones(2)})
-    assert torch.equal(with_own.own["a"]["x"], torch.full((2,), 2.0))
+    with_effect_grads = first.with_effect_grads("a", {"x": torch.ones(2)}) + first.with_effect_grads(
+        "a", {"x": torch.ones(2)}
+    )
+    assert torch.equal(with_effect_grads.effect_grads["a"]["x"], torch.full((2,), 2.0))
 
 
 class OwnPicture(MaskPolicy):
@@ -120,13 +122,13 @@ class Carried(Effect):
     def rows(self, gaussians):
         return {"gain": GaussianAttribute(torch.zeros(len(gaussians), 1), rate=0.01)}
 
-    def shade(self, gaussians, rows, base, shot):
+    def shade(self, gaussians, rows, base, context):
         gain = gaussians.attributes["gain"][rows]
 
-        def pull(d):
+        def vjp(d):
             return ShadeGradients((1 + gain) * d, {"gain": (d * base).sum(dim=1, keepdim=True)})
 
-        return (1 + gain) * base, pull
+        return (1 + gain) * base, vjp
 
 
 def test_a_learnt_row_learns(scene, tmp_path):

@@ -15,8 +15,8 @@ from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, sphere_of, spread
 from ambiguous_wild.splat.gaussians import PARAMETERS
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
@@ -54,8 +54,8 @@ def test_it_lies_far_behind_cameras_and_points_where_photos_look(data):
     for camera in data.cameras:
         centre = -camera.cam_from_world[:3, :3].T @ camera.cam_from_world[:3, 3]
         assert np.linalg.norm(centre - middle) <= radius / 8 * 1.001
-    looked_at = np.any([shares(camera, xyz) for camera in data.cameras], axis=0)
-    assert looked_at.all()
+    checked_gradients = np.any([shares(camera, xyz) for camera in data.cameras], axis=0)
+    assert checked_gradients.all()
 
 
 def test_directions_are_spread_evenly():
@@ -108,7 +108,7 @@ def trainer_for(data, folder, parts, iterations=140, **config):
 
 
 def far_rows(trainer):
-    return int(trainer.effects.effects[-1].spared(trainer.gaussians.means).sum())
+    return int(trainer.effects.effects[-1].frozen_in_density_control(trainer.gaussians.means).sum())
 
 
 def test_pup_removes_its_share_of_those_that_are_no_skybox(data, tmp_path):

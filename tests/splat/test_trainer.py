@@ -21,8 +21,8 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, divisor_at
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
@@ -73,13 +73,13 @@ import sys, torch
 from pathlib import Path
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
 data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
 config = TrainConfig(iterations=400, checkpoint_every_s=0.05, probes=0)
-trainer = Trainer(data, Parts(), config, folder=folder)
+trainer = Trainer(data, MethodHooks(), config, folder=folder)
 trainer.resume()
 trainer.train()
 """
@@ -362,14 +362,14 @@ from pathlib import Path
 import torch
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import Parts
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.io.scene_folder import load_scene
 
 torch.set_num_threads(2)
 scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
 data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
-trainer = Trainer(data, Parts(), TrainConfig(iterations=2, probes=0), folder=folder)
+trainer = Trainer(data, MethodHooks(), TrainConfig(iterations=2, probes=0), folder=folder)
 trainer.step()
 print(torch.get_num_threads())
 """

@@ -9,8 +9,8 @@ import torch
 
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.parts import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MOST_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.splat.test_trainer import parts_of
@@ -111,7 +111,7 @@ def test_a_healthy_run_has_the_same_bits_without_it(scene, tmp_path, method, mon
     looked = trained(scene, tmp_path / "a", parts=parts_of(method), iterations=60)
     saved = checkpoint.load(tmp_path / "a" / "checkpoint" / "last.safetensors")
     assert "rollbacks" not in saved
-    for name in ("look_at_loss", "look_at_gradients", "look_at_parameters"):
+    for name in ("check_loss", "check_gradients", "check_parameters"):
         monkeypatch.setattr(Watchdog, name, lambda self, *args, **kw: None)
     assert bits(looked) == bits(trained(scene, tmp_path / "b", parts=parts_of(method), iterations=60))
 
@@ -119,7 +119,7 @@ def test_a_healthy_run_has_the_same_bits_without_it(scene, tmp_path, method, mon
 def test_large_but_sound_sums_are_no_finding(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path)
     trainer.gaussians.means[:, 0] = 3e38  # their sum overflows
-    trainer.watchdog.look_at_parameters(1, 0, trainer.gaussians)
+    trainer.watchdog.check_parameters(1, 0, trainer.gaussians)
 
 
 def test_the_identity_of_a_run_does_not_know_of_it(scene):

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.bench import bench
+from ambiguous_wild.harness.benchmark import bench
 from ambiguous_wild.report.model_views import watch
 from tests.command_line import aw
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene

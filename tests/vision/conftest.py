@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.vision import fetch
+from ambiguous_wild.vision import weight_download
 from tests.vision.stub_sources import Hub
 
 VIT = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 2, "initializer_range": 0.2}
@@ -182,7 +182,9 @@ def index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 @pytest.fixture
 def without_pip(index: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What pip would download: these tests are about what follows."""
-    monkeypatch.setattr(fetch, "pip_download", lambda package, folder, what: index / package.archive)
+    monkeypatch.setattr(
+        weight_download, "pip_download", lambda package, folder, what: index / package.archive
+    )
 
 
 @pytest.fixture

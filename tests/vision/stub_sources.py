@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.vision.weights import Package, Weight
+from ambiguous_wild.vision.weight_registry import Package, Weight
 
 HEADS = (3, 5, 2, 4, 4)  # channels
 

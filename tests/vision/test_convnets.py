@@ -14,10 +14,10 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision import convnets, weights
+from ambiguous_wild.vision import convnets, weight_registry
 from ambiguous_wild.vision.convnets import NETWORKS, ConvConfig, ConvFeatures
 from ambiguous_wild.vision.labhog import blurred_noisy_copy
-from ambiguous_wild.vision.weight_files import read_as_arrays, tensors_digest
+from ambiguous_wild.vision.weight_conversion import read_as_arrays, tensors_digest
 
 VGG = [(0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256), (14, 256, 256)]
 
@@ -180,8 +180,8 @@ PUBLISHED = {
 @pytest.mark.usefixtures("machine_weights")
 @pytest.mark.parametrize("layer", PUBLISHED)
 def test_the_published_network_gives_the_values_of_the_reference_package(layer: str) -> None:
-    if weights.where(weights.named("efficientnet-lite0")) is None:
-        pytest.skip(f"weights missing; run: {weights.get_command('efficientnet-lite0')}")
+    if weight_registry.where(weight_registry.named("efficientnet-lite0")) is None:
+        pytest.skip(f"weights missing; run: {weight_registry.get_command('efficientnet-lite0')}")
     rows, columns = np.mgrid[0:64, 0:96].astype(np.float64)
     waves = [0.5 + 0.4 * np.sin(rows / 5 + k) * np.cos(columns / (7 + k)) for k in range(3)]
     pixels = torch.from_numpy(np.stack(waves).astype(np.float32))[None]
@@ -205,7 +205,7 @@ def test_loading_keeps_the_callers_random_numbers(folder: Path, photo) -> None:
 def test_files_of_another_network_are_named(tmp_path: Path, name: str, damage: str, photo) -> None:
     tensors = vgg_tensors() if name == "vgg16" else efficientnet_tensors()
     key = next(k for k in tensors if k.endswith("weight") and tensors[k].ndim == 4)
-    path = tmp_path / weights.named(name).files[0]
+    path = tmp_path / weight_registry.named(name).files[0]
     if damage == "missing":
         del tensors[key]
     elif damage == "shape":
@@ -231,7 +231,7 @@ def test_files_of_another_network_are_named(tmp_path: Path, name: str, damage: s
 def test_the_registered_place_holds_the_published_network_and_a_folder_any(
     folder: Path, own: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    weight = weights.named(name)
+    weight = weight_registry.named(name)
     path = own / name / weight.files[0]
     path.parent.mkdir(parents=True)
     shutil.copy(folder / path.name, path)
@@ -239,7 +239,7 @@ def test_the_registered_place_holds_the_published_network_and_a_folder_any(
         _ = ConvFeatures(name).model
     assert ConvFeatures(name, None, path.parent).model is not None
     published = dataclasses.replace(weight, tensors=tensors_digest(read_as_arrays(path)))
-    monkeypatch.setattr(weights, "named", lambda _: published)
+    monkeypatch.setattr(weight_registry, "named", lambda _: published)
     assert ConvFeatures(name).model is not None
 
 

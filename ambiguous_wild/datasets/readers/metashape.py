@@ -14,7 +14,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, read_text
-from ambiguous_wild.datasets.readers import posed
+from ambiguous_wild.datasets.readers import posed_photos
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS, ModelCamera
 
 FISHEYES = ("fisheye", "equidistant_fisheye")  # one lens: Metashape 2.3 calls it by the longer name
@@ -23,7 +23,7 @@ LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "
 
 def find_cameras(root: Path) -> Path | None:
     """Find the folder's XML of cameras; None without one."""
-    return posed.only_file(root, ".xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
+    return posed_photos.only_file(root, ".xml", lambda path: b"<chunk" in path.read_bytes()[:4096])
 
 
 def read_metashape(root: Path) -> ForeignScene:
@@ -34,7 +34,7 @@ def read_metashape(root: Path) -> ForeignScene:
     text = read_text(path)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may expand without limit
         raise AwError(f"{path} has a DOCTYPE or entities, which Metashape does not write; do not use it")
-    with posed.tool_errors("Metashape", path):
+    with posed_photos.tool_errors("Metashape", path):
         chunks = [c for c in ElementTree.fromstring(text).iter("chunk") if c.find("cameras") is not None]
         if len(chunks) != 1:
             raise AwError(f"{path} holds {counted(len(chunks), 'chunk')} with cameras; export one")
@@ -62,7 +62,9 @@ def read_metashape(root: Path) -> ForeignScene:
             )
         photos = root / "images" if (root / "images").is_dir() else root
         rows = []
-        for camera, name in zip(used, posed.find_posed(photos, [c.attrib["label"] for c in used], path)):
+        for camera, name in zip(
+            used, posed_photos.find_posed(photos, [c.attrib["label"] for c in used], path)
+        ):
             own = moves.get(camera.get("component_id"))
             if own is not None and whole is not None and not np.allclose(own, whole):
                 raise AwError(f"{path}: component and chunk state different transforms; export one")
@@ -77,7 +79,7 @@ def read_metashape(root: Path) -> ForeignScene:
     notes = [f"{counted(left, 'photo')} not aligned or not enabled: left out"] if left else []
     if not local:
         notes.append("a chunk on a map: its point cloud would have other coordinates than its cameras")
-    return posed.posed_scene("metashape", root, photos, rows, notes, points=local)
+    return posed_photos.posed_scene("metashape", root, photos, rows, notes, points=local)
 
 
 def _numbers(element: Element | None, *shape: int) -> np.ndarray:
@@ -112,6 +114,6 @@ def _camera(sensor: Element, where: str) -> ModelCamera:
     width, height = int(size.attrib["width"]), int(size.attrib["height"])
     pinhole, shear = (f + b1, f, width / 2 + cx, height / 2 + cy), b2 / f if f else 0.0
     if kind == "frame":
-        return posed.brown_camera((width, height), pinhole, (k1, k2, k3, k4), (p2, p1), where, shear)
+        return posed_photos.brown_camera((width, height), pinhole, (k1, k2, k3, k4), (p2, p1), where, shear)
     params = (*pinhole, k1, k2, p2, p1, k3, k4, 0.0, 0.0)
     return ModelCamera(1, "THIN_PRISM_FISHEYE", width, height, params, shear)

@@ -9,7 +9,7 @@ from pathlib import Path
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.scene import Evaluation
 from ambiguous_wild.datasets.foreign import ForeignScene, inside
-from ambiguous_wild.datasets.photos import at_photo_size
+from ambiguous_wild.datasets.imported_photos import at_photo_size
 from ambiguous_wild.datasets.readers.colmap import read_plain
 from ambiguous_wild.datasets.readers.phototourism import NERF_W, read_phototourism
 from ambiguous_wild.datasets.readers.transforms import read_blender, read_json, read_transforms

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.datasets.foreign import ForeignScene
-from ambiguous_wild.datasets.readers.posed import find_posed, posed_scene, tool_errors
+from ambiguous_wild.datasets.readers.posed_photos import find_posed, posed_scene, tool_errors
 from ambiguous_wild.datasets.readers.transforms import frame_camera, read_json
 
 LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h")

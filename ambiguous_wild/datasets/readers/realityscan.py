@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.datasets.foreign import ForeignScene, read_text
-from ambiguous_wild.datasets.readers import posed
+from ambiguous_wild.datasets.readers import posed_photos
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import header_size, pillow
 
@@ -27,7 +27,7 @@ ORIENTATION = 274  # tag of EXIF
 
 def find_table(root: Path) -> Path | None:
     """Find the folder's CSV with a pose and a focal length for each photo; None without one."""
-    return posed.only_file(root, ".csv", lambda path: bool(_table(path)))
+    return posed_photos.only_file(root, ".csv", lambda path: bool(_table(path)))
 
 
 def _table(path: Path) -> list[list[str]]:
@@ -49,11 +49,11 @@ def _table(path: Path) -> list[list[str]]:
 def read_realityscan(root: Path) -> ForeignScene:
     """Read poses and lenses of the CSV, and the point cloud of a PLY beside it in the same coordinates."""
     tables: dict[Path, list[list[str]]] = {}  # each is read once
-    path = posed.only_file(root, ".csv", lambda path: bool(tables.setdefault(path, _table(path))))
+    path = posed_photos.only_file(root, ".csv", lambda path: bool(tables.setdefault(path, _table(path))))
     if path is None:
         raise AwError(f"{root} has no CSV of RealityScan's export 'Internal/External camera parameters'")
     columns, *lines = tables[path]
-    with posed.tool_errors("RealityScan", path):
+    with posed_photos.tool_errors("RealityScan", path):
         stated = [dict(zip(columns, line, strict=True)) for line in lines]
         numbers = [
             {key: float(row[key].replace(",", ".")) for key in (*POSE, "f", *LENS) if key in row}
@@ -61,14 +61,14 @@ def read_realityscan(root: Path) -> ForeignScene:
         ]
     photos = root / "images" if (root / "images").is_dir() else root
     rows = []
-    for name, row in zip(posed.find_posed(photos, [row["name"] for row in stated], path), numbers):
+    for name, row in zip(posed_photos.find_posed(photos, [row["name"] for row in stated], path), numbers):
         pose = np.eye(4)
         angles = [-row["heading"], row["pitch"], row["roll"]]
         pose[:3, :3] = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
         pose[:3, 3] = row["x"], row["y"], row["alt"]
         rows.append((name, pose, _camera(row, photos / name, path)))
     notes = [] if "k1" in columns else [f"{path.name} states no lens: the photos are taken as undistorted"]
-    return posed.posed_scene("realityscan", root, photos, rows, notes)
+    return posed_photos.posed_scene("realityscan", root, photos, rows, notes)
 
 
 def _camera(row: dict[str, float], photo: Path, path: Path) -> ModelCamera:
@@ -87,4 +87,4 @@ def _camera(row: dict[str, float], photo: Path, path: Path) -> ModelCamera:
         raise AwError(f"{fault}: export with a Brown lens, or undistorted photos")
     longer = max(size)
     f, cx, cy = row["f"] * longer / 36, px * longer + size[0] / 2, py * longer + size[1] / 2
-    return posed.brown_camera(size, (f, f, cx, cy), (k1, k2, k3, k4), (t2, t1), str(path))
+    return posed_photos.brown_camera(size, (f, f, cx, cy), (k1, k2, k3, k4), (t2, t1), str(path))

@@ -12,7 +12,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
 from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, find_photo, inside, read_text, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import sides
-from ambiguous_wild.datasets.readers.posed import brown_camera, model_of_poses
+from ambiguous_wild.datasets.readers.posed_photos import brown_camera, model_of_poses
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, points_without_tracks
 from ambiguous_wild.io.files import unique_keys
 from ambiguous_wild.io.images import header_size

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ambiguous_wild.methods.ablation import Group, Variant, values
+from ambiguous_wild.methods.ablation_groups import Group, Variant, values
 
 _NEITHER_MASK = ("mask.use_local=false", "mask.use_global=false")
 _NO_MASKS = (*_NEITHER_MASK, "first_look.on=false")

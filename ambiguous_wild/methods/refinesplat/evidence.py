@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.masking_common import resized
-from ambiguous_wild.methods.refinesplat.config import MaskConfig, Spread
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, Spread
 from ambiguous_wild.methods.refinesplat.identity import Psi
 from ambiguous_wild.methods.refinesplat.maps import spread_of
 from ambiguous_wild.methods.refinesplat.structure import box

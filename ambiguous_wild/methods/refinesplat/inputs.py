@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.methods.masking_common import nearest
-from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import (
     Identities,
     Psi,

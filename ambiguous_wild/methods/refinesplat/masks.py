@@ -18,10 +18,10 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
-from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_by
-from ambiguous_wild.methods.refinesplat.first_look import FirstLook
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.maps import sized, spread_of
+from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, grown, hysteresis
 from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshold, learnt, pool_of, t_ent
 from ambiguous_wild.splat.backend import backend_of
@@ -216,7 +216,7 @@ class MaskStore:
         photos: Sequence[Tensor],  # [H, W, 3] float32 in [0, 1] on `device`
         cameras: Sequence[Camera],
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points
-        looks: Mapping[int, FirstLook],
+        looks: Mapping[int, InitialMaskPrior],
         labels: Sequence[np.ndarray],  # [H, W] int32 instances, 0 = none
         static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
         device: torch.device | str,

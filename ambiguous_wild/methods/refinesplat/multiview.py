@@ -83,7 +83,7 @@ class MultiViewEvidence:
 
     evidence: Tensor  # at the quantile of the config; NaN where no other view sees the surface
     weight: Tensor  # in [0, 1]: how well their photos agree with this one
-    taught: Tensor  # in [0, 1]: share of `seen_by` views that see the surface
+    coverage: Tensor  # in [0, 1]: share of `seen_by` views that see the surface
 
 
 @dataclass(frozen=True)
@@ -233,8 +233,8 @@ class OtherViews:
         evidence = self.ranks.quantile_of(answers.evidence, seen)
         # also in the first round: to wait until all neighbours have evidence gave 16.9 dB instead of 18.7
         least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
-        taught = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
-        maps = (evidence, weight.float(), taught.float())
+        coverage = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
+        maps = (evidence, weight.float(), coverage.float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))
 
     def _look_up_sparse(
@@ -302,7 +302,7 @@ def _every_second(x: Tensor, shape: torch.Size) -> Tensor:
 def discount(
     evidence: Tensor, others: MultiViewEvidence | None, unit: Tensor, config: MultiViewConfig
 ) -> Tensor:
-    """Return evidence [H, W] * taught / sqrt(1 + strength * excess).
+    """Return evidence [H, W] * coverage / sqrt(1 + strength * excess).
 
     The excess is weight * (other views' evidence above `free`).
 
@@ -316,7 +316,7 @@ def discount(
         return evidence
     excess = (others.evidence / unit - config.free).clamp_(min=0.0) * others.weight
     at_pixels = resized(excess.nan_to_num_(nan=0.0), *evidence.shape)
-    return evidence * resized(others.taught, *evidence.shape) / (1.0 + config.strength * at_pixels).sqrt_()
+    return evidence * resized(others.coverage, *evidence.shape) / (1.0 + config.strength * at_pixels).sqrt_()
 
 
 def _query_of(

@@ -10,9 +10,9 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ambiguous_wild.methods.refinesplat.config import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig, SupportConfig
-from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
+from ambiguous_wild.methods.refinesplat.density_control import EntropyDensityConfig, SupportConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig
 from ambiguous_wild.vision.backends import BY_MACHINE, first_here
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.masking_common import resized
-from ambiguous_wild.methods.refinesplat.config import MaskConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.maps import low_quantile, median
 from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
 from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual

@@ -19,21 +19,21 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, resized
-from ambiguous_wild.methods.refinesplat import pictures
-from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.density import EntropyAwareDensity
+from ambiguous_wild.methods.refinesplat import mask_pictures
+from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, silence
-from ambiguous_wild.methods.refinesplat.first_look import FirstLook, first_look, masked_share
+from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
+from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior, first_look, masked_share
 from ambiguous_wild.methods.refinesplat.masks import MaskStore
 from ambiguous_wild.methods.refinesplat.threshold import Variant
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.parts import MethodHooks, Schedule
+from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
-from ambiguous_wild.vision.moving import moving_labels, moving_map
+from ambiguous_wild.vision.motion_maps import moving_labels, moving_map
 from ambiguous_wild.vision.protocols import Instances
 from ambiguous_wild.vision.segments import GraphSegments
 from ambiguous_wild.vision.sparse_surface import static_surfaces
@@ -124,7 +124,7 @@ class RefineSplatMask(PausingMask):
         self.instances = instances or _instances(config)
         self.visits: dict[int, int] = {}  # view -> number of steps since masks began
         self.points: dict[str, MotionPoints] = {}  # photo's name -> its moving and static features
-        self.looks: dict[int, FirstLook] = {}  # view -> its comparison with other photos, if any
+        self.looks: dict[int, InitialMaskPrior] = {}  # view -> its comparison with other photos, if any
 
     def setup(self, data: TrainData) -> None:
         self.data = data
@@ -265,13 +265,13 @@ class RefineSplatMask(PausingMask):
         return loss
 
     def panels(self, step: Step) -> dict[str, np.ndarray]:
-        return pictures.panels(self, step, begun=self.begun(step))
+        return mask_pictures.panels(self, step, begun=self.begun(step))
 
     def explain(self, step: Step, x: int, y: int) -> list[str]:
-        return pictures.explain(self, step, x, y)
+        return mask_pictures.explain(self, step, x, y)
 
     def draw(self, folder: Path) -> list[Path]:
-        return pictures.draw_entropies(self, folder)
+        return mask_pictures.draw_entropies(self, folder)
 
     def state_dict(self) -> State:
         psi = self.inputs.semantics.psi if self.inputs.has_semantics else None

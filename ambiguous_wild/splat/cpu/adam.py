@@ -1,7 +1,7 @@
 """Kernels over flat arrays: Adam in sixteen lanes, and a check that all values are finite.
 
 Adam has one definition for every row, seen or not: a row that no view sees has gradient zero, its moments
-decay and it moves on momentum alone. The dense step and the postponed steps both run `_moments` and
+decay and it moves on momentum alone. The dense step and the pending steps both run `_moments` and
 `_change`, so that postponing changes no bit.
 """
 
@@ -146,7 +146,7 @@ def catch_up_all(width, p, m, v, last, now, rates, roots, parts):
 
 @parallel_kernel
 def sparse(visible, width, p, m, v, g, last, now, rates, roots, parts):
-    """Take step `now` (counted from 0) of the visible rows; the others are put off."""
+    """Take step `now` (counted from 0) of the visible rows; the others are pending."""
     n = visible.shape[0]
     for part in numba.prange(parts):
         row = part * n // parts

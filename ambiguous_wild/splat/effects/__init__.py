@@ -14,7 +14,7 @@ from ambiguous_wild.core.errors import AwError, unknown
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.effects.base import Effect
-    from ambiguous_wild.splat.parts import MethodHooks
+    from ambiguous_wild.splat.method_hooks import MethodHooks
 
 # name -> (module, class, what it is for), in the order in which they act on a render
 EFFECTS: dict[str, tuple[str, str, str]] = {

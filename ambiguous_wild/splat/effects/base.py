@@ -22,11 +22,11 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import (
     Cotangents,
     Frame,
-    FramePull,
+    FrameVjp,
     Gradients,
-    Pull,
     ShadeGradients,
-    ShadePull,
+    ShadeVjp,
+    Vjp,
 )
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
 
@@ -34,8 +34,8 @@ from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewC
 class Effect:
     """An effect that does nothing. Override the hooks of the places where yours acts; others are not called.
 
-    Gradients pass a hook through the pull that it returned: hooks store nothing about a picture.
-    Gradients of the effect's own parameters are passed in `own`, under the effect's name.
+    Gradients pass a hook through the vjp that it returned: hooks store nothing about a picture.
+    Gradients of the effect's own parameters are passed in `effect_grads`, under the effect's name.
     """
 
     name = ""
@@ -57,25 +57,25 @@ class Effect:
         """Return the attributes that the effect needs with every Gaussian, see `Gaussians.attributes`."""
         return {}
 
-    def spared(self, means: Tensor) -> Tensor:
+    def frozen_in_density_control(self, means: Tensor) -> Tensor:
         """Return the rows that density control must neither copy nor remove, [N] bool, from means [N, 3]."""
         return torch.zeros(len(means), dtype=torch.bool, device=means.device)
 
-    def camera(self, shot: ViewContext) -> Camera:
+    def camera(self, context: ViewContext) -> Camera:
         """Return the camera of a train photo, at the resolution of the step."""
-        return shot.camera
+        return context.camera
 
-    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
-        """Return the Gaussians as they are drawn, all rows, and a pull that changes no tensor in place."""
+    def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
+        """Return the Gaussians as they are drawn, all rows, and a vjp that changes no tensor in place."""
         return gaussians, same
 
     def shade(
-        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: ViewContext
-    ) -> tuple[Tensor, ShadePull]:
+        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, context: ViewContext
+    ) -> tuple[Tensor, ShadeVjp]:
         """Return colours [M, 3] of the visible rows from those of the harmonics, see `rendered.Shade`."""
         return base, ShadeGradients
 
-    def image(self, frame: Frame, shot: ViewContext) -> tuple[Frame, FramePull]:
+    def image(self, frame: Frame, context: ViewContext) -> tuple[Frame, FrameVjp]:
         """Return the pictures as they are compared with the photo, as new tensors.
 
         The effect learns from `Cotangents.image` alone: a method's own loss on the render (`extra`) tells
@@ -83,17 +83,19 @@ class Effect:
         """
         return frame, unchanged
 
-    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: ViewContext) -> Mapping[str, Tensor]:
+    def pose(self, gaussians: Gaussians, gradients: Gradients, context: ViewContext) -> Mapping[str, Tensor]:
         """Return own gradients from a train photo's camera, given Gaussians and gradients of the render."""
         return {}
 
-    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
+    def step(
+        self, effect_grads: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None
+    ) -> None:
         """Learn from the gradients of one step.
 
         Args:
-            own: gradients of the effect's own parameters, as its pulls returned them.
-            shot: shot of the step.
-            called_off: on an accelerator [1] float32; 1 = change nothing, whatever the gradients are.
+            effect_grads: gradients of the effect's own parameters, as its vjps returned them.
+            context: shot of the step.
+            skip_step: on an accelerator [1] float32; 1 = change nothing, whatever the gradients are.
         """
 
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
@@ -105,7 +107,7 @@ class Effect:
     def begin_fit(self) -> None:
         """Called before a test photo is fitted: set its row to neutral."""
 
-    def fit(self, own: Mapping[str, Tensor]) -> None:
+    def fit(self, effect_grads: Mapping[str, Tensor]) -> None:
         """Take one step of the test photo's row; nothing shared changes."""
 
     def facts(self) -> Facts:
@@ -120,12 +122,12 @@ class Effect:
 
 
 def same(gradients: Gradients) -> Gradients:
-    """Return the gradients: the pull of an unchanged model."""
+    """Return the gradients: the vjp of an unchanged model."""
     return gradients
 
 
 def unchanged(cotangents: Cotangents) -> Cotangents:
-    """Return the cotangents: the pull of an unchanged picture."""
+    """Return the cotangents: the vjp of an unchanged picture."""
     return cotangents
 
 
@@ -142,19 +144,17 @@ class RowAdam:
         self.first, self.second = torch.zeros_like(values), torch.zeros_like(values)
         self.steps = [0] * len(values)
 
-    def step(
-        self, row: int, gradient: Tensor, rate: float | Tensor, called_off: Tensor | None = None
-    ) -> None:
-        """Step one row; `rate` broadcasts over it, `called_off` is that of `Effect.step`.
+    def step(self, row: int, gradient: Tensor, rate: float | Tensor, skip_step: Tensor | None = None) -> None:
+        """Step one row; `rate` broadcasts over it, `skip_step` is that of `Effect.step`.
 
-        A step that was called off is counted, because the host does not know of it; this changes only the
+        A step that was skipped is counted, because the host does not know of it; this changes only the
         bias correction of the moments.
         """
         self.steps[row] += 1
         first, second = self.first[row], self.second[row]
         weights: tuple[Any, Any] = (1 - self.betas[0], 1 - self.betas[1])
-        if called_off is not None:
-            go = share_of(called_off, gradient)
+        if skip_step is not None:
+            go = share_of(skip_step, gradient)
             gradient = gradient.masked_fill(go <= 0, 0.0)  # it may not be finite
             weights, rate = (weights[0] * go, weights[1] * go), rate * go
         first.lerp_(gradient, weights[0])
@@ -177,9 +177,9 @@ class RowAdam:
         self.steps = [int(n) for n in state["steps"]]
 
 
-def share_of(called_off: Tensor, like: Tensor) -> Tensor:
-    """Return 0 if the step was called off, else 1, as a 0-d tensor in the type of `like`."""
-    return 1.0 - called_off.reshape(()).to(like)
+def share_of(skip_step: Tensor, like: Tensor) -> Tensor:
+    """Return 0 if the step was skipped, else 1, as a 0-d tensor in the type of `like`."""
+    return 1.0 - skip_step.reshape(()).to(like)
 
 
 def decayed(first: float, last: float, progress: float) -> float:
@@ -187,12 +187,14 @@ def decayed(first: float, last: float, progress: float) -> float:
     return float(first * (last / first) ** progress)
 
 
-def rate_for_run_length(rate: float, made_for: int, shot: ViewContext) -> float:
+def rate_for_run_length(rate: float, made_for: int, context: ViewContext) -> float:
     """Return Adam's learning rate for a run of another length than the rate was published for.
 
     It grows with the square root of the ratio of the lengths, at most tenfold; longer runs get the rate
     itself. Adam's steps have the size of the rate, and a random walk goes as far as the root of its number of
     steps.
     """
-    length = shot.iteration * NOMINAL_ITERATIONS / max(shot.nominal, 1e-9)  # iterations of the whole run
+    length = (
+        context.iteration * NOMINAL_ITERATIONS / max(context.nominal, 1e-9)
+    )  # iterations of the whole run
     return rate * min(max(made_for / length, 1.0), 100.0) ** 0.5

@@ -22,10 +22,18 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, same, unchanged
-from ambiguous_wild.splat.effects.placing import SceneNormaliser
+from ambiguous_wild.splat.effects.geometry import SceneNormaliser
 from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.rendered import Cotangents, Frame, FramePull, Gradients, Own, Pull, sum_own
+from ambiguous_wild.splat.rendered import (
+    Cotangents,
+    EffectGrads,
+    Frame,
+    FrameVjp,
+    Gradients,
+    Vjp,
+    sum_effect_grads,
+)
 from ambiguous_wild.splat.step import TrainData, ViewContext
 
 EXPOSURE_RATE, EXPOSURE_RATE_FINAL = 0.01, 0.001  # 3DGS's exposure_lr
@@ -53,38 +61,48 @@ class AffineExposure(Effect):
         row = self.adam.values[view]
         return row[:, :3] + torch.eye(3, dtype=row.dtype, device=row.device), row[:, 3]
 
-    def image(self, frame: Frame, shot: ViewContext) -> tuple[Frame, FramePull]:
-        row = shot.row(self.views)
+    def image(self, frame: Frame, context: ViewContext) -> tuple[Frame, FrameVjp]:
+        row = context.row(self.views)
         if row is None:
             return frame, unchanged
         matrix, offset = self._affine(row)
         before = frame.image
 
-        def pull(cotangents: Cotangents) -> Cotangents:
+        def vjp(cotangents: Cotangents) -> Cotangents:
             image, extra = (
                 None if d is None else (d @ matrix).contiguous() for d in (cotangents.image, cotangents.extra)
             )
-            own: Own = {}
+            effect_grads: EffectGrads = {}
             if cotangents.image is not None:
                 flat = cotangents.image.reshape(-1, 3)
                 gradient = torch.cat([flat.T @ before.reshape(-1, 3), flat.sum(dim=0)[:, None]], dim=1)
-                own = {self.name: {"affine": gradient.to(self.adam.values)}}
-            return replace(cotangents, image=image, extra=extra, own=sum_own(cotangents.own, own))
+                effect_grads = {self.name: {"affine": gradient.to(self.adam.values)}}
+            return replace(
+                cotangents,
+                image=image,
+                extra=extra,
+                effect_grads=sum_effect_grads(cotangents.effect_grads, effect_grads),
+            )
 
-        return replace(frame, image=(before @ matrix.T + offset).contiguous()), pull
+        return replace(frame, image=(before @ matrix.T + offset).contiguous()), vjp
 
-    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
-        assert shot.view is not None
+    def step(
+        self, effect_grads: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None
+    ) -> None:
+        assert context.view is not None
         self.adam.step(
-            shot.view, own["affine"], decayed(EXPOSURE_RATE, EXPOSURE_RATE_FINAL, shot.progress), called_off
+            context.view,
+            effect_grads["affine"],
+            decayed(EXPOSURE_RATE, EXPOSURE_RATE_FINAL, context.progress),
+            skip_step,
         )
         self._close()
 
     def begin_fit(self) -> None:
         self.adam.reset(self.views)
 
-    def fit(self, own: Mapping[str, Tensor]) -> None:
-        self.adam.step(self.views, own["affine"], EXPOSURE_FIT_RATE)
+    def fit(self, effect_grads: Mapping[str, Tensor]) -> None:
+        self.adam.step(self.views, effect_grads["affine"], EXPOSURE_FIT_RATE)
 
     def facts(self) -> Facts:
         gains = self.adam.values[: self.views, range(3), range(3)] + 1
@@ -134,8 +152,8 @@ class AppearanceEmbedding(Effect):
         # multiply by the embedding first: one matrix [33, 6] a view instead of SIZE of them a Gaussian
         return hidden @ torch.einsum("hse,s->he", net["last"].reshape(-1, SIZE, 6), embedding)
 
-    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
-        row = shot.row(self.views)
+    def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
+        row = context.row(self.views)
         if row is None:
             return gaussians, same
         leaves = self.net | {"row": self.rows_of_photos.values[row], "sh0": gaussians.sh0}
@@ -145,28 +163,30 @@ class AppearanceEmbedding(Effect):
             colour = (SH_C0 * leaves["sh0"] + 0.5) * (1 + change[:, :3]) + change[:, 3:]
             sh0 = (colour - 0.5) / SH_C0
 
-        def pull(gradients: Gradients) -> Gradients:
+        def vjp(gradients: Gradients) -> Gradients:
             parts = torch.autograd.grad(sh0, list(leaves.values()), gradients.sh0.to(sh0), retain_graph=True)
-            own = dict(zip(leaves, parts))
-            before = own.pop("sh0").contiguous()
-            return replace(gradients, sh0=before).with_own(self.name, own)
+            effect_grads = dict(zip(leaves, parts))
+            before = effect_grads.pop("sh0").contiguous()
+            return replace(gradients, sh0=before).with_effect_grads(self.name, effect_grads)
 
-        return replace(gaussians, sh0=sh0.detach()), pull
+        return replace(gaussians, sh0=sh0.detach()), vjp
 
-    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
-        assert shot.view is not None
-        share = decayed(1.0, FINAL, shot.progress)
-        self.rows_of_photos.step(shot.view, own["row"], RATE_ROWS * share, called_off)
+    def step(
+        self, effect_grads: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None
+    ) -> None:
+        assert context.view is not None
+        share = decayed(1.0, FINAL, context.progress)
+        self.rows_of_photos.step(context.view, effect_grads["row"], RATE_ROWS * share, skip_step)
         for name, adam in self.moments.items():
-            adam.step(0, own[name], RATE_NET * share, called_off)
+            adam.step(0, effect_grads[name], RATE_NET * share, skip_step)
         rows = self.rows_of_photos.values[: self.views]
         rows -= rows.mean(dim=0)
 
     def begin_fit(self) -> None:
         self.rows_of_photos.reset(self.views)
 
-    def fit(self, own: Mapping[str, Tensor]) -> None:
-        self.rows_of_photos.step(self.views, own["row"], EMBEDDING_FIT_RATE)
+    def fit(self, effect_grads: Mapping[str, Tensor]) -> None:
+        self.rows_of_photos.step(self.views, effect_grads["row"], EMBEDDING_FIT_RATE)
 
     def facts(self) -> Facts:
         return {"embedding_std": float(self.rows_of_photos.values[: self.views].std(unbiased=False))}

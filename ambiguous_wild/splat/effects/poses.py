@@ -18,8 +18,8 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, share_of
-from ambiguous_wild.splat.effects.placing import higher_harmonics
-from ambiguous_wild.splat.effects.posed import PosedCamera, on_device, scaled
+from ambiguous_wild.splat.effects.device_cameras import PosedCamera, on_device, scaled
+from ambiguous_wild.splat.effects.geometry import higher_harmonics
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import TrainData, ViewContext
@@ -45,34 +45,36 @@ class PoseRefinement(Effect):
         self.cameras = data.cameras
         self.rate = RATE_PX / float(np.median([camera.fx for camera in data.cameras]))  # rad, and depths
 
-    def camera(self, shot: ViewContext) -> Camera:
-        assert shot.view is not None
-        if not self.adam.steps[shot.view]:  # never moved: its row need not be read
-            return shot.camera
-        full, row = self.cameras[shot.view], self.adam.values[shot.view]
+    def camera(self, context: ViewContext) -> Camera:
+        assert context.view is not None
+        if not self.adam.steps[context.view]:  # never moved: its row need not be read
+            return context.camera
+        full, row = self.cameras[context.view], self.adam.values[context.view]
         base = on_device(full, row.device, row.dtype)
         turn, pose = turned(row[:3]), base.viewmat[0].clone()
         pose[:3, :3] = turn @ base.viewmat[0, :3, :3]
         pose[:3, 3] = turn @ base.viewmat[0, :3, 3] + self.depth * row[3:]
-        smaller = shot.camera.width / full.width, shot.camera.height / full.height
-        return PosedCamera(shot.camera, pose, scaled(base.intrinsics[0], *smaller))
+        smaller = context.camera.width / full.width, context.camera.height / full.height
+        return PosedCamera(context.camera, pose, scaled(base.intrinsics[0], *smaller))
 
-    def pose(self, gaussians: Gaussians, gradients: Gradients, shot: ViewContext) -> Mapping[str, Tensor]:
-        assert shot.view is not None
-        row = self.adam.values[shot.view]
-        left = left_gradient(gaussians, shot.camera, gradients)
+    def pose(self, gaussians: Gaussians, gradients: Gradients, context: ViewContext) -> Mapping[str, Tensor]:
+        assert context.view is not None
+        row = self.adam.values[context.view]
+        left = left_gradient(gaussians, context.camera, gradients)
         # the motion is exp(w), then the shift, so the shift's part of the gradient of w is subtracted
         turn = left[:3] - torch.linalg.cross(self.depth * row[3:], left[3:])
         return {"motion": torch.cat([left_jacobian(row[:3]).T @ turn, self.depth * left[3:]])}
 
-    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
-        if shot.progress < BEGIN or shot.view is None:
+    def step(
+        self, effect_grads: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None
+    ) -> None:
+        if context.progress < BEGIN or context.view is None:
             return
-        row = self.adam.values[shot.view]
-        share = decayed(1.0, FINAL, shot.progress)
-        self.adam.step(shot.view, own["motion"], self.rate * share, called_off)
-        pull = PULL * share if called_off is None else PULL * share * share_of(called_off, row)
-        row *= 1 - pull  # decoupled from Adam's scaling, as weight decay is in AdamW
+        row = self.adam.values[context.view]
+        share = decayed(1.0, FINAL, context.progress)
+        self.adam.step(context.view, effect_grads["motion"], self.rate * share, skip_step)
+        vjp = PULL * share if skip_step is None else PULL * share * share_of(skip_step, row)
+        row *= 1 - vjp  # decoupled from Adam's scaling, as weight decay is in AdamW
 
     def facts(self) -> Facts:
         angle = torch.rad2deg(self.adam.values[:, :3].norm(dim=1))

@@ -20,7 +20,7 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.placing import inside, projected
+from ambiguous_wild.splat.effects.geometry import inside, projected
 from ambiguous_wild.splat.effects.tracks import tracks_of
 from ambiguous_wild.splat.gaussians import LEAST_POINTS, Gaussians
 from ambiguous_wild.splat.step import Step, TrainData
@@ -45,9 +45,9 @@ class Skybox(Effect):
         self._middle = torch.from_numpy(middle.astype(np.float32)).to(data.device)
         self._inner = 0.5 * radius
 
-    def spared(self, means: Tensor) -> Tensor:
+    def frozen_in_density_control(self, means: Tensor) -> Tensor:
         if not self.count:  # without a skybox, points so far out are outliers of SfM
-            return super().spared(means)
+            return super().frozen_in_density_control(means)
         return torch.linalg.vector_norm(means - self._middle, dim=1) > self._inner
 
     def first_points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,9 +14,9 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.placing import pose_like
+from ambiguous_wild.splat.effects.geometry import pose_like
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.rendered import Gradients, Pull
+from ambiguous_wild.splat.rendered import Gradients, Vjp
 from ambiguous_wild.splat.step import TrainData, ViewContext
 
 VARIANCE = 0.2  # variance of the filter, in squared sampling intervals
@@ -37,13 +37,13 @@ class SmoothingFilter(Effect):
         self._stale = True  # whether rows have changed since the sizes were computed
         self._at = 0  # iteration of the sizes
 
-    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
+    def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
         size = self.size
-        due = self._stale or (not shot.neutral and shot.iteration - self._at >= EVERY)
-        if due or shot.other_gaussians:
+        due = self._stale or (not context.neutral and context.iteration - self._at >= EVERY)
+        if due or context.other_gaussians:
             size = filter_sizes(gaussians.means, self.cameras)
-            if not shot.neutral and not shot.other_gaussians:  # a probe must not change the state
-                self.size, self._at, self._stale = size, shot.iteration, False
+            if not context.neutral and not context.other_gaussians:  # a probe must not change the state
+                self.size, self._at, self._stale = size, context.iteration, False
         variance = (2 * gaussians.log_scales).exp()
         wide = variance + size.to(variance)[:, None] ** 2
         share = variance / wide  # [N, 3]
@@ -52,7 +52,7 @@ class SmoothingFilter(Effect):
         # the logit of an opaque Gaussian that is not widened would be infinite
         opacity = opacity.clamp(1e-7, 1 - 1e-6)
 
-        def pull(gradients: Gradients) -> Gradients:
+        def vjp(gradients: Gradients) -> Gradients:
             # dL/d log o', with o' (1 - o') the slope of the sigmoid
             d_log = gradients.opacity_logits / (1 - opacity)
             return replace(
@@ -61,7 +61,7 @@ class SmoothingFilter(Effect):
                 opacity_logits=(d_log * (1 - plain)).contiguous(),
             )
 
-        return replace(gaussians, log_scales=0.5 * wide.log(), opacity_logits=torch.logit(opacity)), pull
+        return replace(gaussians, log_scales=0.5 * wide.log(), opacity_logits=torch.logit(opacity)), vjp
 
     def rows_changed(self) -> None:
         self._stale = True

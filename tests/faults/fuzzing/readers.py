@@ -19,14 +19,14 @@ import numpy as np
 import yaml
 
 from ambiguous_wild.core.weight_files import read_tensors
+from ambiguous_wild.harness.cell_run import refuse_other_config
 from ambiguous_wild.harness.effects_plan import read_plan
-from ambiguous_wild.harness.run import refuse_other_config
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io import archive, images, ply, scene_folder
 from ambiguous_wild.io.photos import read_photo
 from ambiguous_wild.report import board, board_pictures
 from ambiguous_wild.report.audit_numbers import read_tables
-from ambiguous_wild.simulate import capture, spec_file
+from ambiguous_wild.simulate import capture_writer, spec_file
 from ambiguous_wild.simulate.cutouts import read_cutouts
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.study.answers import read_answers, read_key
@@ -109,7 +109,7 @@ def _capture(path: Path) -> None:
     truth.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, truth / "capture.json")
     (truth.parent / "a").write_text("x")
-    capture._earlier(truth.parent, "i", overwrite=False)
+    capture_writer._earlier(truth.parent, "i", overwrite=False)
 
 
 def _board(path: Path) -> None:

@@ -26,7 +26,7 @@ from ambiguous_wild.harness.cell import (
     file_of,
     provenance,
 )
-from ambiguous_wild.harness.external import run_program
+from ambiguous_wild.harness.external_runs import run_program
 from ambiguous_wild.harness.pictures import ROWS
 from ambiguous_wild.harness.result_file import (
     FAILED,

@@ -218,7 +218,7 @@ def bench(
     with Session(engine, threads, callbacks) as session:
         from ambiguous_wild.harness.cell import RunOptions
         from ambiguous_wild.harness.effects_plan import read_plan
-        from ambiguous_wild.harness.external import check_program
+        from ambiguous_wild.harness.external_runs import check_program
         from ambiguous_wild.harness.grid import (
             check_grafts,
             expected_line,
@@ -372,8 +372,8 @@ def _rescore_hint(report: BenchReport, metrics: Sequence[Words] = ()) -> str:
 
 
 def _run_report(cell: Cell, report: CellReport) -> RunReport:
+    from ambiguous_wild.harness.cell_run import is_finished
     from ambiguous_wild.harness.result_file import RESULT, read_result
-    from ambiguous_wild.harness.run import is_finished
 
     result = report.result
     if result is None and report.outcome != "failed" and is_finished(report.folder):

@@ -18,7 +18,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.weight_files import read_tensors
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.vision.weights import RECEIPT, Weight
+from ambiguous_wild.vision.weight_registry import RECEIPT, Weight
 
 # Index of the convolutions in torchvision's `features`, in the order of the network.
 _CONVOLUTIONS = {

@@ -18,7 +18,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.callbacks import Lines, outcome_line, run_name
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.bench import BenchReport
+    from ambiguous_wild.harness.benchmark import BenchReport
     from ambiguous_wild.harness.cell import Cell, CellReport
     from ambiguous_wild.splat.trainer import Trainer
 

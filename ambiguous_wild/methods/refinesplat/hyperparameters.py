@@ -8,9 +8,9 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.refinesplat.density import EntropyDensityConfig
-from ambiguous_wild.methods.refinesplat.first_look import FirstLookConfig
+from ambiguous_wild.methods.refinesplat.density_control import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
+from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.methods.refinesplat.threshold import Form, Statistic, Variant
 from ambiguous_wild.vision.backends import check_features, check_instances

@@ -10,7 +10,7 @@ from ambiguous_wild.core.errors import counted
 from ambiguous_wild.io.files import atomic_dir, write_json, write_text
 from ambiguous_wild.report import plain_formats
 from ambiguous_wild.report.plain_formats import markdown_text
-from ambiguous_wild.report.table import text_table
+from ambiguous_wild.report.table_layout import text_table
 from ambiguous_wild.study.answers import KIND_PAIR, KIND_PHOTO
 from ambiguous_wild.study.scores import (
     HARD,

@@ -35,16 +35,7 @@ from ambiguous_wild.io.files import atomic_dir, refuse_foreign_files, sha256_fil
 from ambiguous_wild.simulate.courtyard import courtyard
 from ambiguous_wild.simulate.distractors import lay_out
 from ambiguous_wild.simulate.image_effects import PhotoRandom
-from ambiguous_wild.simulate.records import (
-    CameraRecord,
-    CaptureTruth,
-    DrawnEffects,
-    PhotoTruth,
-    PlacedDistractor,
-    SimulatedCapture,
-    spread,
-)
-from ambiguous_wild.simulate.render import (
+from ambiguous_wild.simulate.photo_render import (
     PlannedPhoto,
     PreparedPhoto,
     RenderedPhoto,
@@ -57,6 +48,15 @@ from ambiguous_wild.simulate.room import room
 from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, CaptureSpec, WorldSpec
 from ambiguous_wild.simulate.spec_file import plain_spec
 from ambiguous_wild.simulate.tracer import TracedPhoto
+from ambiguous_wild.simulate.truth_records import (
+    CameraRecord,
+    CaptureTruth,
+    DrawnEffects,
+    PhotoTruth,
+    PlacedDistractor,
+    SimulatedCapture,
+    spread,
+)
 from ambiguous_wild.simulate.world import World
 from ambiguous_wild.simulate.yard import yard
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision import weights
-from ambiguous_wild.vision.weight_files import check_file, check_folder
-from ambiguous_wild.vision.weights import Weight
+from ambiguous_wild.vision import weight_registry
+from ambiguous_wild.vision.weight_conversion import check_file, check_folder
+from ambiguous_wild.vision.weight_registry import Weight
 
 _SIDE = 64  # px of the picture that features are computed for
 
@@ -28,10 +28,10 @@ def verify(weight: Weight) -> Verdict:
     Features are also computed once. Nothing is downloaded.
     """
     try:
-        place = weights.where(weight)
+        place = weight_registry.where(weight)
         if place is None:
-            raise AwError(weights.missing(weight))
-        advice = f"run: {weights.get_command(weight.name)}"
+            raise AwError(weight_registry.missing(weight))
+        advice = f"run: {weight_registry.get_command(weight.name)}"
         if weight.kind == "file":
             count, hashes = check_file(weight, place, advice), "sha256 as published"
         else:
@@ -82,5 +82,5 @@ def _try(features: object, name: str) -> None:
     if not bool(torch.isfinite(computed).all()) or not bool(computed.std() > 0):
         raise AwError(
             f"the features of {name} are not finite or equal everywhere; "
-            f"run: {weights.get_command(name, again=True)}"
+            f"run: {weight_registry.get_command(name, again=True)}"
         )

@@ -26,7 +26,7 @@ from ambiguous_wild.harness.result_file import (
     read_result,
 )
 from ambiguous_wild.harness.timing import timing_of
-from ambiguous_wild.methods.ablation import DEFAULT, Group, Variant, choose_groups, folder_name
+from ambiguous_wild.methods.ablation_groups import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.pace import TrainConfig

@@ -26,7 +26,7 @@ from ambiguous_wild.report.cost_curves import (
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
 from ambiguous_wild.report.cost_targets import Reach, TargetRow, answers, times_to_reach
 from ambiguous_wild.report.plain_formats import to_csv
-from ambiguous_wild.report.table import Table, text_table
+from ambiguous_wild.report.table_layout import Table, text_table
 
 PLOTS = ("timelines", "budgets", "front", "changes")
 FILES = ("cost.csv", "time-to-psnr.csv", "changes.csv", "timelines.csv", "cost.json",

@@ -19,17 +19,17 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.rendered import (
     NOTHING,
     Cotangents,
-    FramePull,
+    FrameVjp,
     Gradients,
-    Pull,
     Rendered,
     Shade,
     ShadeGradients,
-    ShadePull,
+    ShadeVjp,
+    Vjp,
     as_cotangents,
     frame_of,
+    sum_effect_grads,
     sum_named,
-    sum_own,
     sum_where,
 )
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
@@ -76,69 +76,73 @@ class EffectPipeline:
 
     def protected(self) -> Callable[[Tensor], Tensor] | None:
         """Return a function of means [N, 3] that tells which rows are protected; None = no effect does."""
-        protecting = self._with("spared")
+        protecting = self._with("frozen_in_density_control")
         if not protecting:
             return None
-        return lambda means: torch.stack([effect.spared(means) for effect in protecting]).any(dim=0)
+        return lambda means: torch.stack(
+            [effect.frozen_in_density_control(means) for effect in protecting]
+        ).any(dim=0)
 
-    def camera(self, shot: ViewContext) -> Camera:
+    def camera(self, context: ViewContext) -> Camera:
         """Return the camera of a train photo as the effects change it."""
         for effect in self._with("camera"):
-            shot = replace(shot, camera=effect.camera(shot))
-        return shot.camera
+            context = replace(context, camera=effect.camera(context))
+        return context.camera
 
     def model(
-        self, gaussians: Gaussians, shot: ViewContext, without: Collection[str] = ()
-    ) -> tuple[Gaussians, list[Pull]]:
-        """Return the Gaussians as they are drawn, and the pulls in the order of the effects."""
-        pulls = []
+        self, gaussians: Gaussians, context: ViewContext, without: Collection[str] = ()
+    ) -> tuple[Gaussians, list[Vjp]]:
+        """Return the Gaussians as they are drawn, and the vjps in the order of the effects."""
+        vjps = []
         for effect in self._with("model", without):
-            changed, pull = effect.model(gaussians, shot)
+            changed, vjp = effect.model(gaussians, context)
             gaussians = changed.share_pending_updates(gaussians)
-            pulls.append(pull)
-        return gaussians, pulls
+            vjps.append(vjp)
+        return gaussians, vjps
 
     def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
         """Return the Gaussians as they are drawn without a photo; they do not hold the colours of nets."""
         camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))  # effects on the model do not read it
-        shot = ViewContext(iteration=iteration, nominal=0.0, view=None, camera=camera)
-        return self.model(gaussians, shot)[0]
+        context = ViewContext(iteration=iteration, nominal=0.0, view=None, camera=camera)
+        return self.model(gaussians, context)[0]
 
     def render(
-        self, gaussians: Gaussians, shot: ViewContext, draw: Draw, without: Collection[str] = ()
+        self, gaussians: Gaussians, context: ViewContext, draw: Draw, without: Collection[str] = ()
     ) -> Rendered:
         """Draw with all effects except those named; the effects have already changed the camera."""
         if not self.effects:
-            return draw(gaussians, shot, None)
-        drawn, model_pulls = self.model(gaussians, shot, without)
-        rendered = draw(drawn, shot, self._shade(drawn, shot, without))
-        frame, frame_pulls = frame_of(rendered), []
+            return draw(gaussians, context, None)
+        drawn, model_vjps = self.model(gaussians, context, without)
+        rendered = draw(drawn, context, self._shade(drawn, context, without))
+        frame, frame_vjps = frame_of(rendered), []
         for effect in self._with("image", without):
-            frame, pull = effect.image(frame, shot)
-            frame_pulls.append(pull)
-        posing = () if shot.view is None else self._with("pose", without)
-        return EffectRender(rendered, frame.image, frame.alpha, drawn, shot, model_pulls, frame_pulls, posing)
+            frame, vjp = effect.image(frame, context)
+            frame_vjps.append(vjp)
+        posing = () if context.view is None else self._with("pose", without)
+        return EffectRender(
+            rendered, frame.image, frame.alpha, drawn, context, model_vjps, frame_vjps, posing
+        )
 
-    def _shade(self, drawn: Gaussians, shot: ViewContext, without: Collection[str]) -> Shade | None:
+    def _shade(self, drawn: Gaussians, context: ViewContext, without: Collection[str]) -> Shade | None:
         shading = self._with("shade", without)
         if not shading:
             return None
 
-        def shade(base: Tensor, rows: Tensor | slice) -> tuple[Tensor, ShadePull]:
-            pulls, colours = [], base
+        def shade(base: Tensor, rows: Tensor | slice) -> tuple[Tensor, ShadeVjp]:
+            vjps, colours = [], base
             for effect in shading:
-                colours, pull = effect.shade(drawn, rows, colours, shot)
-                pulls.append(pull)
-            return colours, lambda d_colours: _pull_all(pulls, d_colours)
+                colours, vjp = effect.shade(drawn, rows, colours, context)
+                vjps.append(vjp)
+            return colours, lambda d_colours: _vjp_all(vjps, d_colours)
 
         return shade
 
-    def step(self, gradients: Gradients, shot: ViewContext, called_off: Tensor | None = None) -> None:
+    def step(self, gradients: Gradients, context: ViewContext, skipped: Tensor | None = None) -> None:
         """Let every effect learn from the last backward pass; see `Effect.step`."""
         for effect in self._with("step"):
-            own = gradients.own.get(effect.name)
-            if own is not None:
-                effect.step(own, shot, called_off)
+            effect_grads = gradients.effect_grads.get(effect.name)
+            if effect_grads is not None:
+                effect.step(effect_grads, context, skipped)
 
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
         """Call the effects at the end of a step; see `Effect.after_step`."""
@@ -151,32 +155,32 @@ class EffectPipeline:
             effect.rows_changed()
 
     def fit_view(
-        self, gaussians: Gaussians, shot: ViewContext, photo: Tensor, keep: Tensor, draw: Draw
+        self, gaussians: Gaussians, context: ViewContext, photo: Tensor, keep: Tensor, draw: Draw
     ) -> Tensor:
         """Fit only the colour effects to a part of a photo; returns the picture [H, W, 3] after the fit.
 
         Args:
             gaussians: the trained model; it does not change.
-            shot: shot of the photo, with `fitting`.
+            context: shot of the photo, with `fitting`.
             photo: [H, W, 3] in [0, 1]; it is not read outside of `keep`.
             keep: [H, W], 1 where the fit may read the photo.
             draw: the render call.
         """
         # black where the fit must not read it, also for effects that read the photo
         photo = torch.where(keep[..., None] > 0, photo, torch.zeros_like(photo))
-        shot = replace(shot, photo=photo)
+        context = replace(context, photo=photo)
         fitted = self._with("fit")
         for effect in fitted:
             effect.begin_fit()
         for _ in range(FIT_STEPS if fitted else 0):
-            rendered = self.render(gaussians, shot, draw)
+            rendered = self.render(gaussians, context, draw)
             # "images" blanks both pictures outside of `keep`, so no window of SSIM reaches the other half
             loss = photometric(rendered.image, photo, keep, weighting="images")
-            own = rendered.backward(loss.d_image).own
+            effect_grads = rendered.backward(loss.d_image).effect_grads
             for effect in fitted:
-                if effect.name in own:
-                    effect.fit(own[effect.name])
-        return self.render(gaussians, shot, draw).image
+                if effect.name in effect_grads:
+                    effect.fit(effect_grads[effect.name])
+        return self.render(gaussians, context, draw).image
 
     def fitted(self) -> Facts:
         """Return the effects that `fit_view` fits to a test photo, its steps, and effects that read it."""
@@ -203,15 +207,15 @@ class EffectPipeline:
             effect.load_state_dict(state[effect.name])
 
 
-def _pull_all(pulls: Sequence[ShadePull], d_colours: Tensor) -> ShadeGradients:
+def _vjp_all(vjps: Sequence[ShadeVjp], d_colours: Tensor) -> ShadeGradients:
     total = ShadeGradients(d_colours)
-    for pull in reversed(pulls):
-        one = pull(total.base)
+    for vjp in reversed(vjps):
+        one = vjp(total.base)
         total = ShadeGradients(
             one.base,
             sum_named(one.attributes, total.attributes),
             sum_where(one.means, total.means),
-            sum_own(total.own, one.own),
+            sum_effect_grads(total.effect_grads, one.effect_grads),
         )
     return total
 
@@ -225,9 +229,9 @@ class EffectRender:
         image: Tensor,
         alpha: Tensor,
         drawn: Gaussians,
-        shot: ViewContext,
-        model_pulls: Sequence[Pull],
-        frame_pulls: Sequence[FramePull],
+        context: ViewContext,
+        model_vjps: Sequence[Vjp],
+        frame_vjps: Sequence[FrameVjp],
         posing: Sequence[Effect],
     ) -> None:
         """
@@ -235,15 +239,15 @@ class EffectRender:
             rendered: render of the back end.
             image, alpha: pictures after the image effects.
             drawn: Gaussians that the back end drew.
-            shot: shot of the picture.
-            model_pulls, frame_pulls: pulls in the order in which the effects acted.
+            context: shot of the picture.
+            model_pulls, frame_pulls: vjps in the order in which the effects acted.
             posing: effects that learn from the camera's gradient.
         """
         self.image, self.alpha = image, alpha
         self.visible = rendered.visible
         self.frames, self.renders = frames_of(rendered), renders_of(rendered)
-        self._inner, self._drawn, self._shot = rendered, drawn, shot
-        self._model_pulls, self._frame_pulls, self._posing = model_pulls, frame_pulls, posing
+        self._inner, self._drawn, self._shot = rendered, drawn, context
+        self._model_vjps, self._frame_vjps, self._posing = model_vjps, frame_vjps, posing
 
     @property
     def depth(self) -> Tensor:
@@ -255,13 +259,15 @@ class EffectRender:
 
     @torch.no_grad()
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
-        """Do as `Rendered.backward`; gradients of the effects' own parameters are in `own`."""
+        """Do as `Rendered.backward`; gradients of the effects' own parameters are in `effect_grads`."""
         passed = as_cotangents(cotangents)
-        for frame_pull in reversed(self._frame_pulls):
-            passed = frame_pull(passed)
+        for frame_vjp in reversed(self._frame_vjps):
+            passed = frame_vjp(passed)
         gradients = self._inner.backward(passed, needs)
         for effect in self._posing:
-            gradients = gradients.with_own(effect.name, effect.pose(self._drawn, gradients, self._shot))
-        for pull in reversed(self._model_pulls):
-            gradients = pull(gradients)
+            gradients = gradients.with_effect_grads(
+                effect.name, effect.pose(self._drawn, gradients, self._shot)
+            )
+        for vjp in reversed(self._model_vjps):
+            gradients = vjp(gradients)
         return gradients

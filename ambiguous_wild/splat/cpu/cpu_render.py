@@ -20,11 +20,11 @@ from ambiguous_wild.splat.rendered import (
     Gradients,
     Shade,
     ShadeGradients,
-    ShadePull,
+    ShadeVjp,
     as_cotangents,
     check_needs,
     spread,
-    sum_own,
+    sum_effect_grads,
 )
 
 _pool = BufferPool()
@@ -74,7 +74,7 @@ class _ShadedRender:
 
     rows: Tensor  # [M] int64, the shaded Gaussians
     slots: np.ndarray  # [M] slots of their records
-    pull: ShadePull
+    vjp: ShadeVjp
 
 
 class RenderedCpu:
@@ -109,7 +109,7 @@ class RenderedCpu:
             True if needs & {"squared", "count"} else None,
         )
         gradients = self._chain(sums, c.extra is not None, needs)
-        gradients.own = sum_own(c.own, gradients.own)
+        gradients.effect_grads = sum_effect_grads(c.effect_grads, gradients.effect_grads)
         return gradients
 
     def _sums(
@@ -161,7 +161,7 @@ class RenderedCpu:
         s = self._lists
         colours = np.zeros((len(s.ids), 3), np.float32)
         reverse.colour_sums(s.records, s.ids, s.counts, s.offsets, s.instances, sums, colours)
-        gradients = shaded.pull(torch.from_numpy(colours[shaded.slots]))
+        gradients = shaded.vjp(torch.from_numpy(colours[shaded.slots]))
         colours[shaded.slots] = _array(gradients.base)
         return colours, gradients
 
@@ -195,7 +195,7 @@ def render_cpu(
     """Render on the CPU; arguments and conventions as in `splat.render.render`.
 
     After the projection the optimiser brings the harmonics of the visible rows up to date, see
-    `Gaussians.postponed`.
+    `Gaussians.pending_steps`.
 
     Raises:
         AwError: `sh_degree` is negative or above that of the Gaussians.
@@ -216,8 +216,8 @@ def render_cpu(
     radii = _pool.take("radii", (n,))
     project.project(means, quats, log_scales, logits, cam, antialias, records, ids, counts, radii)
     slots = bins.visible_slots(ids, counts)
-    if gaussians.postponed is not None:
-        gaussians.postponed.make(ids[slots])
+    if gaussians.pending_steps is not None:
+        gaussians.pending_steps.make(ids[slots])
     base = None if shade is None else np.empty((n, 3), np.float32)
     project.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii, base)
     slots = bins.visible_slots(ids, counts)
@@ -259,8 +259,8 @@ def _shade(
 ) -> _ShadedRender:
     """Put the function's colours into the records of the visible Gaussians."""
     rows = torch.from_numpy(ids[slots].astype(np.int64))
-    colours, pull = shade(torch.from_numpy(base[slots]), rows)
+    colours, vjp = shade(torch.from_numpy(base[slots]), rows)
     if tuple(colours.shape) != (len(rows), 3):
         raise AwError(f"a shading function must give colours [{len(rows)}, 3], got {list(colours.shape)}")
     records[slots, project.RED : project.BLUE + 1] = _array(colours).clip(min=0.0)
-    return _ShadedRender(rows, slots, pull)
+    return _ShadedRender(rows, slots, vjp)

@@ -54,7 +54,7 @@ def nerfbaselines_entry(method: str) -> MethodEntry:
         name=f"nerfbaselines-{name}",
         summary=f"{name} as NerfBaselines runs it",
         recipe=no_parts,
-        config="ambiguous_wild.methods.nerfbaselines:Options",
+        config="ambiguous_wild.methods.nerfbaselines_methods:Options",
         needs="NerfBaselines in its own environment",
         source_hash=hashlib.sha256(f"nerfbaselines {name}".encode()).hexdigest(),
         program=NerfBaselines(name, program),

@@ -11,11 +11,11 @@ import numpy as np
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
-from ambiguous_wild.methods.refinesplat.config import RefineSplatConfig
+from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.masks import MaskStore, enlarge
 from ambiguous_wild.splat.step import Step, TrainData
-from ambiguous_wild.vision.moving import POINTS, draw_points
+from ambiguous_wild.vision.motion_maps import POINTS, draw_points
 
 
 class Policy(Protocol):

@@ -60,8 +60,8 @@ class FirstLookConfig:
     smooth: float = 5.0  # px of a map of 20 000 px, radius of the filter over each answer; 0 = none
     # if less of a photo would be masked, nothing is: so few distractors do no harm at the start
     least: float = 0.1
-    # how much the features that move or stay (`vision/moving.py`) raise or lower an answer, but in a crowd;
-    # 0 = not used
+    # how much the features that move or stay (`vision/motion_maps.py`) raise or lower an answer, but in a
+    # crowd; 0 = not used
     motion: float = 1.0
     weight: float = 1.5  # `structure`: largest factor or divisor of later evidence; 1 = unchanged
     # the weight in a crowd, because there the first renders show distractors
@@ -83,7 +83,7 @@ class FirstLookConfig:
 
 
 @dataclass(frozen=True)
-class FirstLook:
+class InitialMaskPrior:
     """What the other photos show at the surfaces of one photo, on a map [h, w] of its frame."""
 
     passing: np.ndarray  # float32 in [0, 1]: 1 = distractor, 0 = other photos show it too, 0.5 = unknown
@@ -111,7 +111,7 @@ def first_look(
     surfaces: Sequence[np.ndarray | None],
     config: FirstLookConfig,
     moving: Sequence[np.ndarray | None] | None = None,
-) -> list[FirstLook | None]:
+) -> list[InitialMaskPrior | None]:
     """Return the first look at every photo; None for one without sparse points or comparable views.
 
     Args:
@@ -172,7 +172,7 @@ def first_look(
     return [
         None
         if passing is None
-        else FirstLook(passing, config.least, weight, _most(passing, inverse, config), crowd)
+        else InitialMaskPrior(passing, config.least, weight, _most(passing, inverse, config), crowd)
         for passing, inverse in zip(answers, surfaces, strict=True)
     ]
 

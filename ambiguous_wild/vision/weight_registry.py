@@ -1,6 +1,6 @@
 """The registry of pretrained weights: size, licence, source, and which of them are on this machine.
 
-This module imports neither torch nor transformers and downloads nothing; `vision.fetch` downloads.
+This module imports neither torch nor transformers and downloads nothing; `vision.weight_download` downloads.
 """
 
 from __future__ import annotations

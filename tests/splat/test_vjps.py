@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.cpu.render import render_cpu
+from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.base import Effect
@@ -14,7 +14,7 @@ from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.fields import Fields, FieldStart
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.gpu_render import render_cuda
-from ambiguous_wild.splat.parts import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, ShadeGradients
 from tests.tiny_scene import with_points
 
@@ -48,11 +48,11 @@ def shade_of(g, weight):
         with torch.enable_grad():
             colours = leaves[0] * leaves[3] + leaves[1] + 0.3 * torch.sin(leaves[2]) - 0.4
 
-        def pull(d_colours):
+        def vjp(d_colours):
             found = torch.autograd.grad(colours, leaves, d_colours, retain_graph=True)
             return ShadeGradients(found[0], {"tint": found[1]}, found[2], {"tint": {"weight": found[3]}})
 
-        return colours.detach(), pull
+        return colours.detach(), vjp
 
     return shade
 
@@ -68,7 +68,7 @@ class Tint(Effect):
     def rows(self, gaussians):
         return {"tint": GaussianAttribute(0.1 * gaussians.means.sin(), rate=1e-3)}
 
-    def shade(self, gaussians, rows, base, shot):
+    def shade(self, gaussians, rows, base, context):
         return shade_of(gaussians, self.weight)(base, rows)
 
 
@@ -116,10 +116,10 @@ class Beside(Fields):
             )
         }
 
-    def drawn(self, shot):
+    def drawn(self, context):
         return ("other",)
 
-    def compose(self, frames, shot):
+    def compose(self, frames, context):
         a, b = frames["static"], frames["other"]
         return replace(a, image=a.image + b.image), lambda c: {"static": c, "other": Cotangents(c.image)}
 
@@ -211,7 +211,7 @@ def test_shaded_colours_and_their_gradients_are_those_of_the_cpu(fake, degree):
     d = given(cotangents(cam.height, cam.width))
     found, expected = there.backward(d), cpu.backward(d)
     agree(found, expected)
-    assert found.own["tint"]["weight"].any() and found.attributes["tint"].any()
+    assert found.effect_grads["tint"]["weight"].any() and found.attributes["tint"].any()
     assert (found.attributes["tint"] == 0).any(dim=1)[there.visible].any()  # some were clamped at 0
 
 

@@ -2,7 +2,7 @@
 
 A recipe declares what is learnt (`leaves`, `rows`) and how colours follow from it: `forward` over the visible
 Gaussians, `change` over all of them, `tone` over the picture. Adam, the row of a test photo, checkpoints and
-the pulls by autograd are here.
+the vjps by autograd are here.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.rendered import (
     Cotangents,
     Frame,
-    FramePull,
+    FrameVjp,
     Gradients,
-    Pull,
     ShadeGradients,
-    ShadePull,
-    sum_own,
+    ShadeVjp,
+    Vjp,
+    sum_effect_grads,
 )
 from ambiguous_wild.splat.step import TrainData, ViewContext
 
@@ -67,17 +67,17 @@ class Learnt(Effect):
         """Return what is learnt beside the attributes of Gaussians (`Effect.rows`)."""
         return {}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         """Return colours [M, 3] of the visible Gaussians; the renderer clamps them at 0."""
         return visible.base
 
     def change(
-        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], shot: ViewContext
+        self, gaussians: Gaussians, leaf: Mapping[str, Tensor], context: ViewContext
     ) -> Mapping[str, Tensor]:
         """Return by name those raw parameters [N, ...] that are drawn with other values."""
         return {}
 
-    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], shot: ViewContext) -> Tensor:
+    def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         """Return the picture [H, W, 3] as it is compared with the photo."""
         return image
 
@@ -100,15 +100,15 @@ class Learnt(Effect):
             return values.clone()[None]
         return torch.cat([values, torch.zeros_like(values[:1])])
 
-    def _leaf(self, shot: ViewContext) -> dict[str, Tensor]:
+    def _leaf(self, context: ViewContext) -> dict[str, Tensor]:
         """Return copies of the leaves, to differentiate and to read after the optimiser's step."""
-        return {name: self._row(name, shot).detach().clone() for name in self._leaves}
+        return {name: self._row(name, context).detach().clone() for name in self._leaves}
 
-    def _row(self, name: str, shot: ViewContext) -> Tensor:
+    def _row(self, name: str, context: ViewContext) -> Tensor:
         values = self._adam[name].values
         if not self._leaves[name].per_photo:
             return values[0]
-        row = shot.row(self.photos)
+        row = context.row(self.photos)
         return self._unseen(name) if row is None else values[row]
 
     def _unseen(self, name: str) -> Tensor:
@@ -123,18 +123,18 @@ class Learnt(Effect):
             else getattr(type(self), function) is not getattr(Learnt, function)
         )
 
-    def model(self, gaussians: Gaussians, shot: ViewContext) -> tuple[Gaussians, Pull]:
-        leaf = self._leaf(shot)
+    def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
+        leaf = self._leaf(context)
         given = {name: tensor.detach().clone() for name, tensor in gaussians.rows()}
         graph = _Graph(leaf, given)
         with torch.enable_grad():
             attributes = {name: given[name] for name in gaussians.attributes}
             inputs = Gaussians(*(given[name] for name in PARAMETERS), attributes=attributes)
-            changed = dict(self.change(inputs, leaf, shot))
+            changed = dict(self.change(inputs, leaf, context))
 
-        def pull(gradients: Gradients) -> Gradients:
+        def vjp(gradients: Gradients) -> Gradients:
             d = {name: getattr(gradients, name) for name in changed}
-            gradients_of = graph.pull([changed[name] for name in changed], [d[name] for name in changed])
+            gradients_of = graph.vjp([changed[name] for name in changed], [d[name] for name in changed])
             sums: dict[str, Any] = {}
             for name in PARAMETERS:
                 unchanged = None if name in changed else getattr(gradients, name)
@@ -143,24 +143,26 @@ class Learnt(Effect):
                 name: _sum(gradients.attributes.get(name), gradients_of.get(name), given[name])
                 for name in inputs.attributes
             }
-            own = {name: gradients_of[name] for name in leaf if name in gradients_of}
-            return replace(gradients, **sums, attributes=attributes).with_own(self.name, own)
+            effect_grads = {name: gradients_of[name] for name in leaf if name in gradients_of}
+            return replace(gradients, **sums, attributes=attributes).with_effect_grads(
+                self.name, effect_grads
+            )
 
         drawn: dict[str, Any] = {name: value.detach().contiguous() for name, value in changed.items()}
-        return replace(gaussians, **drawn), pull
+        return replace(gaussians, **drawn), vjp
 
     def shade(
-        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, shot: ViewContext
-    ) -> tuple[Tensor, ShadePull]:
-        leaf = self._leaf(shot)
+        self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, context: ViewContext
+    ) -> tuple[Tensor, ShadeVjp]:
+        leaf = self._leaf(context)
         attributes = {name: values[rows].detach() for name, values in gaussians.attributes.items()}
         means, base = gaussians.means[rows].detach(), base.detach()
         graph = _Graph(leaf, {"base": base, "means": means}, attributes)
         with torch.enable_grad():
-            colours = self.forward(Visible(base, means, attributes), leaf, shot)
+            colours = self.forward(Visible(base, means, attributes), leaf, context)
 
-        def pull(d_colours: Tensor) -> ShadeGradients:
-            gradients_of = graph.pull([colours], [d_colours])
+        def vjp(d_colours: Tensor) -> ShadeGradients:
+            gradients_of = graph.vjp([colours], [d_colours])
             through = gradients_of.get("base")
             return ShadeGradients(
                 torch.zeros_like(base) if through is None else through.contiguous(),
@@ -169,37 +171,41 @@ class Learnt(Effect):
                 {self.name: {name: gradients_of[name] for name in leaf if name in gradients_of}},
             )
 
-        return colours.detach(), pull
+        return colours.detach(), vjp
 
-    def image(self, frame: Frame, shot: ViewContext) -> tuple[Frame, FramePull]:
-        leaf, image, alpha = self._leaf(shot), frame.image.detach().clone(), frame.alpha.detach().clone()
+    def image(self, frame: Frame, context: ViewContext) -> tuple[Frame, FrameVjp]:
+        leaf, image, alpha = self._leaf(context), frame.image.detach().clone(), frame.alpha.detach().clone()
         graph = _Graph(leaf, {"image": image, "alpha": alpha})
         with torch.enable_grad():
-            toned = self.tone(image, alpha, leaf, shot)
+            toned = self.tone(image, alpha, leaf, context)
 
-        def pull(c: Cotangents) -> Cotangents:
-            main = {} if c.image is None else graph.pull([toned], [c.image])
-            second = {} if c.extra is None else graph.pull([toned], [c.extra])
+        def vjp(c: Cotangents) -> Cotangents:
+            main = {} if c.image is None else graph.vjp([toned], [c.image])
+            second = {} if c.extra is None else graph.vjp([toned], [c.extra])
             alphas = [a for a in (c.alpha, main.get("alpha"), second.get("alpha")) if a is not None]
-            own = {name: main[name] for name in leaf if name in main}
+            effect_grads = {name: main[name] for name in leaf if name in main}
             return replace(
                 c,
                 image=None if c.image is None else _sum(None, main.get("image"), image),
                 extra=None if c.extra is None else _sum(None, second.get("image"), image),
                 alpha=sum(alphas[1:], alphas[0]).contiguous() if alphas else None,
-                own=sum_own(c.own, {self.name: own}) if own else c.own,
+                effect_grads=sum_effect_grads(c.effect_grads, {self.name: effect_grads})
+                if effect_grads
+                else c.effect_grads,
             )
 
-        return replace(frame, image=toned.detach().contiguous()), pull
+        return replace(frame, image=toned.detach().contiguous()), vjp
 
-    def step(self, own: Mapping[str, Tensor], shot: ViewContext, called_off: Tensor | None = None) -> None:
-        for name, gradient in own.items():
+    def step(
+        self, effect_grads: Mapping[str, Tensor], context: ViewContext, skipped: Tensor | None = None
+    ) -> None:
+        for name, gradient in effect_grads.items():
             leaf = self._leaves[name]
-            row = shot.view if leaf.per_photo else 0
+            row = context.view if leaf.per_photo else 0
             assert row is not None
-            rate = decayed(leaf.rate, leaf.rate * leaf.final, shot.progress)
-            rate = rate if leaf.made_for is None else rate_for_run_length(rate, leaf.made_for, shot)
-            self._adam[name].step(row, gradient, rate, called_off)
+            rate = decayed(leaf.rate, leaf.rate * leaf.final, context.progress)
+            rate = rate if leaf.made_for is None else rate_for_run_length(rate, leaf.made_for, context)
+            self._adam[name].step(row, gradient, rate, skipped)
 
     def begin_fit(self) -> None:
         for name, leaf in self._leaves.items():
@@ -207,8 +213,8 @@ class Learnt(Effect):
                 self._adam[name].reset(self.photos)
                 self._adam[name].values[self.photos] = self._unseen(name)
 
-    def fit(self, own: Mapping[str, Tensor]) -> None:
-        for name, gradient in own.items():
+    def fit(self, effect_grads: Mapping[str, Tensor]) -> None:
+        for name, gradient in effect_grads.items():
             if self._leaves[name].per_photo:
                 self._adam[name].step(self.photos, gradient, self._leaves[name].fit_rate)
 
@@ -231,7 +237,7 @@ _FILLED_BY = {"model": "change", "shade": "forward", "image": "tone"}
 
 
 class _Graph:
-    """The inputs of one forward pass; gradients can be pulled to them more than once."""
+    """The inputs of one forward pass; gradients can be taken to them more than once."""
 
     def __init__(self, *named: dict[str, Tensor]) -> None:
         self.inputs: dict[str, Tensor] = {}
@@ -243,7 +249,7 @@ class _Graph:
                 group[name] = tensor.requires_grad_(self.recorded)
                 self.inputs[name] = group[name]
 
-    def pull(self, outputs: Sequence[Tensor], cotangents: Sequence[Tensor]) -> dict[str, Tensor]:
+    def vjp(self, outputs: Sequence[Tensor], cotangents: Sequence[Tensor]) -> dict[str, Tensor]:
         """Return the gradients, by name, of those inputs that the outputs depend on.
 
         Raises:

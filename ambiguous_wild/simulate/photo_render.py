@@ -23,10 +23,10 @@ from ambiguous_wild.simulate.distractors import DistractorPose, movers
 from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
-from ambiguous_wild.simulate.records import DrawnEffects
 from ambiguous_wild.simulate.shapes import Shape, shape_table
 from ambiguous_wild.simulate.spec import CaptureSpec, Effects
 from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, linear_to_srgb, trace
+from ambiguous_wild.simulate.truth_records import DrawnEffects
 from ambiguous_wild.simulate.world import World
 
 _MAX_INSTANTS = 24  # largest number of instants of an exposure

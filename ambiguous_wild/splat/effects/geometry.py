@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.effects.learnt import Leaf
-from ambiguous_wild.splat.effects.posed import on_device
+from ambiguous_wild.splat.effects.autograd_effect import Leaf
+from ambiguous_wild.splat.effects.device_cameras import on_device
 from ambiguous_wild.splat.gaussians import SH_C0
 
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts, to_plain
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.ablation import (
+from ambiguous_wild.harness.ablation_study import (
     DIFFERENCES,
     METRICS,
     REPORT,
@@ -32,12 +32,12 @@ from ambiguous_wild.harness.ablation import (
 )
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.io.files import atomic_path, write_json, write_text
-from ambiguous_wild.methods.ablation import DEFAULT
+from ambiguous_wild.methods.ablation_groups import DEFAULT
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_plots import label_points, new_figure
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
-from ambiguous_wild.report.table import BLANK, Column, Row, Table, TableCell, ranks
+from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell, ranks
 
 KEYS = tuple(m.key for m in METRICS)
 

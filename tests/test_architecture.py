@@ -169,6 +169,55 @@ def test_no_file_is_too_long() -> None:
     assert too_long == {}
 
 
+def late_constants(path: Path) -> list[int]:
+    """Lines of constants after the third definition that could stand at the top of the file.
+
+    Those made of the file's own functions or classes cannot: tables of functions, instances.
+    """
+    defined: set[str] = set()
+    late = []
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
+            defined.add(node.name)
+            continue
+        if not isinstance(node, ast.Assign | ast.AnnAssign):
+            continue
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        named = [t.id for t in targets if isinstance(t, ast.Name) and t.id.strip("_").isupper()]
+        used = {inner.id for inner in ast.walk(node) if isinstance(inner, ast.Name)}
+        if named and len(defined) >= 3:
+            if used & defined:
+                defined.update(named)
+            else:
+                late.append(node.lineno)
+    return late
+
+
+def test_constants_stand_at_the_top(tmp_path: Path) -> None:
+    late = {str(path.relative_to(ROOT)): lines for path in FILES if (lines := late_constants(path))}
+    assert late == {}
+    text = "def a(): ...\ndef b(): ...\ndef c(): ...\nTABLE = {1: a}\nOTHER = TABLE\nMOST = 5\n"
+    (tmp_path / "module.py").write_text(text)
+    assert late_constants(tmp_path / "module.py") == [6]
+
+
+def repeated(names: list[str]) -> list[str]:
+    return sorted({name for name in names if names.count(name) > 1})
+
+
+def test_names_of_files_and_classes_occur_once() -> None:
+    """So that a reader can search for them."""
+    assert repeated([path.stem for path in FILES if path.stem != "__init__"]) == []
+    bodies = [ast.parse(path.read_text(encoding="utf-8")).body for path in FILES]
+    classes = [node.name for body in bodies for node in body if isinstance(node, ast.ClassDef)]
+    assert repeated([name.lstrip("_") for name in classes]) == []
+
+
+def test_every_package_has_a_folder_of_tests() -> None:
+    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert packages <= {path.name for path in (ROOT / "tests").iterdir()}
+
+
 def test_pycolmap_is_imported_by_the_guard_alone() -> None:
     found = [
         p.relative_to(PACKAGE).as_posix()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
-from ambiguous_wild.builder.placement import ALIKE_DEG, FITS, LEAST_PHOTOS, Placement, centre_of
+from ambiguous_wild.builder.photo_placement import ALIKE_DEG, FITS, LEAST_PHOTOS, Placement, centre_of
 from ambiguous_wild.builder.point_lookup import PointLookup
 
 JOINED_BY = 2  # smallest number of pairs across two parts that must fit; they involve one more photo

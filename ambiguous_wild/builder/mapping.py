@@ -12,7 +12,7 @@ import numpy as np
 from ambiguous_wild.builder.adjustment import pipeline_options, plausible
 from ambiguous_wild.builder.joining import join
 from ambiguous_wild.builder.matched import Matched, connected_photos
-from ambiguous_wild.builder.placement import LEAST_PHOTOS, Placement
+from ambiguous_wild.builder.photo_placement import LEAST_PHOTOS, Placement
 from ambiguous_wild.builder.records import ModelSummary, no_model
 from ambiguous_wild.builder.retrieval import FEW, MOTIONS
 from ambiguous_wild.builder.settings import ENOUGH

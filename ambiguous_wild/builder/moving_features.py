@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import LEAST
-from ambiguous_wild.builder.placement import FITS
+from ambiguous_wild.builder.photo_placement import FITS
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera

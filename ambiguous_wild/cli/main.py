@@ -50,37 +50,6 @@ RENAMED: dict[str, dict[str, str | None]] = {
     "weights get": {"--again": "--overwrite"},
 }
 _NAMES_OR_FOLDERS = {"view", "video"}  # --scene was the name of a scene, and is a folder now
-
-
-def with_new_names(args: Sequence[str]) -> list[str]:
-    """Replace old names of options in the words after `aw`, with a line on stderr for each old name."""
-    length = next((n for n in (2, 1) if " ".join(args[:n]) in RENAMED), 0)
-    command = " ".join(args[:length])
-    names, words = dict(RENAMED.get(command, {})), list(args)
-    if command == "ambiguity-report" and {"keep", "--masks-white=keep"} & {*words}:
-        names["--masks"] = "--keep-masks"
-    renamed, notes = words[:length], dict[str, str]()
-    words = words[length:]
-    while words and words[0] != "--":
-        old, equals, value = words.pop(0).partition("=")
-        following = value or "".join(words[:1])
-        folder = "/" in following or os.path.isdir(following)  # pathlib raises on a long word
-        if old not in names or (command in _NAMES_OR_FOLDERS and old == "--scene" and folder):
-            renamed.append(old + equals + value)
-            continue
-        new = names[old]
-        notes[old] = "not needed any more" if new is GONE else new or "given without a name"
-        if new:
-            renamed.append(new + equals + value)
-        elif new == POSITIONAL and equals:
-            renamed.append(value)
-        elif new is GONE and not equals:
-            del words[:1]
-    for old, new_name in notes.items():
-        click.echo(f"{old} is now {new_name}; the old name works in this version only", err=True)
-    return renamed + words
-
-
 # Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
 # `aw --help` imports no command.
 SECTIONS = {
@@ -138,6 +107,37 @@ SECTIONS = {
     },
 }
 COMMANDS = {name: about for commands in SECTIONS.values() for name, about in commands.items()}
+_LITTLE = "too little memory; close other programs, raise ulimit -v, or use fewer or smaller photos"
+_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def with_new_names(args: Sequence[str]) -> list[str]:
+    """Replace old names of options in the words after `aw`, with a line on stderr for each old name."""
+    length = next((n for n in (2, 1) if " ".join(args[:n]) in RENAMED), 0)
+    command = " ".join(args[:length])
+    names, words = dict(RENAMED.get(command, {})), list(args)
+    if command == "ambiguity-report" and {"keep", "--masks-white=keep"} & {*words}:
+        names["--masks"] = "--keep-masks"
+    renamed, notes = words[:length], dict[str, str]()
+    words = words[length:]
+    while words and words[0] != "--":
+        old, equals, value = words.pop(0).partition("=")
+        following = value or "".join(words[:1])
+        folder = "/" in following or os.path.isdir(following)  # pathlib raises on a long word
+        if old not in names or (command in _NAMES_OR_FOLDERS and old == "--scene" and folder):
+            renamed.append(old + equals + value)
+            continue
+        new = names[old]
+        notes[old] = "not needed any more" if new is GONE else new or "given without a name"
+        if new:
+            renamed.append(new + equals + value)
+        elif new == POSITIONAL and equals:
+            renamed.append(value)
+        elif new is GONE and not equals:
+            del words[:1]
+    for old, new_name in notes.items():
+        click.echo(f"{old} is now {new_name}; the old name works in this version only", err=True)
+    return renamed + words
 
 
 class _LazyGroup(click.Group):
@@ -244,10 +244,6 @@ def main() -> None:
         if isinstance(error, ImportError) and not re.search("allocate memory|failed to map", str(error)):
             raise
         _fail(_LITTLE)
-
-
-_LITTLE = "too little memory; close other programs, raise ulimit -v, or use fewer or smaller photos"
-_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 def _check_threads() -> None:

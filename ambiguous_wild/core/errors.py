@@ -11,6 +11,8 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+_LONGEST = 2000  # characters of a message; ours have fewer than 700
+
 
 def installed(package: str) -> str | None:
     """Return the version of an installed distribution, or None."""
@@ -47,9 +49,6 @@ def torch_command(version: str) -> str:
 
 def _pinned(root: Path) -> str:
     return f" -c '{root / 'constraints.txt'}'" if (root / "constraints.txt").is_file() else ""
-
-
-_LONGEST = 2000  # characters of a message; ours have fewer than 700
 
 
 class AwError(Exception):

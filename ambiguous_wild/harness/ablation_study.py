@@ -31,6 +31,16 @@ from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.pace import TrainConfig
 
+REPORT = "ablation.json"
+# The columns of the tables; keys as in ablation.json.
+METRICS = (
+    *map(measure, ("psnr", "ssim", "lpips_alex")),
+    *(Measure(key, f"mask {label}", "higher", 3) for key, label in MASK_LABELS.items()),
+    *map(measure, ("gaussians", "model_mb", "ms_per_iteration", "setup_s")),
+    Measure("total_s", "total s", "lower", 1, per_image=False, timed=True),
+)
+DIFFERENCES = tuple(m for m in METRICS if m.key in ("psnr", "iou", "ms_per_iteration"))
+
 
 class StudyFacts(TypedDict):
     """Facts in which two studies must agree before one report can hold both."""
@@ -80,9 +90,6 @@ class StudyReport(StudyFacts):
     note: NotRequired[str]  # of the method, about itself
     groups: list[GroupFacts]
     rows: list[VariantRow]
-
-
-REPORT = "ablation.json"
 
 
 @dataclass(frozen=True)
@@ -296,16 +303,6 @@ class VariantResult:
         """The reason why times are not ranked; empty for a run that was alone, or has no result."""
         timing = timing_of(self.result["cost"]) if self.result else None
         return f"{timing.verdict}: {timing.reason}" if timing and timing.verdict != "alone" else ""
-
-
-# The columns of the tables; keys as in ablation.json.
-METRICS = (
-    *map(measure, ("psnr", "ssim", "lpips_alex")),
-    *(Measure(key, f"mask {label}", "higher", 3) for key, label in MASK_LABELS.items()),
-    *map(measure, ("gaussians", "model_mb", "ms_per_iteration", "setup_s")),
-    Measure("total_s", "total s", "lower", 1, per_image=False, timed=True),
-)
-DIFFERENCES = tuple(m for m in METRICS if m.key in ("psnr", "iou", "ms_per_iteration"))
 
 
 def read_outcomes(cells: Sequence[Cell], output: Path) -> list[VariantResult]:

@@ -46,6 +46,17 @@ from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.pace import TrainConfig
 
 PACKAGES = ("numpy", "numba", "torch", "opencv-contrib-python-headless", "scipy", "gsplat", "transformers")
+# Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
+# values that are not finite (the result says so where there were any), where the scene lies.
+IGNORED: dict[str, tuple[str, ...]] = {
+    "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
+    "scene": ("path",),
+    "start": ("path",),
+}
+# Files that record how a scene was made, versions included. Nothing is trained or scored on them: the same
+# photos simulated by a later version are the same scene.
+RECORDS = ("truth/capture.json",)
+MEASURED_WITH = ("truth/clean", "truth/distractor", "masks/test")  # folders that scores and references read
 
 
 def environment(device: str) -> Environment:
@@ -80,18 +91,6 @@ def _cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
-# Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
-# values that are not finite (the result says so where there were any), where the scene lies.
-IGNORED: dict[str, tuple[str, ...]] = {
-    "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
-    "scene": ("path",),
-    "start": ("path",),
-}
-# Files that record how a scene was made, versions included. Nothing is trained or scored on them: the same
-# photos simulated by a later version are the same scene.
-RECORDS = ("truth/capture.json",)
-
-
 def config_identity(config: RunConfig | Mapping[str, Any]) -> str:
     """Return the sha256 of the settings that decide a run's result.
 
@@ -106,9 +105,6 @@ def config_identity(config: RunConfig | Mapping[str, Any]) -> str:
     for part in IGNORED.keys() & settings.keys():
         settings[part] = {k: v for k, v in settings[part].items() if k not in IGNORED[part]}
     return config_hash(settings)
-
-
-MEASURED_WITH = ("truth/clean", "truth/distractor", "masks/test")  # folders that scores and references read
 
 
 def scene_identity(scene: Scene) -> str:

@@ -17,6 +17,10 @@ from ambiguous_wild.splat.effects import check_effects
 if TYPE_CHECKING:
     from ambiguous_wild.harness.effects_plan import EffectsPlan
 
+MIXED = "test photos may hold distractors"  # begins the note on such a scene in results, tables and pages
+WORDS = ("auto", "none", "all")
+NOT_OURS = "an external program takes none"  # why a method trains without the effects that others have
+
 
 def scene_protocol(scene: Scene) -> Literal["full", "half"]:
     """Return which part of a test photo is measured, from scene.json.
@@ -47,9 +51,6 @@ def _evaluation(scene: Scene) -> Mapping[str, object]:
     return section if isinstance(section, dict) else {}
 
 
-MIXED = "test photos may hold distractors"  # begins the note on such a scene in results, tables and pages
-
-
 def mixed_tests(scene: Scene) -> str:
     """Return a note for a scene whose test photos were not chosen as clean; empty for every other scene.
 
@@ -60,10 +61,6 @@ def mixed_tests(scene: Scene) -> str:
         return ""
     every = split.removeprefix("every-")
     return f"{MIXED}: every {every}th photo is a test photo, and everything in it counts as truth"
-
-
-WORDS = ("auto", "none", "all")
-NOT_OURS = "an external program takes none"  # why a method trains without the effects that others have
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,20 @@ RELIT = 0.5  # if more of a photo's points than this share are far from their me
 LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they are all at one place
 LEAST_SPREAD = 0.01  # of the colour range, or of the logarithm: smallest median deviation that is used
 MOST = 20_000  # number of points whose view dependence is fitted; more do not change a median
+SCHEMA = 1
+# Thresholds, set on tracks with and without the injected effect (tests/harness/test_planning.py), on
+# presets and on real captures.
+EXPOSURE = 0.05
+APPEARANCE = 0.043
+# A highlight is not linear in the direction. Its remainder, up to 1.7 times its linear part in the tests,
+# must not be taken for light that differs by place.
+OF_SHINE = 1.7
+SAMPLING = 1.5
+# cameras around an object have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1;
+# for the last a dense start of 30 photos was better
+OUTWARD = 2.0
+# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not
+LEAST_PHOTOS, FEW_PHOTOS = 3, 24
 
 
 @dataclass(frozen=True)
@@ -197,21 +211,6 @@ def _point_of_observation(scene: Scene) -> np.ndarray:
 
 
 Answer = Literal["on", "off", "unknown"]
-SCHEMA = 1
-
-# Thresholds, set on tracks with and without the injected effect (tests/harness/test_planning.py), on
-# presets and on real captures.
-EXPOSURE = 0.05
-APPEARANCE = 0.043
-# A highlight is not linear in the direction. Its remainder, up to 1.7 times its linear part in the tests,
-# must not be taken for light that differs by place.
-OF_SHINE = 1.7
-SAMPLING = 1.5
-# cameras around an object have 0.07 to 0.93, a drone's side by side 1.04, those in the middle of a yard 7.1;
-# for the last a dense start of 30 photos was better
-OUTWARD = 2.0
-# captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not
-LEAST_PHOTOS, FEW_PHOTOS = 3, 24
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,20 @@ LARGE = 0.05  # of a photo: a larger patch is more than one instance
 
 # Limits, as shares of the photos' pixels, set on the presets.
 OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.003, 0.003, 0.05, 0.01
+MOST_PHOTOS = 60  # evenly spaced photos of a pair: 300 iterations visit each five times
+SEED = 0  # of the blocks and of the pair
+LEAST_PHOTOS = 4  # fewer give no useful standard error
+# Without growth masks gain little: static captures -0.02 to +0.01 dB, captures with distractors from 0.05 dB
+LEAST_DB = 0.02
+# Share of unexplained pixels: static captures have 0.0 to 0.9 %, captures with distractors 0.6 % or more.
+CERTAIN = 0.03
+MASK_LINES = ("masks", "masks, local", "masks, global", "entropy density")
+STATIC = "static: leaving out the patches does not improve held-back pixels"
+HELD_BACK = 0.2  # share of a photo's blocks that is left out
+BLOCKS = 8  # number along a photo's longest side
+MEASURED_FROM = 0.5  # share of a probe after which visits measure
+FIXED = DensityConfig(start=1e9, stop=0.0)
+NO_BAR: Bar = functools.partial(tqdm, disable=True)
 
 
 @dataclass(frozen=True)
@@ -207,21 +221,6 @@ def persists(
     return result
 
 
-MOST_PHOTOS = 60  # evenly spaced photos of a pair: 300 iterations visit each five times
-SEED = 0  # of the blocks and of the pair
-LEAST_PHOTOS = 4  # fewer give no useful standard error
-# Without growth masks gain little: static captures -0.02 to +0.01 dB, captures with distractors from 0.05 dB
-LEAST_DB = 0.02
-# Share of unexplained pixels: static captures have 0.0 to 0.9 %, captures with distractors 0.6 % or more.
-CERTAIN = 0.03
-MASK_LINES = ("masks", "masks, local", "masks, global", "entropy density")
-STATIC = "static: leaving out the patches does not improve held-back pixels"
-HELD_BACK = 0.2  # share of a photo's blocks that is left out
-BLOCKS = 8  # number along a photo's longest side
-MEASURED_FROM = 0.5  # share of a probe after which visits measure
-FIXED = DensityConfig(start=1e9, stop=0.0)
-
-
 class HeldBack(MaskPolicy):
     """Leave blocks of every photo out of the loss and measure the render there."""
 
@@ -334,7 +333,6 @@ class Pair:
 
 
 Bar = Callable[..., AbstractContextManager[Any]]
-NO_BAR: Bar = functools.partial(tqdm, disable=True)
 
 
 @dataclass(frozen=True)

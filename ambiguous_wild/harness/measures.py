@@ -27,6 +27,13 @@ if TYPE_CHECKING:
     from ambiguous_wild.core import Scene, View
 
 Better = Literal["higher", "lower", None]  # None: not ranked
+_IMAGE = "ambiguous_wild.metrics.image:"
+_REGION_DB = 1e-2  # larger, because rounding may move a pixel into or out of a region
+MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
+ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
+COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
+# An unknown metric is shown like its family: psnr_distractor like PSNR.
+FAMILIES = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_alex"}
 
 
 @dataclass(frozen=True)
@@ -94,10 +101,6 @@ def _lpips(key: str, label: str) -> Metric:
     return Metric(key, label, "lower", function=function, low=0.0, tolerance=None)
 
 
-_IMAGE = "ambiguous_wild.metrics.image:"
-_REGION_DB = 1e-2  # larger, because rounding may move a pixel into or out of a region
-
-MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 MEASURES: dict[str, Measure] = {
     m.key: m
     for m in (
@@ -129,10 +132,6 @@ MEASURES: dict[str, Measure] = {
         Measure("peak_cuda_mb", "peak CUDA MB", "lower", 0, per_image=False),
     )
 }
-ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
-COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
-# An unknown metric is shown like its family: psnr_distractor like PSNR.
-FAMILIES = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_alex"}
 
 # registered, or known only from the record in a result: then without a function
 own_metrics: dict[str, Metric] = {}

@@ -30,6 +30,17 @@ from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration
 _STAT = Path("/proc/stat")
 _IDLE = (3, 4)  # fields of a line of /proc/stat: idle, waiting for a disk
 _GUEST = (8, 9)  # counted in user and nice already
+# The error of one calibration is a tenth, on a busy machine a fifth, so a run needs about 20 of them.
+# Time between two calibrations: SHARE of the training so far, but from LEAST_S to EVERY_S.
+LEAST_S = 1.0
+SHARE = 1 / 20
+EVERY_S = 15.0
+OTHERS = 0.1  # a run is contended if others use more than this share of the processors that it needs
+VARIED = 1.3  # or if the machine is this many times slower in one part of the training than in another
+LEAST_GAIN = 0.15  # extra processors that several threads must get, to be distinguished from one thread
+PARTS = 5  # parts of the training that are compared
+PART_SAMPLES = 4  # fewest calibrations of a part
+COVERED = 0.9  # share of the training that must lie between the first and the last calibration
 
 
 def busy_s() -> float | None:
@@ -130,19 +141,6 @@ def _own_folder() -> Path:
     except (OSError, KeyError, ImportError):
         user = "user"
     return Path(tempfile.gettempdir()) / f"ambiguous_wild-runs-{user}"
-
-
-# The error of one calibration is a tenth, on a busy machine a fifth, so a run needs about 20 of them.
-# Time between two calibrations: SHARE of the training so far, but from LEAST_S to EVERY_S.
-LEAST_S = 1.0
-SHARE = 1 / 20
-EVERY_S = 15.0
-OTHERS = 0.1  # a run is contended if others use more than this share of the processors that it needs
-VARIED = 1.3  # or if the machine is this many times slower in one part of the training than in another
-LEAST_GAIN = 0.15  # extra processors that several threads must get, to be distinguished from one thread
-PARTS = 5  # parts of the training that are compared
-PART_SAMPLES = 4  # fewest calibrations of a part
-COVERED = 0.9  # share of the training that must lie between the first and the last calibration
 
 
 class Meter:

@@ -29,6 +29,7 @@ VIEWS = 3
 CELL = 240  # px, width of a picture in a row
 WORST = 0.5  # error that is drawn red: mean over channels of |photo - render|
 ROWS = ".moments"  # folder of finished rows while the run trains; hidden, because it is no result
+SHOWN = 20_000  # most points of a kind in a picture
 
 
 class Recorder:
@@ -115,9 +116,6 @@ def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
     written += draw_density(trainer, pictures / "density.png")
     written += sheets.write_contact(trainer.data.scene, folder / "masks", pictures / "masks.jpg")
     return written
-
-
-SHOWN = 20_000  # most points of a kind in a picture
 
 
 def draw_density(trainer: Trainer, path: Path) -> list[Path]:

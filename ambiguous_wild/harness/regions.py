@@ -36,6 +36,8 @@ SUPPORTED_FROM = 3  # number of train views that show it
 MOST_VIEWS = 64  # number of train views compared with a test view where there are no exact masks
 
 Visibility = tuple[np.ndarray, np.ndarray]
+VALID, COVERED, UNCOVERED = "psnr_valid", "psnr_covered", "psnr_uncovered"
+SUPPORTED = "psnr_supported"
 
 
 def train_visibility(scene: Scene, masks: Sequence[np.ndarray | None]) -> dict[str, Visibility] | str:
@@ -118,10 +120,6 @@ def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray, where: np.ndarra
     column = np.where(where, np.clip(np.rint(x), 0, picture.shape[1] - 1), 0).astype(np.intp)
     row = np.where(where, np.clip(np.rint(y), 0, picture.shape[0] - 1), 0).astype(np.intp)
     return picture[row, column]
-
-
-VALID, COVERED, UNCOVERED = "psnr_valid", "psnr_covered", "psnr_uncovered"
-SUPPORTED = "psnr_supported"
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,10 @@ Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
 Options = dict[str, Any]  # plain values of a method's options: every method has its own keys
 RunFacts = dict[str, Any]  # of a run; beside the keys of `Cell.result`, methods and effects add their own
+SCHEMA = 1
+RESULT = "metrics.json"
+FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
+MODEL = "point_cloud.ply"
 
 
 def metrics_of(row: ImageRow) -> dict[str, float | None]:
@@ -201,11 +205,6 @@ class RunConfig(UnusualConfig):
     config_hash: NotRequired[str]  # added when it is written
 
 
-SCHEMA = 1
-RESULT = "metrics.json"
-FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
-
-
 def write_result(path: Path | str, result: Mapping[str, object]) -> None:
     """Check a result and write it atomically.
 
@@ -240,9 +239,6 @@ def read_result(path: Path | str) -> RunResult:
     except (OSError, ValueError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error}); run 'aw bench' again to replace it") from None
     return _checked(data, str(path))
-
-
-MODEL = "point_cloud.ply"
 
 
 def model_hash(run: Path) -> dict[str, str]:

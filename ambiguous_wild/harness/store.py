@@ -41,6 +41,9 @@ TEXT_OF_RUNS = (
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
 ReadConfig = dict[str, Any]
+ROUNDING = 1e-9  # by which a share computed in floats may leave its range
+# settings of training that are compared on their own, or decide nothing
+BOOKKEEPING = ("seed", "iterations", "budget_s", "checkpoint_every_s", "probes", "on_nonfinite")
 
 
 @dataclass(frozen=True)
@@ -130,9 +133,6 @@ def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FolderResult]
         raise _no_run(root)
     _refuse_duplicates(results)
     return results
-
-
-ROUNDING = 1e-9  # by which a share computed in floats may leave its range
 
 
 def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
@@ -316,10 +316,6 @@ def _length(config: ReadConfig) -> str:
     if settings.get("budget_s") is not None:
         return f"{settings['budget_s']:g} s"
     return f"{settings['iterations']} iterations" if "iterations" in settings else ""
-
-
-# settings of training that are compared on their own, or decide nothing
-BOOKKEEPING = ("seed", "iterations", "budget_s", "checkpoint_every_s", "probes", "on_nonfinite")
 
 
 def _training(config: ReadConfig) -> str:

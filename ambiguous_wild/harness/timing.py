@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 Verdict = Literal["alone", "contended", "unknown"]
 VERDICTS: tuple[Verdict, ...] = ("alone", "contended", "unknown")
 UNTIMED = "its time was not calibrated (an earlier version, several GPUs, or an external program)"
+# ms of a step of 3dgs on the reference machine (splat/calibration.py): a constant, a part for every 1000 px
+# and one for every 1000 Gaussians. Fitted to captures of 240x134 to 480x268 px with 32 000 to 102 000
+# Gaussians, whose times were LEAST to MOST times what the formula gives.
+STEP_MS, PIXELS_MS, GAUSSIANS_MS = 2.2, 0.09, 0.22
+LEAST, MOST = 0.67, 1.5
 
 
 @dataclass(frozen=True)
@@ -83,13 +88,6 @@ def in_reference_seconds(
     inside = np.interp(times, begin, at_samples)
     early, late = np.minimum(times - begin[0], 0.0) * speed[0], np.maximum(times - begin[-1], 0.0) * speed[-1]
     return inside + early + late
-
-
-# ms of a step of 3dgs on the reference machine (splat/calibration.py): a constant, a part for every 1000 px
-# and one for every 1000 Gaussians. Fitted to captures of 240x134 to 480x268 px with 32 000 to 102 000
-# Gaussians, whose times were LEAST to MOST times what the formula gives.
-STEP_MS, PIXELS_MS, GAUSSIANS_MS = 2.2, 0.09, 0.22
-LEAST, MOST = 0.67, 1.5
 
 
 def expected_s(iterations: int, pixels: int, gaussians: int) -> float:

@@ -40,6 +40,12 @@ from ambiguous_wild.splat.trainer import Trainer
 LOG = logging.getLogger(__name__)
 _PROC = Path("/proc/self")
 _NO_MEMORY = ("CUDA out of memory", "CUDA error: out of memory")
+_SUMS = ("train_s", "cpu_s", "reference_s", "setup_s", "iterations")
+_WORST_FIRST = ("contended", "unknown", "alone")
+_PEAKS = ("peak_rss_mb", "peak_cuda_mb")
+FOLDER = "first-pass"  # in the run folder; holds a checkpoint while it trains, then masks/ and cost.json
+COST, MASKS = "cost.json", "masks"
+STOPPED = "stopped"  # folder with the model as it was when Ctrl-C came; removed when the run ends
 
 
 def reset_peak(device: str = "cpu") -> None:
@@ -106,11 +112,6 @@ def out_of_gpu_memory(error: BaseException, gaussians: int | None, factor: int |
     )
 
 
-_SUMS = ("train_s", "cpu_s", "reference_s", "setup_s", "iterations")
-_WORST_FIRST = ("contended", "unknown", "alone")
-_PEAKS = ("peak_rss_mb", "peak_cuda_mb")
-
-
 def cost_of(cell: Cell, trainer: Trainer) -> Cost:
     """Return the cost of the training that a trainer has done so far."""
     import numba
@@ -166,8 +167,6 @@ def _both_timings(first: TimeRecord, second: TimeRecord, first_s: float) -> Time
     return both
 
 
-FOLDER = "first-pass"  # in the run folder; holds a checkpoint while it trains, then masks/ and cost.json
-COST, MASKS = "cost.json", "masks"
 Tick = Callable[[Any], None]  # gets the `Trainer` after every iteration, with its clock stopped
 
 
@@ -235,9 +234,6 @@ def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | Non
 
     evaluate.write_keeps(cell.scene, keeps(), place / MASKS)
     write_json(place / COST, cost)  # written last: this file marks the pass as finished
-
-
-STOPPED = "stopped"  # folder with the model as it was when Ctrl-C came; removed when the run ends
 
 
 def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None) -> RunResult:

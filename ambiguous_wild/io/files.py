@@ -31,6 +31,8 @@ from ambiguous_wild.core.errors import AwError
 
 # Time to try again, for the case that the holder unlinked the file between our open and our lock.
 _TRY_S, _AGAIN_S = 0.05, 0.005
+# names of `atomic_path` and `atomic_dir` while they write
+_TEMPORARY = re.compile(r"\..+\.(\d+-[a-z0-9_]{8}\.tmp(\..*)?|(tmp|old)-[a-z0-9_]{8})", re.DOTALL)
 
 
 class Busy(AwError):
@@ -273,10 +275,6 @@ def refuse_file(path: Path | str) -> None:
     """Raise AwError if `path`, a folder to be made, is a file."""
     if os.path.exists(path) and not os.path.isdir(path):
         raise AwError(f"cannot make the folder {path}: a file lies there; move it, or choose another -o")
-
-
-# names of `atomic_path` and `atomic_dir` while they write
-_TEMPORARY = re.compile(r"\..+\.(\d+-[a-z0-9_]{8}\.tmp(\..*)?|(tmp|old)-[a-z0-9_]{8})", re.DOTALL)
 
 
 def sweep(folder: Path | str) -> None:

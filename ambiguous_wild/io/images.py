@@ -19,6 +19,7 @@ from ambiguous_wild.io.files import atomic_path
 # Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
 MAX_PIXELS = 120_000_000
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
+_SLACK = {"JPEG": 8}  # tolerance of black and white; 2 in lossless formats
 
 
 def read_png_rgb(
@@ -133,9 +134,6 @@ def read_mask(
             "write 255 where the photo is kept and 0 elsewhere, or leave the masks out"
         )
     return shown
-
-
-_SLACK = {"JPEG": 8}  # tolerance of black and white; 2 in lossless formats
 
 
 def _black_and_white(grey: np.ndarray, slack: int) -> np.ndarray | None:

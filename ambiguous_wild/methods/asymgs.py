@@ -41,6 +41,8 @@ from ambiguous_wild.vision.backends import make_features, make_instances
 from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
 
+TWIN = "twin"
+
 
 class SlowAverage(Effect):
     """Updates p_slow = keep p_slow + (1 - keep) p of the raw parameters after every step."""
@@ -172,9 +174,6 @@ class AsymMask(MaskPolicy):
     def load_state_dict(self, state: State) -> None:
         for view, soft in enumerate(self.soft):
             soft.load_state_dict(state[str(view)])
-
-
-TWIN = "twin"
 
 
 @dataclass(frozen=True)

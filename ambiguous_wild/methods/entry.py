@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from ambiguous_wild.methods.external_process import Program
     from ambiguous_wild.splat.method_hooks import MethodHooks
 
+SUFFIX = "+2passes"
+
 
 @dataclass(frozen=True)
 class MethodEntry:
@@ -168,9 +170,6 @@ def resolve(target: Any) -> Any:
         return target
     module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
-
-
-SUFFIX = "+2passes"
 
 
 def second_pass_name(name: str, passes: int) -> str:

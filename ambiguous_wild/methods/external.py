@@ -41,6 +41,15 @@ from ambiguous_wild.methods.external_process import (
 )
 
 _FORMATTER = string.Formatter()
+COMMANDS = ("train", "render", "resume")
+BEGUN = "begun.json"  # in the program's folder: the command that was started, which `resume` must match
+RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", "factor", "device")
+VIEW = ("stem", "name", "index")
+_WITHOUT_INFLUENCE = ("summary", "paper", "needs", "timeout_h")  # keys that do not change the result
+_ADDED = {"photos": "all", "drawn_by": "program"}  # keys of later versions, with their defaults
+_CODE = (".py", ".sh", ".yaml", ".yml", ".toml", ".json")  # other files may be logs, weights or builds
+LISTS = ("train_names", "test_names", "train_stems", "test_stems")
+PACKAGED = Path(__file__).parent / "descriptions"
 
 
 def placeholders(template: str, where: str) -> set[str]:
@@ -84,10 +93,6 @@ def fill_pattern(template: str, values: Mapping[str, object]) -> str:
     """Fill in a glob pattern: wildcards of the template work, those in values are plain text."""
     escaped = {k: glob.escape(v) if isinstance(v, str) else v for k, v in values.items()}
     return fill(template, escaped)
-
-
-COMMANDS = ("train", "render", "resume")
-BEGUN = "begun.json"  # in the program's folder: the command that was started, which `resume` must match
 
 
 @dataclass(frozen=True)
@@ -296,14 +301,6 @@ def _revision(folder: Path) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", "factor", "device")
-VIEW = ("stem", "name", "index")
-_WITHOUT_INFLUENCE = ("summary", "paper", "needs", "timeout_h")  # keys that do not change the result
-_ADDED = {"photos": "all", "drawn_by": "program"}  # keys of later versions, with their defaults
-_CODE = (".py", ".sh", ".yaml", ".yml", ".toml", ".json")  # other files may be logs, weights or builds
-LISTS = ("train_names", "test_names", "train_stems", "test_stems")
-
-
 @dataclass(frozen=True)
 class Description:
     """The keys of the file. Commands are lists, or text split as a shell splits it; no shell runs them."""
@@ -327,9 +324,6 @@ class Description:
     photos: Photos = "all"  # what {scene} holds: "all", "train" alone, or as "nerf-w"
     drawn_by: Literal["program", "us"] = "program"  # "us": our renderer draws the test views from `ply`
     timeout_h: float = 0.0  # limit of each command; 0 = none
-
-
-PACKAGED = Path(__file__).parent / "descriptions"
 
 
 def packaged(name: str) -> Path:

@@ -32,6 +32,12 @@ from ambiguous_wild.io.images import image_size
 Photos = Literal["all", "train", "nerf-w"]
 
 _LEFT_OUT = {"truth", "scene.json"}
+WORK, LOGS = "external", "logs"  # folders of a run for the program's output and for its logs
+DONE = "done.json"  # in WORK: the finished commands, and their seconds
+GRACE_S = 10.0  # seconds between SIGTERM and SIGKILL
+_RECORD = ".running.json"  # record of a running command, beside its log
+_TAIL_BYTES, _TAIL_LINES = 8192, 4
+_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
 
 def stage(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photos = "all") -> Path:
@@ -127,10 +133,6 @@ def split_lists(scene: Scene) -> dict[str, str]:
     return out | {f"{side}_stems": "".join(f"{s}\n" for s in names) for side, names in stems.items()}
 
 
-WORK, LOGS = "external", "logs"  # folders of a run for the program's output and for its logs
-DONE = "done.json"  # in WORK: the finished commands, and their seconds
-
-
 @dataclass(frozen=True)
 class Task:
     """One run of a program."""
@@ -181,12 +183,6 @@ class Program(Protocol):
 def no_parts(options: Any) -> NoReturn:
     """Raise AwError: the recipe of an external method, which has no parts."""
     raise AwError("an external method is a program of its own: it has no parts that fit into another method")
-
-
-GRACE_S = 10.0  # seconds between SIGTERM and SIGKILL
-_RECORD = ".running.json"  # record of a running command, beside its log
-_TAIL_BYTES, _TAIL_LINES = 8192, 4
-_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
 
 def run_logged(

@@ -39,6 +39,7 @@ from ambiguous_wild.splat.rendered import Cotangents, Frame, Vjp
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 OCTAVES, LAYERS, SKIP = 10, 8, 4
+TRANSIENT = "transient"
 
 
 @dataclass(frozen=True)
@@ -148,9 +149,6 @@ def fill(mask: Tensor, segments: Tensor, count: int, share: float) -> Tensor:
     most = torch.zeros(count, device=mask.device).scatter_reduce(0, flat, mask.reshape(-1), "amax")
     whole = label_means(mask, segments, count) >= share
     return torch.where(whole[segments], most[segments], mask)
-
-
-TRANSIENT = "transient"
 
 
 def build(options: ForestSplatsConfig) -> MethodHooks:

@@ -45,6 +45,9 @@ from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
 CHANNELS, FREE = 16, 2  # channels of a map; number of maps that are sampled at learnt places
 DYNAMIC = (FREE + 1) * CHANNELS
+INTRINSIC, OCTAVES = 48, 10  # intrinsic features of a Gaussian; octaves of the code of positions
+LENGTH = 70_000  # iterations of the release's commands
+MOST = 64  # number of train photos whose maps are averaged for a camera without a photo
 
 
 def unet_leaves(width: int, rng: np.random.Generator, rate: float) -> dict[str, Leaf]:
@@ -97,11 +100,6 @@ def sample(maps: Tensor, at: Tensor) -> Tensor:
     """Sample a map [C, h, w] at (x, y) [M, 2] in [-1, 1]^2, bilinear, with border values outside, [M, C]."""
     samples = F.grid_sample(maps[None], at[None, None], padding_mode="border", align_corners=False)
     return samples[0, :, 0].T
-
-
-INTRINSIC, OCTAVES = 48, 10  # intrinsic features of a Gaussian; octaves of the code of positions
-LENGTH = 70_000  # iterations of the release's commands
-MOST = 64  # number of train photos whose maps are averaged for a camera without a photo
 
 
 @dataclass(frozen=True)

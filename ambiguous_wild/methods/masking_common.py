@@ -20,6 +20,8 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.method_hooks import MaskPolicy
 from ambiguous_wild.splat.step import Step, TrainData
 
+_WORD = 1 << 32
+
 
 def cosine_target(cosine: Tensor) -> Tensor:
     """Return T_cos = 1 - clip(1 - (c - 0.5) / 0.5, 0, 1): 1 where photo and render agree, 0 below 0.5."""
@@ -99,9 +101,6 @@ def keep_of(mask: Tensor, threshold: float, erosion: int) -> Tensor:
     """Return [M > threshold] with the static region eroded by a min-pool of side `erosion`."""
     kept = (mask > threshold).float()
     return -F.max_pool2d(-kept[None, None], erosion, stride=1, padding=erosion // 2)[0, 0]
-
-
-_WORD = 1 << 32
 
 
 class WarmUp(Protocol):

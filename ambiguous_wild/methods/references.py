@@ -26,6 +26,8 @@ from ambiguous_wild.methods.entry import MethodEntry, required
 _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
 _helpers: dict[str, Path] = {}  # files of modules that loaded files imported from beside them, by name
 _NO_HELPERS = (Path(os.__file__).resolve().parent, Path(__file__).resolve().parents[1])  # Python's and ours
+EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
+_RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
 
 def import_file(path: Path) -> tuple[ModuleType, str]:
@@ -85,10 +87,6 @@ def place_of(error: BaseException) -> str:
     """Return the last place of an error in a loaded file, such as " (my_method.py, line 7)"; else ""."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _loaded]
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-
-
-EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
-_RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
 
 def is_reference(name: str) -> bool:

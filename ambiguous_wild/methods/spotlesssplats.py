@@ -44,6 +44,9 @@ from ambiguous_wild.vision.backends import check_features, make_features
 from ambiguous_wild.vision.precompute import photo_features
 from ambiguous_wild.vision.segments import ward_clusters
 
+OCTAVES = 20
+CELLS, BINS = 50, 10_000  # cells on the longer side of the clusters' grid; bins of the histogram
+
 
 @dataclass(frozen=True)
 class SpotLessDensityConfig(DensityConfig):
@@ -109,9 +112,6 @@ class PruningDensity(SpotLessDensity):
         return self.keep_rows(gaussians, optimiser, ~drop)
 
 
-OCTAVES = 20
-
-
 class PlacedNet(MaskNet):
     """The net of RobustSplat that also gets the position of the pixel."""
 
@@ -140,9 +140,6 @@ def placed(size: int, like: Tensor) -> Tensor:
     at = torch.arange(size, device=like.device, dtype=torch.float64) / max(size - 1, 1)
     angles = torch.pi * torch.stack([2.0**k * at for k in range(OCTAVES)], dim=1)
     return torch.cat([angles.sin(), angles.cos()], dim=1).to(like)
-
-
-CELLS, BINS = 50, 10_000  # cells on the longer side of the clusters' grid; bins of the histogram
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData, ViewContext
 PARTS = 8  # parallel parts of the positions
 PRIMES = (1, 2_654_435_761, 805_459_861)  # as in Instant-NGP
 _SECOND, _THIRD = np.uint64(PRIMES[1]), np.uint64(PRIMES[2])
+PHOTO = 24
+CLOSED, LEAST = -20.0, 1e-7  # logit of Gaussians that are left out; least opacity under a gate
 
 
 @kernel
@@ -137,10 +139,6 @@ class _Encoding(torch.autograd.Function):
         d_grid = torch.zeros(ctx.size)
         look_up_backward(unit.numpy(), cells.numpy(), d_code[0].contiguous().numpy(), d_grid.numpy())
         return None, d_grid, None
-
-
-PHOTO = 24
-CLOSED, LEAST = -20.0, 1e-7  # logit of Gaussians that are left out; least opacity under a gate
 
 
 @dataclass(frozen=True)

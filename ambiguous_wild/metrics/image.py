@@ -16,6 +16,25 @@ from ambiguous_wild.core import AwError
 WINDOW = 11  # px, Wang et al. 2004
 SIGMA = 1.5  # px
 C1, C2 = 0.01**2, 0.03**2  # for a data range of 1
+RANK = 1e-12  # share of the largest eigenvalue below which a channel copies others, as in grey pictures
+# The paper's default: a screen of 0.7 m and 3840 px, seen from 0.7 m: 67.02.
+PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
+# Contrast sensitivity per channel: Gaussians (amplitude, width in degrees^2), table 1.
+_CSF = {
+    "achromatic": ((1.0, 0.0047),),
+    "red-green": ((1.0, 0.0053),),
+    "blue-yellow": ((34.1, 0.04), (13.5, 0.025)),
+}
+_COLOUR_EXPONENT = 0.7  # q_c
+_KNEE, _KNEE_ERROR = 0.4, 0.95  # p_c, p_t: share of the largest colour error, and the value it maps to
+_FEATURE_DEGREES = 0.082  # w, edge width of highest visibility
+_FEATURE_EXPONENT = 0.5  # q_f
+# CIE xy of sRGB's primaries and of its white point D65.
+_PRIMARIES = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
+_WHITE = (0.3127, 0.3290)
+# YCxCz, the opponent space of the contrast sensitivity functions: rows act on XYZ / white.
+_YCC_FROM_XYZ = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
+_YCC_OFFSET = np.array([-16.0, 0.0, 0.0])
 
 
 def checked_pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,9 +163,6 @@ def _as_float(image: np.ndarray, which: str) -> np.ndarray:
     return values
 
 
-RANK = 1e-12  # share of the largest eigenvalue below which a channel copies others, as in grey pictures
-
-
 def psnr_affine(
     render: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1]
     photo: np.ndarray,  # [H, W, 3] uint8 or float in [0, 1]
@@ -168,25 +184,6 @@ def psnr_affine(
     matrix = np.linalg.lstsq(x.T @ x, x.T @ (y - y_mean), rcond=RANK)[0]
     fitted = np.clip(x @ matrix + y_mean, 0.0, 1.0)
     return psnr_from_mse(min(plain, float(np.mean((fitted - y) ** 2))))
-
-
-# The paper's default: a screen of 0.7 m and 3840 px, seen from 0.7 m: 67.02.
-PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
-
-# Contrast sensitivity per channel: Gaussians (amplitude, width in degrees^2), table 1.
-_CSF = {
-    "achromatic": ((1.0, 0.0047),),
-    "red-green": ((1.0, 0.0053),),
-    "blue-yellow": ((34.1, 0.04), (13.5, 0.025)),
-}
-_COLOUR_EXPONENT = 0.7  # q_c
-_KNEE, _KNEE_ERROR = 0.4, 0.95  # p_c, p_t: share of the largest colour error, and the value it maps to
-_FEATURE_DEGREES = 0.082  # w, edge width of highest visibility
-_FEATURE_EXPONENT = 0.5  # q_f
-
-# CIE xy of sRGB's primaries and of its white point D65.
-_PRIMARIES = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
-_WHITE = (0.3127, 0.3290)
 
 
 def flip(
@@ -230,9 +227,6 @@ def _xyz_from_rgb() -> np.ndarray:
 
 _XYZ_FROM_RGB = _xyz_from_rgb()
 _XYZ_WHITE = _XYZ_FROM_RGB.sum(axis=1)
-# YCxCz, the opponent space of the contrast sensitivity functions: rows act on XYZ / white.
-_YCC_FROM_XYZ = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
-_YCC_OFFSET = np.array([-16.0, 0.0, 0.0])
 _YCC_FROM_RGB = _YCC_FROM_XYZ @ (_XYZ_FROM_RGB / _XYZ_WHITE[:, None])
 
 

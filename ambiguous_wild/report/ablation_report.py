@@ -40,6 +40,7 @@ from ambiguous_wild.report.plain_formats import to_csv, to_markdown
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell, ranks
 
 KEYS = tuple(m.key for m in METRICS)
+SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "model_mb")
 
 
 def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
@@ -205,9 +206,6 @@ def _panel(axes: Any, group: GroupFacts, points: list[tuple[str, float, float, f
     axes.set_title(f"{group['name']}: {group['title']}", fontsize=8)
     axes.set_xlabel("ms per iteration", fontsize=8)
     axes.set_ylabel("PSNR (dB)", fontsize=8)
-
-
-SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "model_mb")
 
 
 def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:

@@ -24,6 +24,10 @@ from ambiguous_wild.vision.motion_maps import MOVES, moving_map
 KINDS = ("colour", "structure", "features", "motion")
 REVEALED_FROM = 0.5  # share of a distractor's pixels at which a kind of evidence reveals it
 CORRELATED = 0.5  # correlation with the background below which the structure at a pixel differs
+BINS = np.linspace(0.0, math.sqrt(3.0), 53)  # edges of the residual's histogram
+# longer side of the photos for labhog, which has cells of 4 px: scores must not depend on the photos' size
+LOOKS_PX = 240
+FIT_PHOTOS = 24  # number of evenly spaced photos that features are fitted to
 
 
 @dataclass(frozen=True)
@@ -100,10 +104,6 @@ def _most(yes: np.ndarray | None, at: np.ndarray, sure: np.ndarray | None) -> bo
     return bool(yes[where].mean() >= REVEALED_FROM) if where.any() else None
 
 
-BINS = np.linspace(0.0, math.sqrt(3.0), 53)  # edges of the residual's histogram
-# longer side of the photos for labhog, which has cells of 4 px: scores must not depend on the photos' size
-LOOKS_PX = 240
-FIT_PHOTOS = 24  # number of evenly spaced photos that features are fitted to
 Bar = Callable[[list[View]], Iterable[View]]
 
 

@@ -43,6 +43,39 @@ from ambiguous_wild.report.typeset import html_table
 
 PHOTOS = 4
 SIDE = 480  # px a picture in the figure at most
+FILES = ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv")
+SHOWN = 8  # photos with maps on the page
+WIDTH = 420  # px of a picture on the page
+_STYLE = """
+:root{--back:#fff;--text:#222;--line:#ddd}
+@media(prefers-color-scheme:dark){:root{--back:#14181b;--text:#e6e9eb;--line:#343c42}}
+body{font:16px/1.45 system-ui,sans-serif;max-width:90em;margin:1.5em auto;padding:0 1em}
+body{background:var(--back);color:var(--text)}figure{margin:0}figcaption{font-size:13px;opacity:.8}
+img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
+td,th{padding:3px 9px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
+th:first-child{text-align:left;font-weight:normal}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
+.row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
+.row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
+.bar{height:.9em;max-width:24rem;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
+.ends{display:flex;justify-content:space-between;max-width:24rem;font-size:13px}
+"""
+_CLASSES = {
+    "both": "ambiguous in colour and semantically",
+    "colour": "ambiguous in colour",
+    "semantic": "semantically ambiguous",
+    "neither": "neither ambiguous in colour nor semantically",
+    NO_DISTRACTORS: "no distractors",
+}
+_HEADS = {
+    "photo": "photo",
+    "occlusion": "covered",
+    am.COLOUR_METRIC: "colour: close share",
+    "mean_residual": "mean residual",
+    "distractor_px": "distractor px",
+    "unknown_px": "unknown px",
+    "regions": "distractors",
+    "told_by": "each revealed by",
+}
 
 
 def chosen(measured: list[PhotoMeasures], most: int = PHOTOS) -> list[int]:
@@ -183,11 +216,6 @@ def _histograms(figure: Any, grid: Any, measured: list[PhotoMeasures], seen: Map
         axes.tick_params(labelsize=8)
 
 
-FILES = ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv")
-SHOWN = 8  # photos with maps on the page
-WIDTH = 420  # px of a picture on the page
-
-
 def check_folder(folder: Path) -> None:
     """Raise AwError if the path is a file, or a folder with other files than a report."""
     refuse_file(folder)
@@ -234,38 +262,6 @@ def _pictures(
         images = zip(captions, ((255 * photo + 0.5).astype(np.uint8), *maps))
         jpegs = [(caption, jpeg_bytes(narrowed(i, WIDTH), 85)) for caption, i in images if i is not None]
         yield scene.train[index].name, jpegs
-
-
-_STYLE = """
-:root{--back:#fff;--text:#222;--line:#ddd}
-@media(prefers-color-scheme:dark){:root{--back:#14181b;--text:#e6e9eb;--line:#343c42}}
-body{font:16px/1.45 system-ui,sans-serif;max-width:90em;margin:1.5em auto;padding:0 1em}
-body{background:var(--back);color:var(--text)}figure{margin:0}figcaption{font-size:13px;opacity:.8}
-img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
-td,th{padding:3px 9px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
-th:first-child{text-align:left;font-weight:normal}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
-.row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
-.row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
-.bar{height:.9em;max-width:24rem;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
-.ends{display:flex;justify-content:space-between;max-width:24rem;font-size:13px}
-"""
-_CLASSES = {
-    "both": "ambiguous in colour and semantically",
-    "colour": "ambiguous in colour",
-    "semantic": "semantically ambiguous",
-    "neither": "neither ambiguous in colour nor semantically",
-    NO_DISTRACTORS: "no distractors",
-}
-_HEADS = {
-    "photo": "photo",
-    "occlusion": "covered",
-    am.COLOUR_METRIC: "colour: close share",
-    "mean_residual": "mean residual",
-    "distractor_px": "distractor px",
-    "unknown_px": "unknown px",
-    "regions": "distractors",
-    "told_by": "each revealed by",
-}
 
 
 def page(

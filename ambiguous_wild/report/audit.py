@@ -26,6 +26,7 @@ from ambiguous_wild.report.plain_formats import markdown_text, to_csv
 LOWER = ("lpips", "flip", "memory", "gpu_hours", "train_s", "ms", "model_mb", "peak", "gaussians")
 HIGHER = ("psnr", "ssim", "fps", "mask_", "iou")
 UNITLESS = ("memory", "time", "size")  # metrics that need a unit and a definition
+FULL = 12  # digits of a number that was never rounded, whose last ones may be zeros
 
 
 def contradictions(numbers: list[PrintedNumber]) -> list[AuditFinding]:
@@ -169,9 +170,6 @@ def digits(numbers: list[PrintedNumber]) -> list[AuditFinding]:
         if n.metric.startswith(("psnr", "ssim", "lpips")):
             columns[n.table, n.metric].append(n)
     return [f for column in columns.values() for f in _odd_digits(column)]
-
-
-FULL = 12  # digits of a number that was never rounded, whose last ones may be zeros
 
 
 def _odd_digits(column: list[PrintedNumber]) -> Iterator[AuditFinding]:

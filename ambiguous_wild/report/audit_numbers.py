@@ -27,6 +27,29 @@ UNKNOWN = "unknown"
 MEAN, ALL = "mean", "all"  # in place of a scene: the mean over scenes; in place of a dataset: over datasets
 LARGEST = 50_000_000  # bytes
 REPORTED = Path(__file__).parent / "reported"  # the RefineSplat paper's tables, see docs/tables.md
+# kind -> its meaning, in the order of the report
+KINDS = {
+    "repeated": "different results with equal digits",
+    "contradiction": "another number for the same result in another place",
+    "swapped": "numbers or columns that look exchanged",
+    "mean": "a mean that differs from the mean of its parts",
+    "out of place": "a number outside the range of its metric or of its neighbours",
+    "rank": "a marked rank that contradicts the numbers",
+    "digits": "another number of digits than in the rest of the column",
+    "unit": "the unit, or what was counted, is not given",
+}
+SIZE = "model_mb"  # follows from the number of Gaussians, which many runs let grow to the same limit
+NEAR, CLOSE = 25, 5  # units of the last digit; CLOSE is for numbers that lie in clusters
+ODDS = 0.005  # largest probability of a coincidence, over all comparisons, at which something is reported
+# metric family -> smallest and largest value; LPIPS has no upper limit, but no right value was above 1.5
+LIMITS = {"psnr": (2.0, 100.0), "ssim": (-1.0, 1.0), "lpips": (0.0, 1.5)}
+MARGIN = 0.5  # of the others' range: a value within this distance is not unusual
+OTHERS = 4  # other methods that a scene needs, before one is compared with them
+CLEARLY = 3.0  # an exchange must bring values this many times nearer to the others
+FAR = 8.0  # robust deviations of a residual; in normal noise once in 10^15
+USUAL = 4.0  # robust deviations that the other two metrics may have
+FINEST = 0.0125  # smallest robust deviation that is used
+SMALLEST = 4  # methods and scenes that a table needs for a fit
 
 
 @dataclass(frozen=True)
@@ -123,19 +146,6 @@ def _number(path: Path, line: int, row: dict[str, str]) -> PrintedNumber | None:
     )
 
 
-# kind -> its meaning, in the order of the report
-KINDS = {
-    "repeated": "different results with equal digits",
-    "contradiction": "another number for the same result in another place",
-    "swapped": "numbers or columns that look exchanged",
-    "mean": "a mean that differs from the mean of its parts",
-    "out of place": "a number outside the range of its metric or of its neighbours",
-    "rank": "a marked rank that contradicts the numbers",
-    "digits": "another number of digits than in the rest of the column",
-    "unit": "the unit, or what was counted, is not given",
-}
-
-
 @dataclass(frozen=True)
 class AuditFinding:
     """Something that is unlikely or wrong in reported numbers."""
@@ -170,9 +180,6 @@ def method_name(number: PrintedNumber) -> str:
     return f"{number.method} ({number.setting})" if number.setting else number.method
 
 
-SIZE = "model_mb"  # follows from the number of Gaussians, which many runs let grow to the same limit
-NEAR, CLOSE = 25, 5  # units of the last digit; CLOSE is for numbers that lie in clusters
-ODDS = 0.005  # largest probability of a coincidence, over all comparisons, at which something is reported
 Key = tuple[str, ...]
 Line = dict[Key, PrintedNumber]
 
@@ -315,15 +322,6 @@ def _near(a: PrintedNumber, b: PrintedNumber, units: int) -> bool:
     return abs(a.value - b.value) <= units * 10.0 ** -max(a.digits, b.digits) + 1e-12
 
 
-# metric family -> smallest and largest value; LPIPS has no upper limit, but no right value was above 1.5
-LIMITS = {"psnr": (2.0, 100.0), "ssim": (-1.0, 1.0), "lpips": (0.0, 1.5)}
-MARGIN = 0.5  # of the others' range: a value within this distance is not unusual
-OTHERS = 4  # other methods that a scene needs, before one is compared with them
-CLEARLY = 3.0  # an exchange must bring values this many times nearer to the others
-FAR = 8.0  # robust deviations of a residual; in normal noise once in 10^15
-USUAL = 4.0  # robust deviations that the other two metrics may have
-FINEST = 0.0125  # smallest robust deviation that is used
-SMALLEST = 4  # methods and scenes that a table needs for a fit
 Entry = dict[str, PrintedNumber]  # family -> number
 Scenes = dict[tuple[str, str, str], dict[str, Entry]]  # (table, dataset, scene) -> method -> entry
 

@@ -26,6 +26,20 @@ FORMULA = ("=", "+", "-", "@")
 LARGEST = 200_000_000  # bytes
 LONGEST = 200  # characters of a name
 CsvValue = str | int | float | None
+FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
+LAST = (
+    "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
+    "result_hash", "checked", "reproduce", "row_hash",
+)  # fmt: skip
+NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns that are not plain text
+COST = "cost_"  # prefix of columns with costs; all other columns with numbers are qualities
+ALONE = "alone"  # the cost that is 1 if the run had the machine alone, else 0
+TIDY = (
+    "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
+    "version", "source", "config_hash", "scene_hash", "checked",
+)  # fmt: skip
+CHECKED: tuple[Checked, ...] = ("files", "psnr", "photos")  # from weak to strong
+ALL = "all"
 
 
 def guard(text: str) -> str:
@@ -120,21 +134,8 @@ def unique_slug(*texts: str) -> str:
     return "-".join(filter(None, (slug(texts[0]), digest)))
 
 
-FIRST = ("dataset", "scene", "method", "setting", "options", "seed", "images")
-LAST = (
-    "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
-    "result_hash", "checked", "reproduce", "row_hash",
-)  # fmt: skip
-NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns that are not plain text
-COST = "cost_"  # prefix of columns with costs; all other columns with numbers are qualities
-ALONE = "alone"  # the cost that is 1 if the run had the machine alone, else 0
-TIDY = (
-    "dataset", "scene", "method", "setting", "options", "seed", "kind", "metric", "value", "device",
-    "version", "source", "config_hash", "scene_hash", "checked",
-)  # fmt: skip
 # What was computed again from renders and photos: every metric of pictures, PSNR only, or nothing.
 Checked = Literal["photos", "psnr", "files"]
-CHECKED: tuple[Checked, ...] = ("files", "psnr", "photos")  # from weak to strong
 Key = tuple[str, str, str, str, str, int]
 
 
@@ -239,9 +240,6 @@ def tidy(entries: Iterable[Entry]) -> Iterator[list[CsvValue]]:
         for kind, values in (("quality", qualities), ("cost", e.cost)):
             for metric in in_order(values):
                 yield [*e.key, kind, metric, values[metric], *last]
-
-
-ALL = "all"
 
 
 def measured(board: Path) -> Path:

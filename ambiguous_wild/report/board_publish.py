@@ -79,6 +79,19 @@ PAPERS = {
     "mcmc": "https://arxiv.org/abs/2404.09591",
     "pup-3dgs": "https://arxiv.org/abs/2406.10219",
 }
+SOURCE = "reported"
+SOURCES = "sources.json"
+REPORTED_COLUMNS = (
+    "source", "method", "setting", "dataset", "scene", "metric", "variant", "value", "printed", "table",
+)  # fmt: skip
+GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
+OURS = {"index.html", "data", "images", "models"}
+MANIFEST = "data/files.json"  # every other file of the page
+SCRIPTS = (
+    "page_data.js", "page_table.js", "page_matrix.js", "page_runs.js", "page_plot.js", "page_compare.js",
+    "page_reported.js", "page_main.js",
+)  # fmt: skip
+MODELS = "models"
 
 
 def facts(
@@ -158,13 +171,6 @@ def _method(name: str) -> dict[str, str]:
     }  # fmt: skip
 
 
-SOURCE = "reported"
-SOURCES = "sources.json"
-REPORTED_COLUMNS = (
-    "source", "method", "setting", "dataset", "scene", "metric", "variant", "value", "printed", "table",
-)  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Reported:
     """Numbers that papers print, their sources, and the findings of `aw audit`."""
@@ -236,15 +242,6 @@ def _link(url: object) -> str:
 def _plain(number: PrintedNumber, column: str) -> CsvValue:
     value: CsvValue = getattr(number, "text" if column == "printed" else column)
     return value
-
-
-GENERATOR = '<meta name="generator" content="aw leaderboard publish">'
-OURS = {"index.html", "data", "images", "models"}
-MANIFEST = "data/files.json"  # every other file of the page
-SCRIPTS = (
-    "page_data.js", "page_table.js", "page_matrix.js", "page_runs.js", "page_plot.js", "page_compare.js",
-    "page_reported.js", "page_main.js",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -389,7 +386,6 @@ def page(title: str, data: Facts) -> str:
     return fill_page(template, data, SCRIPTS, title=title, images="'self' file: data:", sort_keys=True)
 
 
-MODELS = "models"
 Say = Callable[[str], None]
 
 

@@ -24,6 +24,9 @@ from ambiguous_wild.simulate.spec_file import plain_spec
 
 # options of `aw build-scene`
 FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing", "sfm")
+_PLUGIN = re.compile(r"[\w.-]+\.py")
+_REFERENCE = re.compile(rf"({_PLUGIN.pattern}:\w+|external:[\w.-]+|nerfbaselines:[\w.-]+)([@+][\w@+=,.-]+)?")
+SIMULATED = "simulated"
 
 
 def setting(config: RunConfig, planned: bool = False) -> str:
@@ -100,10 +103,6 @@ def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -
     if hidden is not None:
         raise AwError(f"config.yaml holds the invisible character {hidden!a}: run again without it")
     return text
-
-
-_PLUGIN = re.compile(r"[\w.-]+\.py")
-_REFERENCE = re.compile(rf"({_PLUGIN.pattern}:\w+|external:[\w.-]+|nerfbaselines:[\w.-]+)([@+][\w@+=,.-]+)?")
 
 
 def _method(config: RunConfig, recorded: str) -> list[str]:
@@ -235,9 +234,6 @@ def _build(raw: str, name: str, settings: Facts) -> list[str]:
         if key in settings and settings[key] != usual[key]:
             words += [f"--{key.replace('_', '-')}", str(settings[key])]
     return words + (["--strict"] if settings.get("strict") else [])
-
-
-SIMULATED = "simulated"
 
 
 class Scenes:

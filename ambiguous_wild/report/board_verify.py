@@ -45,6 +45,7 @@ from ambiguous_wild.report.board_reproduce import (
 
 RENDERS = Path("renders") / "test"
 REQUIRED = ("psnr", "ssim", "ssim_inria")  # always measurable: they need only the two pictures
+RESTORE = "restore the files, or run it again with 'aw bench --overwrite always'"
 
 
 class Unfinished(AwError):
@@ -285,9 +286,6 @@ def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[st
 
 def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
-
-
-RESTORE = "restore the files, or run it again with 'aw bench --overwrite always'"
 
 
 def check_photos(

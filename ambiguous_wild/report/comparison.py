@@ -28,6 +28,13 @@ from ambiguous_wild.report.table_layout import Column, Row, State, Table, TableC
 from ambiguous_wild.report.typeset import to_html
 
 MASK_COLUMNS = ("mask_iou", "mask_precision")
+EFFECTS = Measure("effects", "effects", None, 0, per_image=False)
+COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash",
+           "effects", "length")  # fmt: skip
+_KEYS = ["scene", "method", "seed"]
+_OF_RUN = ["config_hash", "effects", "length"]
+_NO_NUMBER = {*_KEYS, "images", *TEXT_OF_RUNS}
+_TEXT = ("scene", "method", "image", "metric", "better", "reason", *_OF_RUN)
 
 
 def comparison(
@@ -107,9 +114,6 @@ def table(
     runs = runs if isinstance(runs, Runs) else read_runs(runs)
     columns, only = ([names] if isinstance(names, str) else names for names in (metrics, scenes))
     return Tables(comparison(runs, metrics=columns, scenes=only))
-
-
-EFFECTS = Measure("effects", "effects", None, 0, per_image=False)
 
 
 def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
@@ -292,14 +296,6 @@ def _why_unranked(row: Row) -> str:
     if row.ranked:
         return ""
     return "knows the truth, not ranked" if knows_truth(row.name) else "unfinished, not ranked"
-
-
-COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash",
-           "effects", "length")  # fmt: skip
-_KEYS = ["scene", "method", "seed"]
-_OF_RUN = ["config_hash", "effects", "length"]
-_NO_NUMBER = {*_KEYS, "images", *TEXT_OF_RUNS}
-_TEXT = ("scene", "method", "image", "metric", "better", "reason", *_OF_RUN)
 
 
 def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> pd.DataFrame:

@@ -30,6 +30,11 @@ GREY = "0.45"
 PANEL = (4.6, 3.4)  # inches
 DPI = 130
 MOST_COLUMNS = 3
+AXES = (
+    ("minutes", "training time", True),
+    ("model_mb", "model size (MB)", True),
+    ("fps", "frames a second", False),
+)
 
 
 def new_figure(
@@ -143,13 +148,6 @@ def ticks_of_time(axes: Any, times: Sequence[float]) -> None:
 
 def finite(*values: float) -> bool:
     return all(math.isfinite(v) for v in values)
-
-
-AXES = (
-    ("minutes", "training time", True),
-    ("model_mb", "model size (MB)", True),
-    ("fps", "frames a second", False),
-)
 
 
 def draw_all(report: CostReport, folder: Path) -> list[Path]:

@@ -31,6 +31,12 @@ from ambiguous_wild.report.table_layout import Table, text_table
 PLOTS = ("timelines", "budgets", "front", "changes")
 FILES = ("cost.csv", "time-to-psnr.csv", "changes.csv", "timelines.csv", "cost.json",
          *(f"{plot}{suffix}" for plot in PLOTS for suffix in (".svg", ".png")))  # fmt: skip
+MISSING = "—"
+TIMES = {
+    True: "times: reference seconds, see docs/cost.md; ranked between runs that were alone",
+    False: "times: wall seconds of the machine; ranked between runs that were alone",
+}
+SHORT_MIN = 3.0  # trainings below this are shown in seconds
 
 
 @dataclass(frozen=True)
@@ -194,14 +200,6 @@ def _timeline_rows(curves: Iterable[Curve]) -> Iterable[Facts]:
 
 def _both(name: str, value: MeanAndDeviation) -> dict[str, float]:
     return {name: value.mean, f"{name}_std": value.spread}
-
-
-MISSING = "—"
-TIMES = {
-    True: "times: reference seconds, see docs/cost.md; ranked between runs that were alone",
-    False: "times: wall seconds of the machine; ranked between runs that were alone",
-}
-SHORT_MIN = 3.0  # trainings below this are shown in seconds
 
 
 def to_text(report: CostReport) -> str:

@@ -16,6 +16,8 @@ from ambiguous_wild.report.cost_curves import Curve, MeanAndDeviation, scenes_of
 from ambiguous_wild.report.cost_runs import CostRun, why_unranked
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
+MOST = 0.9  # of the best PSNR
+LAST_DB = 1.0
 
 
 @dataclass(frozen=True)
@@ -160,10 +162,6 @@ def _missing(curve: Curve, scenes: Iterable[str], runs: Sequence[CostRun]) -> st
     unprobed = [run.unprobed for run in runs if run.unprobed]
     # an unprobed run gives an upper bound at its end, and bounds and times are not averaged together
     return shortlist(unprobed, 2) if unprobed and len(unprobed) < len(runs) else ""
-
-
-MOST = 0.9  # of the best PSNR
-LAST_DB = 1.0
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,21 @@ from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
 
 LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps
 REFERENCE = "reference_s"  # comparable between machines; other times are not
+CONDITIONS = {
+    "effects": "effects",
+    "length": "lengths",
+    "fit": "protocols",
+    "features": "features",
+    "start": "starts",
+    "training": "settings of training",
+}
+FITTED = {
+    "fitted": "colours fitted on the left half of each test photo, the right half measured",
+    "read": "colours read from the left half of each test photo, the right half measured",
+    "plain": "nothing fitted, the right half measured",
+    "unknown": "the right half measured; what was fitted is not recorded",
+    "full": "whole test photos measured, nothing fitted",
+}
 
 
 def notes(
@@ -42,16 +57,6 @@ def notes(
         *_about(runs, methods),
         *time_notes(runs.runs, columns),
     )
-
-
-CONDITIONS = {
-    "effects": "effects",
-    "length": "lengths",
-    "fit": "protocols",
-    "features": "features",
-    "start": "starts",
-    "training": "settings of training",
-}
 
 
 def unequal(frame: pd.DataFrame) -> list[str]:
@@ -117,15 +122,6 @@ def _not_ranked(runs: Runs) -> list[str]:
 def _references(methods: Sequence[str]) -> list[str]:
     names = [method for method in methods if knows_truth(method)]
     return [f"references, not ranked: {shortlist(names)} (exact masks or clean photos)"] if names else []
-
-
-FITTED = {
-    "fitted": "colours fitted on the left half of each test photo, the right half measured",
-    "read": "colours read from the left half of each test photo, the right half measured",
-    "plain": "nothing fitted, the right half measured",
-    "unknown": "the right half measured; what was fitted is not recorded",
-    "full": "whole test photos measured, nothing fitted",
-}
 
 
 def _fitted(runs: Runs) -> list[str]:

@@ -19,6 +19,11 @@ from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableC
 PER_TABLE = 6  # scenes side by side, as in the papers
 LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
 MEMORY = ("model_mb",)
+LEVEL = 0.95
+RESAMPLES = 2000
+LEAST = 6  # images; five differences have the same sign by chance once in 16 times
+FAMILIES = ("psnr", "ssim", "lpips")
+NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
 
 def in_blocks(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> list[Table]:
@@ -164,11 +169,6 @@ def _cells(part: Table, method: str) -> tuple[TableCell, ...]:
     return next((row.cells for row in part.rows if row.name == method), absent)
 
 
-LEVEL = 0.95
-RESAMPLES = 2000
-LEAST = 6  # images; five differences have the same sign by chance once in 16 times
-
-
 def difference_interval(
     differences: Sequence[np.ndarray],  # of each scene: [n], one method minus another on the same images
 ) -> tuple[float, float]:
@@ -250,10 +250,6 @@ class Ties:
         low, high = difference_interval(differences)
         few = sum(map(len, differences)) < LEAST and not math.isnan(low)
         return few or low <= 0.0 <= high
-
-
-FAMILIES = ("psnr", "ssim", "lpips")
-NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
 
 def read_reported(folder: Path | None = None) -> list[PrintedNumber]:

@@ -23,6 +23,16 @@ from ambiguous_wild.report.table_layout import ARROWS, TIE, Column, Row, Table, 
 
 RANKS = "(1) (2) (3): first, second and third in the column"
 COLORS = {1: "green", 2: "cyan", 3: "yellow"}  # of the terminal
+LONG_HEAD = ("table", "kind", "method", "dataset", "column", "scene", "metric", "value", "std", "rank",
+             "not_significant", "status", "printed", "note")  # fmt: skip
+UNEQUAL = "not comparable"  # begins a note that every format with ranks shows
+WIDTH = 100
+# The most important columns; others follow in the order of the table.
+FIRST = (
+    "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
+    "flip", "fps", "model_mb",
+)  # fmt: skip
+UNFITTED = "colours of test photos are not fitted"  # begins a note, with which PSNR affine comes second
 
 
 def display_width(text: str) -> int:
@@ -236,10 +246,6 @@ def read_csv(
     return head, [(line, dict(zip(head, cells))) for line, cells in rows]
 
 
-LONG_HEAD = ("table", "kind", "method", "dataset", "column", "scene", "metric", "value", "std", "rank",
-             "not_significant", "status", "printed", "note")  # fmt: skip
-
-
 def to_long_csv(tables: Sequence[Table]) -> str:
     """Return CSV with one number per row; measured numbers have a value, reported ones only `printed`.
 
@@ -293,16 +299,6 @@ def _wide_values(table: Table, row: Row) -> Iterator[float | str]:
 def _status(row: Row) -> str:
     states = {cell.state for cell in row.cells}
     return next((s for s in ("failed", "absent", "ok") if s in states), "missing")
-
-
-UNEQUAL = "not comparable"  # begins a note that every format with ranks shows
-WIDTH = 100
-# The most important columns; others follow in the order of the table.
-FIRST = (
-    "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
-    "flip", "fps", "model_mb",
-)  # fmt: skip
-UNFITTED = "colours of test photos are not fitted"  # begins a note, with which PSNR affine comes second
 
 
 def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:

@@ -33,6 +33,28 @@ SPECIAL = {
     "–": "--",
     "—": "---",
 }
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; margin: 1.5rem auto;
+  max-width: 96rem; padding: 0 1rem; }
+h2 { font-size: 1.05rem; margin: 2rem 0 .5rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; border-top: 2px solid #1a1a1a; border-bottom: 2px solid #1a1a1a; }
+th, td { padding: .25rem .6rem; text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
+th { font-weight: 600; }
+thead tr:last-child th { border-bottom: 1px solid #1a1a1a; }
+th.group { text-align: center; border-bottom: 1px solid #bbb; }
+th.name { text-align: left; font-weight: normal; position: sticky; left: 0; background: #fff; }
+.first { background: #ffbfbf; font-weight: 600; }
+.second { background: #ffdeb8; }
+.third { background: #fffab8; }
+.begins { border-left: 1px solid #ddd; }
+.spread { color: #666; font-size: .85em; }
+tr.reported td, tr.reported th { color: #666; font-style: italic; }
+tr.divider th { text-align: left; color: #666; font-size: .85em; border-top: 1px solid #1a1a1a; }
+ul { padding-left: 1.1rem; color: #555; font-size: .85rem; overflow-wrap: anywhere; }
+.key span { padding: 0 .4rem; }
+"""
+RANKS = ("first", "second", "third")
 
 
 def latex_text(text: str) -> str:
@@ -128,30 +150,6 @@ def _latex_cell(cell: TableCell, measure: Measure) -> str:
     text = latex_text(cell.text(measure)).replace("±", r"$\pm$").replace("inf", r"$\infty$")
     text += r"$^{\approx}$" if cell.tie else ""
     return text if cell.rank is None else f"\\cellcolor{{{COLORS[cell.rank - 1][0]}}}{text}"
-
-
-STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; margin: 1.5rem auto;
-  max-width: 96rem; padding: 0 1rem; }
-h2 { font-size: 1.05rem; margin: 2rem 0 .5rem; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; border-top: 2px solid #1a1a1a; border-bottom: 2px solid #1a1a1a; }
-th, td { padding: .25rem .6rem; text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
-th { font-weight: 600; }
-thead tr:last-child th { border-bottom: 1px solid #1a1a1a; }
-th.group { text-align: center; border-bottom: 1px solid #bbb; }
-th.name { text-align: left; font-weight: normal; position: sticky; left: 0; background: #fff; }
-.first { background: #ffbfbf; font-weight: 600; }
-.second { background: #ffdeb8; }
-.third { background: #fffab8; }
-.begins { border-left: 1px solid #ddd; }
-.spread { color: #666; font-size: .85em; }
-tr.reported td, tr.reported th { color: #666; font-style: italic; }
-tr.divider th { text-align: left; color: #666; font-size: .85em; border-top: 1px solid #1a1a1a; }
-ul { padding-left: 1.1rem; color: #555; font-size: .85rem; overflow-wrap: anywhere; }
-.key span { padding: 0 .4rem; }
-"""
-RANKS = ("first", "second", "third")
 
 
 def to_html(tables: Sequence[Table]) -> str:

@@ -62,6 +62,10 @@ from ambiguous_wild.simulate.yard import yard
 
 _NEAREST_WALL_M = 0.1
 _AHEAD_M = 4.0  # distance to the point that an outward camera looks at
+_LENS_MM = 4.2  # focal length without zoom
+_ISO = 64
+_DATE = "2025:06:14 15:{:02d}:{:02d}"
+_PLACES = {"courtyard": courtyard, "room": room, "yard": yard}
 
 
 def focal_px(spec: CaptureSpec) -> float:
@@ -151,10 +155,6 @@ def _zoomed(cameras: list[Camera], spec: CaptureSpec, shift: float) -> list[Came
     return zoomed
 
 
-_LENS_MM = 4.2  # focal length without zoom
-_ISO = 64
-_DATE = "2025:06:14 15:{:02d}:{:02d}"
-_PLACES = {"courtyard": courtyard, "room": room, "yard": yard}
 PhotoProgress = Callable[[list[PlannedPhoto]], Iterable[PlannedPhoto]]
 
 

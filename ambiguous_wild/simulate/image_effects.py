@@ -31,6 +31,20 @@ from ambiguous_wild.simulate.spec import (
 from ambiguous_wild.simulate.tracer import Light
 
 _EFFECTS = 1000  # spawn key of effects; world, walk and layout have 0 to 2
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
+SHOT = 1.2e-4  # variance at full signal and ISO 100: a full well of about 8000 electrons
+READ = 5e-4  # standard deviation at ISO 100
+_FINE = 9  # subpixels a side that resolve the disc's rim
+# Gains of sun, sky and ground light at strength 1; other hours use powers of them, so hour 0 has gain 1.
+_MORNING = ((0.45, 0.55, 0.75), (0.80, 0.95, 1.25), (0.80, 0.90, 1.10))  # thin cloud, blue
+_EVENING = ((1.25, 0.85, 0.50), (0.85, 0.70, 0.70), (0.95, 0.75, 0.60))  # low and golden
+_AWAY_M = 9.0  # distance towards the sun: outside every photo
+_TARGET_M = ((-2.4, 2.4), (-1.2, 3.4))  # x and y around which the shadow falls
+_LOBES = 4
+# Lens distortion, rolling shutter and motion blur share one resampling. The pinhole image is traced larger
+# than the photo, and finer by a whole factor; each fine pixel of the photo is looked up in it. All weights
+# are non-negative, so a mask resampled with them is positive exactly where masked pixels contribute.
+_MAX_BORDER = 2  # greatest border, in longer sides of the photo
 
 
 @dataclass(frozen=True)
@@ -73,9 +87,6 @@ def exposure_drift(
     return image * np.float32(2.0**stops)
 
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
-
-
 def draw_white_balance(settings: WhiteBalance, random: PhotoRandom) -> tuple[float, float, float]:
     """Draw the photo's gains (red, green, blue); white keeps its luminance."""
     warmth = settings.warmth * random.drift("white_balance", cycles=2.3)
@@ -91,10 +102,6 @@ def white_balance(
 ) -> np.ndarray:
     """Multiply each channel by its gain."""
     return image * np.array(gains, np.float32)
-
-
-SHOT = 1.2e-4  # variance at full signal and ISO 100: a full well of about 8000 electrons
-READ = 5e-4  # standard deviation at ISO 100
 
 
 def draw_iso_noise(settings: IsoNoise, random: PhotoRandom) -> float:
@@ -132,9 +139,6 @@ def vignetting(
     r2 = ((x[None] * width) ** 2 + (y[:, None] * height) ** 2) / (width**2 + height**2)
     c = (1.0 - falloff) ** -0.5 - 1.0
     return image * ((1.0 + c * r2) ** -2).astype(np.float32)[..., None]
-
-
-_FINE = 9  # subpixels a side that resolve the disc's rim
 
 
 def draw_defocus(settings: Defocus, random: PhotoRandom) -> float:
@@ -184,11 +188,6 @@ def jpeg(
     return np.array(Image.open(stored).convert("RGB"))
 
 
-# Gains of sun, sky and ground light at strength 1; other hours use powers of them, so hour 0 has gain 1.
-_MORNING = ((0.45, 0.55, 0.75), (0.80, 0.95, 1.25), (0.80, 0.90, 1.10))  # thin cloud, blue
-_EVENING = ((1.25, 0.85, 0.50), (0.85, 0.70, 0.70), (0.95, 0.75, 0.60))  # low and golden
-
-
 def draw_time_of_day(settings: TimeOfDay, random: PhotoRandom) -> float:
     """Draw the photo's hour: -1 morning, 0 as in the test photos, 1 evening; in random order."""
     return float(random.rng("time_of_day").uniform(-1, 1))
@@ -209,11 +208,6 @@ def time_of_day(light: Light, hour: float, strength: float, sweep_deg: float) ->
         ground_colour=light.ground_colour * ground,
     )
     return lit, sky
-
-
-_AWAY_M = 9.0  # distance towards the sun: outside every photo
-_TARGET_M = ((-2.4, 2.4), (-1.2, 3.4))  # x and y around which the shadow falls
-_LOBES = 4
 
 
 def draw_moving_shadow(settings: MovingShadow, random: PhotoRandom) -> tuple[tuple[float, float, float], ...]:
@@ -297,12 +291,6 @@ def hand_turns(
     """
     instants = (np.arange(steps) + 0.5) / steps - 0.5
     return seconds * instants[:, None] * velocity
-
-
-# Lens distortion, rolling shutter and motion blur share one resampling. The pinhole image is traced larger
-# than the photo, and finer by a whole factor; each fine pixel of the photo is looked up in it. All weights
-# are non-negative, so a mask resampled with them is positive exactly where masked pixels contribute.
-_MAX_BORDER = 2  # greatest border, in longer sides of the photo
 
 
 def fine_points(camera: Camera, fine: int) -> np.ndarray:

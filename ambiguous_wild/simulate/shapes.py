@@ -20,6 +20,8 @@ from ambiguous_wild.simulate.tracer import Atlas, ShapeTable
 
 SIZE = 64  # samples a side
 Point = tuple[float, float, float]
+UNSEEN = -1  # owner of an invisible shadow caster
+SHEET_M = 2.0  # side of the square that an object's texture covers before it repeats mirrored
 
 
 @cache
@@ -135,9 +137,6 @@ STATUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "spire": _spire,
 }
 
-
-UNSEEN = -1  # owner of an invisible shadow caster
-SHEET_M = 2.0  # side of the square that an object's texture covers before it repeats mirrored
 
 Vector = tuple[float, float, float]
 Axes = tuple[Vector, ...]

@@ -33,6 +33,7 @@ Ambiguity = Literal["colour", "semantic", "none"]
 Colour = tuple[float, float, float]  # linear light
 FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 x 24 mm, what `focal_35mm` is an equivalent on
 STATUES = ("bust", "knot", "hound", "spire")  # signed-distance shapes, in the world and as distractors
+SURFACE_NAMES = ("ground", "wall_back", "wall_left", "wall_right", "wall_front")
 
 
 @dataclass(frozen=True)
@@ -233,9 +234,6 @@ class CaptureSpec:
     effects: Effects = field(default_factory=Effects)
     fixed: FixedThing | None = None  # fixed to the camera, in every train photo, on top of `occlusion`
     designed: Designed = field(default_factory=Designed)
-
-
-SURFACE_NAMES = ("ground", "wall_back", "wall_left", "wall_right", "wall_front")
 
 
 @dataclass(frozen=True)

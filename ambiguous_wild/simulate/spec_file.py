@@ -27,6 +27,46 @@ from ambiguous_wild.simulate.spec import (
 )
 from ambiguous_wild.simulate.world import POSTERS, SHEETS
 
+PICTURES = tuple(f"poster_{name}" for name in POSTERS)
+MOST = 255  # largest number of distractors, as the ray caster stores a pixel's distractor in a byte
+_SPEC: Limits = {
+    "train_views": (3, 2000),
+    "test_views": (1, 2000),
+    "width": (64, 4096),
+    "height": (36, 4096),
+    "detail_px_per_m": (2, 300),
+    "focal_35mm": (10, 200),
+    "occlusion": (0, 0.9),
+    "zoom": (0.5, 4),
+}
+_WALKS: dict[str, Limits] = {
+    "around": {"arc_deg": (5, 150), "radius_m": (1.5, 7)},
+    "outward": {"arc_deg": (5, 360), "radius_m": (0.2, 7)},
+}
+_DISTRACTOR: Limits = {
+    "size": (0.02, 10),
+    "presence": (0, 1),
+    "lift_m": (0, 3),
+    "laps": (0, 100),
+    "distance_m": (0.3, 12),
+    "tint": (0, 4),
+}
+_THING: Limits = {"size_m": (0.01, 12), "yaw_deg": (-360, 360), "tint": (0, 4)}
+_EFFECTS: dict[str, Limits] = {
+    "exposure_drift": {"stops": (0, 3)},
+    "white_balance": {"warmth": (0, 2), "tint": (0, 1)},
+    "iso_noise": {"iso": (50, 25600)},
+    "vignetting": {"falloff": (0, 0.9)},
+    "lens_distortion": {"k1": (-0.3, 0.3), "k2": (-0.1, 0.1)},
+    "motion_blur": {"exposure_s": (1e-5, 0.5), "speed_deg_s": (0, 60)},
+    "rolling_shutter": {"readout_s": (0, 0.2), "speed_deg_s": (0, 60)},
+    "defocus": {"share": (0, 1), "radius": (0, 0.02)},
+    "jpeg": {"quality": (1, 95)},
+    "time_of_day": {"strength": (0, 2), "sweep_deg": (0, 90)},
+    "moving_shadow": {"presence": (0, 1), "size_m": (0.05, 3)},
+    "specular": {"strength": (0, 3), "sharpness": (1, 1000)},
+}
+
 
 class _Dumper(yaml.SafeDumper):
     """YAML's safe dumper, with lists of scalars on one line and without aliases."""
@@ -122,48 +162,8 @@ def plain_spec(spec: CaptureSpec) -> dict[str, Any]:
     return data
 
 
-PICTURES = tuple(f"poster_{name}" for name in POSTERS)
-MOST = 255  # largest number of distractors, as the ray caster stores a pixel's distractor in a byte
-
 # Least and greatest value of each number; in pairs the smaller number comes first.
 Limits = dict[str, tuple[float, float]]
-_SPEC: Limits = {
-    "train_views": (3, 2000),
-    "test_views": (1, 2000),
-    "width": (64, 4096),
-    "height": (36, 4096),
-    "detail_px_per_m": (2, 300),
-    "focal_35mm": (10, 200),
-    "occlusion": (0, 0.9),
-    "zoom": (0.5, 4),
-}
-_WALKS: dict[str, Limits] = {
-    "around": {"arc_deg": (5, 150), "radius_m": (1.5, 7)},
-    "outward": {"arc_deg": (5, 360), "radius_m": (0.2, 7)},
-}
-_DISTRACTOR: Limits = {
-    "size": (0.02, 10),
-    "presence": (0, 1),
-    "lift_m": (0, 3),
-    "laps": (0, 100),
-    "distance_m": (0.3, 12),
-    "tint": (0, 4),
-}
-_THING: Limits = {"size_m": (0.01, 12), "yaw_deg": (-360, 360), "tint": (0, 4)}
-_EFFECTS: dict[str, Limits] = {
-    "exposure_drift": {"stops": (0, 3)},
-    "white_balance": {"warmth": (0, 2), "tint": (0, 1)},
-    "iso_noise": {"iso": (50, 25600)},
-    "vignetting": {"falloff": (0, 0.9)},
-    "lens_distortion": {"k1": (-0.3, 0.3), "k2": (-0.1, 0.1)},
-    "motion_blur": {"exposure_s": (1e-5, 0.5), "speed_deg_s": (0, 60)},
-    "rolling_shutter": {"readout_s": (0, 0.2), "speed_deg_s": (0, 60)},
-    "defocus": {"share": (0, 1), "radius": (0, 0.02)},
-    "jpeg": {"quality": (1, 95)},
-    "time_of_day": {"strength": (0, 2), "sweep_deg": (0, 90)},
-    "moving_shadow": {"presence": (0, 1), "size_m": (0.05, 3)},
-    "specular": {"strength": (0, 3), "sharpness": (1, 1000)},
-}
 
 
 def check_spec(spec: CaptureSpec) -> CaptureSpec:

@@ -32,6 +32,34 @@ from ambiguous_wild.simulate.shapes import SHEET_M, Axes, Shape, between, figure
 from ambiguous_wild.simulate.spec import STATUES, GroundPlan, Thing, WorldSpec
 from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable, build_atlas
 
+OVERHEAD_M = 2.0  # foot of a thing that hangs above the distractors
+POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
+# Textures of objects and distractors; `brick` and `gravel` also cover the courtyard's walls and ground,
+# `plaster` the room's walls, `asphalt` the yard's ground.
+SHEETS = {
+    "stone": tx.stone,
+    "foliage": tx.foliage,
+    "timber": tx.timber,
+    "clay": tx.clay,
+    "skin": tx.skin,
+    "brick": tx.brick,
+    "gravel": tx.gravel,
+    "vivid": tx.vivid,
+    "cloth": tx.cloth,
+    "plaster": built.plaster,
+    "asphalt": built.asphalt,
+    "enamel": built.enamel,
+}
+# These have random streams of their own, so that adding a sheet changes no bit of other captures.
+_LATER_SHEETS = ("cloth", "plaster", "asphalt", "enamel")
+# Local axes of the walls: along the wall, up, inwards.
+WALL_AXES: Mapping[str, Axes] = {
+    "wall_back": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "wall_left": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
+    "wall_right": ((0, -1, 0), (0, 0, 1), (-1, 0, 0)),
+    "wall_front": ((-1, 0, 0), (0, 0, 1), (0, 1, 0)),
+}
+
 
 def statue(name: str, texture: str, height_m: float) -> Shape:
     """Make a signed-distance statue at the origin."""
@@ -127,37 +155,6 @@ def circle_of(thing: Thing) -> tuple[float, float, float]:
     if thing.kind in STATUES or thing.kind == "figure":
         return (thing.at_m[0], thing.at_m[1], 0.3 * height)
     return (thing.at_m[0], thing.at_m[1], 0.5 * max(width, depth))
-
-
-OVERHEAD_M = 2.0  # foot of a thing that hangs above the distractors
-POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
-
-# Textures of objects and distractors; `brick` and `gravel` also cover the courtyard's walls and ground,
-# `plaster` the room's walls, `asphalt` the yard's ground.
-SHEETS = {
-    "stone": tx.stone,
-    "foliage": tx.foliage,
-    "timber": tx.timber,
-    "clay": tx.clay,
-    "skin": tx.skin,
-    "brick": tx.brick,
-    "gravel": tx.gravel,
-    "vivid": tx.vivid,
-    "cloth": tx.cloth,
-    "plaster": built.plaster,
-    "asphalt": built.asphalt,
-    "enamel": built.enamel,
-}
-# These have random streams of their own, so that adding a sheet changes no bit of other captures.
-_LATER_SHEETS = ("cloth", "plaster", "asphalt", "enamel")
-
-# Local axes of the walls: along the wall, up, inwards.
-WALL_AXES: Mapping[str, Axes] = {
-    "wall_back": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-    "wall_left": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
-    "wall_right": ((0, -1, 0), (0, 0, 1), (-1, 0, 0)),
-    "wall_front": ((-1, 0, 0), (0, 0, 1), (0, 1, 0)),
-}
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Cotangents
 
+COLD_S = 27  # seconds to compile all kernels, measured on two cores at 2.6 GHz
+
 
 @dataclass(frozen=True)
 class Size:
@@ -125,9 +127,6 @@ def _moved(shift: float) -> np.ndarray:
     pose = np.eye(4)
     pose[0, 3] = shift
     return pose
-
-
-COLD_S = 27  # seconds to compile all kernels, measured on two cores at 2.6 GHz
 
 
 def _tiny_scene() -> tuple[Gaussians, Camera]:

@@ -23,6 +23,9 @@ from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.images import as_float, load_image_codes, read_alpha, read_keep_map
 from ambiguous_wild.splat.step import TrainData
 
+RESIDENT = 0.25  # share of the memory; Gaussians, their moments, masks and gsplat's lists need the rest
+READY = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
+
 
 def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir: Path) -> TrainData:
     """Read the train photos and the user's own keep masks.
@@ -155,10 +158,6 @@ class Pyramid:
         if (view, divisor) not in self._cameras:
             self._cameras[view, divisor] = shrink_camera(self._data.cameras[view], divisor)
         return self._cameras[view, divisor]
-
-
-RESIDENT = 0.25  # share of the memory; Gaussians, their moments, masks and gsplat's lists need the rest
-READY = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
 
 
 class Copies(Protocol):

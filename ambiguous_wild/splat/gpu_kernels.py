@@ -25,6 +25,9 @@ from ambiguous_wild.splat.gaussians import rotation_matrices
 BOX = 128  # points in a box
 FIRST = 8  # nearest boxes that are searched first
 _AT_A_TIME = 2**25  # distances in memory at a time
+_REACH = 5  # px to either side of a window of 11 taps
+_C1, _C2 = 0.01**2, 0.03**2
+_SMALLEST = 1e-30  # keeps the square root differentiable
 
 
 @torch.no_grad()
@@ -135,10 +138,6 @@ def compiles(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
-_REACH = 5  # px to either side of a window of 11 taps
-_C1, _C2 = 0.01**2, 0.03**2
-
-
 def _window() -> tuple[float, ...]:
     taps = [math.exp(-((i - _REACH) ** 2) / (2 * 1.5**2)) for i in range(2 * _REACH + 1)]
     return tuple(tap / sum(taps) for tap in taps)
@@ -241,9 +240,6 @@ def prepare(
         render, photo = (torch.zeros(height, width, 3, device=device) for _ in range(2))
         for keep in (None, torch.ones(height, width, device=device)):
             photometric_fused(render, photo, keep, lambda_dssim, weighting)
-
-
-_SMALLEST = 1e-30  # keeps the square root differentiable
 
 
 def _covers(radii: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, size: Tensor) -> Tensor:

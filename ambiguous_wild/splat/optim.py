@@ -3,8 +3,8 @@
 Means, quats, scales and opacity are read by culling, and sh0 by every view: these 14 floats of a Gaussian are
 stepped at once, seen or not. The higher harmonics, 45 floats, are read only when a Gaussian is drawn. Steps
 of a row that no view sees are pending; it takes them, with gradient zero, when the renderer is about to draw
-it (`Gaussians.pending_steps`), or at `flush`. On an accelerator torch's fused kernel steps every row, one launch
-a tensor; there a flag on the device can call off the step without the host's knowledge.
+it (`Gaussians.pending_steps`), or at `flush`. On an accelerator torch's fused kernel steps every row, one
+launch a tensor; there a flag on the device can skip the step without the host's knowledge.
 """
 
 from __future__ import annotations
@@ -54,9 +54,7 @@ class SplatAdam:
         self._history = np.zeros((2, 256), np.float32)  # a step's lr / bias1 of sh_rest, and 1 / sqrt(bias2)
         self._rows = len(gaussians)
         self._bound: Gaussians | None = None
-        self._pending_steps: PendingSteps | None = (
-            None  # that of the Gaussians bound now, if rows are pending
-        )
+        self._pending_steps: PendingSteps | None = None  # of the Gaussians bound now
         self.bind(gaussians)
         self._set_rates(learning_rates)
 

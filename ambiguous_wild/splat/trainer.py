@@ -381,9 +381,9 @@ def _refuse_a_loss(value: object, step: Step) -> None:
 
 
 def _for_statistics(step: Step, gradients: Gradients, skip_step: Tensor) -> tuple[Step, Gradients]:
-    """Return step and gradients for the densification statistics: a skipped step marks every Gaussian invisible.
+    """Return step and gradients for the densification statistics: a skipped step must not enter them.
 
-    So neither its zeros nor its NaN are added.
+    So it marks every Gaussian invisible.
     """
     going = skip_step == 0
     step = replace(step, rendered=with_visible(step.rendered, step.rendered.visible & going))

@@ -21,6 +21,8 @@ from ambiguous_wild.io.files import write_text
 # On a GPU the parts of every 17th step are timed, because an event costs a launch. The number is prime:
 # growth comes every hundredth step, merging every thousandth; a divisor of these would time them too often.
 SAMPLED = 17
+ROWS = 100  # rows of a timeline
+MOST = 20_000  # positions kept of each kind: enough for a picture, small in every checkpoint
 
 
 class Clock:
@@ -125,7 +127,6 @@ def clock_for(device: torch.device, elapsed_s: float = 0.0, parts_s: dict[str, f
     return (GpuClock if device.type == "cuda" else Clock)(elapsed_s, parts_s)
 
 
-ROWS = 100  # rows of a timeline
 Row = dict[str, float | None]  # one row of a timeline, see `Timeline.add`
 
 
@@ -169,9 +170,6 @@ class Timeline:
         writer.writeheader()
         writer.writerows(self.rows)
         write_text(path, text.getvalue())
-
-
-MOST = 20_000  # positions kept of each kind: enough for a picture, small in every checkpoint
 
 
 @dataclass

@@ -33,6 +33,9 @@ from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Cotangents
 
 UNIT = 2.0**-24  # relative rounding error of one float32 operation (Higham's u)
+REGISTERED: list[Case] = []  # in the order of the files
+_DRAWS = 2  # number of random roundings; the largest change is used
+FAST_MATH = 8  # largest error of a GPU's exponential, in units
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,6 @@ class Case:
     @property
     def key(self) -> str:
         return f"{self.row:02d}-{re.sub(r'[^a-z0-9.]+', '-', self.name.lower()).strip('-')}"
-
-
-REGISTERED: list[Case] = []  # in the order of the files
 
 
 @dataclass(frozen=True)
@@ -122,10 +122,6 @@ def worst(parts: Iterable[CaseResult]) -> CaseResult:
         return m.error / m.tolerance if m.tolerance > 0 else float("inf") if m.error > 0 else 0.0
 
     return max(parts, key=share)
-
-
-_DRAWS = 2  # number of random roundings; the largest change is used
-FAST_MATH = 8  # largest error of a GPU's exponential, in units
 
 
 def device_result(

@@ -11,6 +11,9 @@ from ambiguous_wild.stress.case import REGISTERED, Case, StressLine, run
 
 FILES = (render_cases, training_cases, mask_cases)  # each registers its cases when it is imported
 CASES: tuple[Case, ...] = tuple(sorted(REGISTERED, key=lambda c: c.row))
+HEAD = ("case", "device", "correct result", "worst error", "tolerance", "reason", "condition", "verdict")
+WORDS = ("device", "correct result", "reason", "verdict")  # columns that hold text
+HEADER = f"{'verdict':7} {'on':4}  {'error':>9} {'allowed':>9} {'condition':>9}  case"
 
 
 def chosen(only: Sequence[str]) -> list[Case]:
@@ -47,10 +50,6 @@ def run_all(
     return outcomes
 
 
-HEAD = ("case", "device", "correct result", "worst error", "tolerance", "reason", "condition", "verdict")
-WORDS = ("device", "correct result", "reason", "verdict")  # columns that hold text
-
-
 def row(o: StressLine) -> tuple[str, ...]:
     """Return the cells of the outcome, in the columns of `HEAD`."""
     condition = "" if o.condition is None else f"{o.condition:.1e}"
@@ -70,9 +69,6 @@ def to_line(o: StressLine) -> str:
     if not o.passed:
         text += f"\n        {o.failure or o.why}".rstrip()
     return text
-
-
-HEADER = f"{'verdict':7} {'on':4}  {'error':>9} {'allowed':>9} {'condition':>9}  case"
 
 
 def _figure(value: float) -> str:

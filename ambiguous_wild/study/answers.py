@@ -19,6 +19,23 @@ KEY_FORMAT, KEY_VERSION = "aw-study-key", 1
 KIND_PHOTO: Final = "ambiguity"
 KIND_PAIR: Final = "preference"
 _KEY_FIELDS = {KIND_PHOTO: ("scene", "view"), KIND_PAIR: ("scene", "view", "x", "y")}
+FORMAT, VERSION = "aw-study-answers", 1
+CHOICES = {KIND_PAIR: ("x", "y", "tie"), KIND_PHOTO: ("1", "2", "3", "4", "5", "none")}
+# the values in JSON and CSV -> whether the outline was shown
+OUTLINES: dict[str | bool | None, bool | None] = {
+    True: True,
+    False: False,
+    "yes": True,
+    "no": False,
+    "": None,
+    None: None,
+}
+LARGEST = 5_000_000  # bytes; ten times the size of a thousand answers
+LONGEST = 80  # characters of a rater's id or name, as in the page
+_COLUMNS = ("study", "rater", "name", "question", "answer", "left", "ms", "outline")
+# Nobody can look at a question in less than these seconds: at one photo, or at two renders and a photo. Such
+# answers are read and counted, but left out of every score.
+TOO_FAST_S = {KIND_PHOTO: 0.7, KIND_PAIR: 1.0}
 
 
 @dataclass(frozen=True)
@@ -80,25 +97,6 @@ def _complete(entry: Any) -> bool:
     if not isinstance(kind, str) or kind not in _KEY_FIELDS:
         return False
     return all(isinstance(entry.get(field), str) for field in _KEY_FIELDS[kind])
-
-
-FORMAT, VERSION = "aw-study-answers", 1
-CHOICES = {KIND_PAIR: ("x", "y", "tie"), KIND_PHOTO: ("1", "2", "3", "4", "5", "none")}
-# the values in JSON and CSV -> whether the outline was shown
-OUTLINES: dict[str | bool | None, bool | None] = {
-    True: True,
-    False: False,
-    "yes": True,
-    "no": False,
-    "": None,
-    None: None,
-}
-LARGEST = 5_000_000  # bytes; ten times the size of a thousand answers
-LONGEST = 80  # characters of a rater's id or name, as in the page
-_COLUMNS = ("study", "rater", "name", "question", "answer", "left", "ms", "outline")
-# Nobody can look at a question in less than these seconds: at one photo, or at two renders and a photo. Such
-# answers are read and counted, but left out of every score.
-TOO_FAST_S = {KIND_PHOTO: 0.7, KIND_PAIR: 1.0}
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrow
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.study.answers import KEY_FORMAT, KEY_VERSION, KIND_PAIR, KIND_PHOTO, study_id
 
+OUTLINE = (255, 220, 0)  # sRGB; drawn over a black edge, so that it is visible on any background
+
 
 @dataclass(frozen=True)
 class PhotoQuestion:
@@ -166,9 +168,6 @@ def sample_questions(questions: Sequence[Question], limit: int, rng: np.random.G
 
 def _stem(name: str) -> str:
     return str(PurePosixPath(name).with_suffix(""))
-
-
-OUTLINE = (255, 220, 0)  # sRGB; drawn over a black edge, so that it is visible on any background
 
 
 def outlined(photo: Path, mask: Path) -> np.ndarray:  # [H, W, 3] uint8

@@ -21,6 +21,11 @@ from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.metrics.ambiguity import ratio_interval
 from ambiguous_wild.study.answers import KIND_PAIR, KIND_PHOTO, TOO_FAST_S, Answer, Key, Rater
 
+# Regularisation, like this fraction of an extra answer for each side of every pair. It keeps the strength of
+# a method that won every answer finite, and changes others by less than the printed digits.
+PRIOR = 0.1
+HARD = 4  # of 5: a photo rated this or more is hard
+
 
 class Counted(TypedDict):
     """Number of answers and two 95 % intervals of a share; None = not defined."""
@@ -200,11 +205,6 @@ def _needed(module: str, why: str) -> Any:
         raise AwError(f"{why} ({error}); install it with: {install_command('study')}") from None
 
 
-# Regularisation, like this fraction of an extra answer for each side of every pair. It keeps the strength of
-# a method that won every answer finite, and changes others by less than the printed digits.
-PRIOR = 0.1
-
-
 def bradley_terry(
     methods: list[str],
     wins: np.ndarray,  # [raters, methods, methods], wins[r, i, j]: r preferred i to j; a tie is 0.5 each
@@ -267,7 +267,6 @@ def _fit(wins: np.ndarray) -> np.ndarray:
     return theta - theta.mean()
 
 
-HARD = 4  # of 5: a photo rated this or more is hard
 Counts = np.ndarray  # [raters, 2]: successes, trials
 
 

@@ -24,6 +24,18 @@ from ambiguous_wild.metrics.image import psnr
 if TYPE_CHECKING:
     from ambiguous_wild.splat.gaussians import Gaussians
 
+AXES = {
+    sign + axis: (-1.0 if sign else 1.0) * row for sign in ("", "-") for axis, row in zip("xyz", np.eye(3))
+}
+_FLOOR = 0.02  # share of the Gaussians around the middle that lie below the floor
+FORMATS: Mapping[str, tuple[str, Callable[[Path], dict[str, np.ndarray]]]] = {
+    "ply": (".ply", read_splat_ply),
+    "compressed-ply": (".compressed.ply", compressed_ply.read_compressed_ply),
+    "spz": (".spz", spz.read_spz),
+    "sog": (".sog", sog.read_sog),
+    "gltf": (".glb", gltf.read_gltf),
+}
+
 
 @dataclass(frozen=True)
 class Space:
@@ -210,12 +222,6 @@ class Renderer:
         return to_uint8(drawn.image.numpy())
 
 
-AXES = {
-    sign + axis: (-1.0 if sign else 1.0) * row for sign in ("", "-") for axis, row in zip("xyz", np.eye(3))
-}
-_FLOOR = 0.02  # share of the Gaussians around the middle that lie below the floor
-
-
 def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:
     """Return a place in which an axis of `AXES` points up and the floor below the scene's middle is at zero.
 
@@ -236,15 +242,6 @@ def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:
     turn, _ = Rotation.align_vectors([AXES[axis]], [place.rotation.T @ space.up])
     a, b, c, d = turn.as_quat().tolist()
     return SceneTransform((x, y, z), place.scale, (d, a, b, c))
-
-
-FORMATS: Mapping[str, tuple[str, Callable[[Path], dict[str, np.ndarray]]]] = {
-    "ply": (".ply", read_splat_ply),
-    "compressed-ply": (".compressed.ply", compressed_ply.read_compressed_ply),
-    "spz": (".spz", spz.read_spz),
-    "sog": (".sog", sog.read_sog),
-    "gltf": (".glb", gltf.read_gltf),
-}
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,12 @@ MOST_POINTS = 20_000  # moving and static features of all photos
 MOST_MASK_BYTES = 300_000  # text of the masks of all models
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
+WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
+MAP_WIDTHS = (1300, 1000, 800)  # px
+_QUALITY = 78
+_MASK_WIDTH = 480  # px; largest width of masks
+_NEAR = 0.01  # nearest depth, as in training
+_MARGIN = 0.15  # share of the picture beyond each side that is still counted
 
 
 @dataclass(frozen=True)
@@ -211,12 +217,6 @@ def _fill(title: str, data: Mapping[str, object], models: str) -> str:
     )
 
 
-WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
-MAP_WIDTHS = (1300, 1000, 800)  # px
-_QUALITY = 78
-_MASK_WIDTH = 480  # px; largest width of masks
-
-
 def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
     """Return a data: address of each photo as JPEG, at the largest width at which all fit `most_bytes`.
 
@@ -268,10 +268,6 @@ def _mask(path: Path, width: int) -> str:
     black_and_white = ((narrowed(read_gray(path), width) > 127) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_PNG_BILEVEL, 1]
     return data_uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
-
-
-_NEAR = 0.01  # nearest depth, as in training
-_MARGIN = 0.15  # share of the picture beyond each side that is still counted
 
 
 def reduced(

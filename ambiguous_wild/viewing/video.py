@@ -23,6 +23,9 @@ _TILT_DEG = 15.0  # angle of an orbit's cameras above the middle
 _WIDTH, _HEIGHT, _VIEWS = 960, 540, 8  # px and number of cameras without a scene
 _AWAY = 3.0  # distance of these cameras, relative to the Gaussians' median distance from their middle
 _MOST_POINTS = 20_000
+_GAP = 4  # px between pictures
+_MOST_SIDE = 8192  # px; largest side of a frame
+_GIF_COLOURS = 128
 
 
 def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
@@ -218,10 +221,6 @@ def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarr
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
     return pose
 
-
-_GAP = 4  # px between pictures
-_MOST_SIDE = 8192  # px; largest side of a frame
-_GIF_COLOURS = 128
 
 Frame = np.ndarray  # [H, W, 3] uint8
 Tick = Callable[[int, int], None]

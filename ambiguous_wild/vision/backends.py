@@ -47,6 +47,8 @@ FEATURES = ("labhog", "sceneconv", *CONV, *DINO)
 INSTANCES = ("graph", *CONV, *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")
 Config = TypeVar("Config")
 _OPTION = re.compile(r",\s*([A-Za-z_][\w.]*)=([^,]*)$")
+# Metadata of an option whose default depends on the machine: a command that repeats a run elsewhere names it.
+BY_MACHINE = {"by_machine": True}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,10 +240,6 @@ def _weights(options: dict[str, str], key: str = "weights") -> tuple[Path | None
 def _no_options(parsed: Spec, spec: str) -> None:
     if parsed.options or parsed.size is not None:
         raise AwError(f"features {spec!r}: {parsed.name} takes no options")
-
-
-# Metadata of an option whose default depends on the machine: a command that repeats a run elsewhere names it.
-BY_MACHINE = {"by_machine": True}
 
 
 def first_here(*specs: str) -> str:

@@ -37,6 +37,12 @@ BLOCKS = (
 )  # fmt: skip
 # Last block of a resolution: name of the layer -> (block, stride in px, channels)
 LAYERS = {"stride4": (2, 4, 24), "stride8": (4, 8, 40), "stride16": (10, 16, 112), "stride32": (14, 32, 192)}
+_VGG = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
+# name of the layer -> (entries of _VGG, stride in px, channels)
+_VGG_LAYERS = {
+    "relu1_2": (2, 1, 64), "relu2_2": (5, 2, 128), "relu3_3": (9, 4, 256), "relu4_3": (13, 8, 512),
+    "relu5_3": (17, 16, 512),
+}  # fmt: skip
 
 
 class Block(nn.Module):
@@ -106,14 +112,6 @@ def _folded(
     total = kernel - stride  # the odd pixel goes right and below
     low, high = total // 2, total - total // 2
     return nn.Sequential(nn.ZeroPad2d((low, high, low, high)), net)
-
-
-_VGG = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
-# name of the layer -> (entries of _VGG, stride in px, channels)
-_VGG_LAYERS = {
-    "relu1_2": (2, 1, 64), "relu2_2": (5, 2, 128), "relu3_3": (9, 4, 256), "relu4_3": (13, 8, 512),
-    "relu5_3": (17, 16, 512),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)

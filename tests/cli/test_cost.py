@@ -12,7 +12,7 @@ from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import cell_folder, grouped, plan_cells
 from ambiguous_wild.splat.pace import TrainConfig
-from tests.harness.fake_cost import cost_run
+from tests.report.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene
 
 

@@ -15,7 +15,7 @@ from ambiguous_wild.harness.measures import Metric, load_metrics, measure, metri
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_png_rgb
 from tests.command_line import aw
-from tests.harness.board_runs import write_run, write_scene
+from tests.report.board_runs import write_run, write_scene
 
 OWN = """
 from ambiguous_wild import Metric

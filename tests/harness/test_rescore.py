@@ -22,7 +22,7 @@ from ambiguous_wild.harness.store import could_be_measured
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.report.rescore import rescore
-from tests.harness.board_runs import write_run, write_scene
+from tests.report.board_runs import write_run, write_scene
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from ambiguous_wild.study.answers import read_key
 from tests.builder.capture_maker import HEIGHT, WIDTH, write_capture
 from tests.command_line import ROOT, aw
 from tests.datasets import layouts
-from tests.harness.clean_tables import clean_tables, write
+from tests.report.clean_tables import clean_tables, write
 from tests.study.studies import panel, write_panel
 from tests.tiny_scene import write_tiny_scene
 

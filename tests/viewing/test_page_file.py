@@ -25,7 +25,7 @@ from ambiguous_wild.viewing import page_file
 from ambiguous_wild.viewing.model import RenderSettings
 from ambiguous_wild.viewing.page_file import MAP, importance, reduced
 from tests.command_line import aw
-from tests.harness.board_runs import change_result
+from tests.report.board_runs import change_result
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run
 

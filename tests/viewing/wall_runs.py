@@ -10,7 +10,7 @@ import numpy as np
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
-from tests.harness.board_runs import write_run
+from tests.report.board_runs import write_run
 from tests.tiny_scene import HEIGHT, TRAIN, WALL_Z, WIDTH, wall_colour
 
 SH_C0 = 0.28209479177387814

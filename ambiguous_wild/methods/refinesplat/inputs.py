@@ -25,6 +25,9 @@ from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.precompute import cache_key, cached, instance_labels, photo_features
 from ambiguous_wild.vision.protocols import Features, Instances, SceneFeatures
 
+SHORTEST = 3  # views of a track at least
+FEWEST = 100  # observations that a photo needs to be judged
+
 
 @dataclass(frozen=True)
 class Semantics:
@@ -175,10 +178,6 @@ def train_tracks(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     photo = table[points.track_views]
     used = (photo >= 0) & (points.track_views >= 0)
     return point[used], photo[used], points.track_xy[used]
-
-
-SHORTEST = 3  # views of a track at least
-FEWEST = 100  # observations that a photo needs to be judged
 
 
 def static_instances(

@@ -15,6 +15,9 @@ from torch import Tensor
 
 from ambiguous_wild.splat.backend import backend_of
 
+FAR_MORE = 1.5  # ratio of agreeing pixels from which an offset is accepted
+_WHITE = 255.0  # colours are from 0 to 255
+
 
 def sized(array: np.ndarray, device: torch.device | str) -> Tensor:
     """Copy an array to the device as float32."""
@@ -85,10 +88,6 @@ class Selected:
         if self.shares is not None:
             places = (places + 1.0) * self.shares - 1.0
         return F.grid_sample(self.maps, places, mode=mode, padding_mode=outside, align_corners=False)
-
-
-FAR_MORE = 1.5  # ratio of agreeing pixels from which an offset is accepted
-_WHITE = 255.0  # colours are from 0 to 255
 
 
 def ascending(x: Tensor, dim: int = 0) -> Tensor:

@@ -40,6 +40,7 @@ _JUMPS = 3  # three jumps need half as many rounds as one; more do not help
 _ROUNDS = 8
 _ROUNDS_PIXELS = 504 * 378
 _FLOAT32_EXACT = 1 << 24
+STATIC_QUANTILE = 0.25  # pixels at this quantile are static even if distractors cover two thirds
 
 
 def rounds_for(pixels: int) -> int:
@@ -135,9 +136,6 @@ def _largest_around(labels: Tensor, connectivity: int, dtype: torch.dtype) -> Te
         return F.max_pool2d(x, 3, 1, 1).long().view(-1)
     upright, level = F.max_pool2d(x, (3, 1), 1, (1, 0)), F.max_pool2d(x, (1, 3), 1, (0, 1))
     return torch.maximum(upright, level).long().view(-1)
-
-
-STATIC_QUANTILE = 0.25  # pixels at this quantile are static even if distractors cover two thirds
 
 
 class PixelEvidence:

@@ -27,6 +27,9 @@ from ambiguous_wild.methods.refinesplat.maps import spread_of
 
 Variant = Literal["sigmoid", "softmax"]
 Statistic = Literal["structure", "entropy", "surprise", "contrast", "evidence"]
+THETA_LIMIT = 8.0  # |theta| beyond this, sigmoid(theta) rounds to 0 or 1 in float32
+TEMPERATURE = 0.1  # nats, temperature of the soft threshold by which w2 is learnt
+RATE = 1.0  # rate of plain gradient steps on theta, each clipped to 1
 
 
 def entropy(logits: Tensor, variant: Variant = "sigmoid") -> Tensor:
@@ -76,9 +79,6 @@ def _x_log_x(log_p: Tensor) -> Tensor:
 
 
 Form = Literal["kapur", "literal", "hard", "statistics"]
-THETA_LIMIT = 8.0  # |theta| beyond this, sigmoid(theta) rounds to 0 or 1 in float32
-TEMPERATURE = 0.1  # nats, temperature of the soft threshold by which w2 is learnt
-RATE = 1.0  # rate of plain gradient steps on theta, each clipped to 1
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,8 @@ _EPS = np.float32(EPS)
 # of the learning rate, even if v is 0 and the denominator is eps = 1e-15.
 _TINY_M = np.float32(1e-30)
 _TINY_V = np.float32(1.2e-38)
+_MAGNITUDE = np.int32(0x7FFFFFFF)  # all bits of a float32 but its sign
+_INFINITY = np.int32(0x7F800000)  # as an integer: finite magnitudes are smaller, NaN is larger
 
 
 @inner_kernel
@@ -184,10 +186,6 @@ def dense_step(
     """Step every value in place; arguments as for `Backend.adam_step`."""
     arrays = *flat(parameter, moments), gradient.numpy().reshape(-1)
     dense(*arrays, *step_size(rate, steps), 8 * threads())
-
-
-_MAGNITUDE = np.int32(0x7FFFFFFF)  # all bits of a float32 but its sign
-_INFINITY = np.int32(0x7F800000)  # as an integer: finite magnitudes are smaller, NaN is larger
 
 
 @kernel

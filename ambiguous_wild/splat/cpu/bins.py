@@ -40,6 +40,10 @@ SPAN_ROWS = 3  # rows of tiles whose spans are stored between the two passes; fe
 SPANS = 2 + 2 * SPAN_ROWS  # int16 values of a Gaussian: first and last row, first and last column of each row
 _AHEAD = 8  # ranks between a record that is used and one that is prefetched; records lie in another order
 _SLACK = 1e-3  # px, so that float32 rounding loses no pixel; the alpha test decides
+PIXELS = TILE * TILE
+SIDE = 4  # px, width and height of a block
+BLOCK = SIDE * SIDE
+ACROSS = TILE // SIDE  # blocks along a side of a tile; block b lies in row b // 4 and column b % 4
 
 
 @kernel
@@ -224,12 +228,6 @@ def scatter(order, records, width, columns, spans, offsets, histogram, tile_slot
                     tile_slots[at] = slot
                     tile_instances[at] = instance
                     instance += 1
-
-
-PIXELS = TILE * TILE
-SIDE = 4  # px, width and height of a block
-BLOCK = SIDE * SIDE
-ACROSS = TILE // SIDE  # blocks along a side of a tile; block b lies in row b // 4 and column b % 4
 
 
 @kernel

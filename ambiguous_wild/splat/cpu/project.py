@@ -40,6 +40,20 @@ C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+BLUR = 0.3  # px^2 added to both variances unless a method says otherwise
+NEAR = 0.01  # smallest depth that is drawn
+MIN_ALPHA = 1.0 / 255.0
+CHUNK = 1024  # Gaussians of a work item; records of a chunk are contiguous
+GROUP = 64  # Gaussians whose values are transposed together, and then computed eight at a time
+RECORD = 16  # floats a record: one cache line
+# Fields of a record.
+MX, MY, SLANT, CURVE_X, CURVE_Y, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
+EXTENT_X, EXTENT_Y, VARIANCE_Y, VARIANCE_X, HALF_WIDTH, OPACITY = range(10, 16)
+_LOG2E = 1.4426950408889634
+_LOG_255 = math.log(255.0)
+_FAR_PX = 1e15  # centres farther out have no accurate position in float32
+_HUGE = 1e30
+_SHORT = 1e-30  # least norm of a quaternion: its gradient is divided by it, and float32 ends at 3e38
 
 
 @fused_kernel
@@ -149,24 +163,6 @@ def colours(means, sh0, sh_rest, degree, centre, records, ids, counts, radii, ba
         _colours_chunk(
             first, first + counts[chunk], means, sh0, sh_rest, degree, centre, records, ids, radii, base
         )
-
-
-BLUR = 0.3  # px^2 added to both variances unless a method says otherwise
-NEAR = 0.01  # smallest depth that is drawn
-MIN_ALPHA = 1.0 / 255.0
-CHUNK = 1024  # Gaussians of a work item; records of a chunk are contiguous
-GROUP = 64  # Gaussians whose values are transposed together, and then computed eight at a time
-RECORD = 16  # floats a record: one cache line
-
-# Fields of a record.
-MX, MY, SLANT, CURVE_X, CURVE_Y, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
-EXTENT_X, EXTENT_Y, VARIANCE_Y, VARIANCE_X, HALF_WIDTH, OPACITY = range(10, 16)
-
-_LOG2E = 1.4426950408889634
-_LOG_255 = math.log(255.0)
-_FAR_PX = 1e15  # centres farther out have no accurate position in float32
-_HUGE = 1e30
-_SHORT = 1e-30  # least norm of a quaternion: its gradient is divided by it, and float32 ends at 3e38
 
 
 @fused_kernel

@@ -24,6 +24,13 @@ from ambiguous_wild.splat.cpu.compile import intrinsic
 LANES = 8  # of doubles
 _F32, _I32, _I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _ELEMENTS = {"f32": _F32, "f64": ir.DoubleType(), "mask": ir.IntType(1)}
+# 2^f on [-0.5, 0.5], least largest relative error with 2^0 exact: 9e-8 before rounding.
+_EXP2 = (1.0, 0.693146977594, 0.240222420792, 0.055507337491, 0.00967151301, 0.00132647263)
+_ROUND = 12582912.0  # 1.5 * 2^23: adding it rounds to an integer kept in the low bits
+_LN2 = math.log(2.0)
+_LN2_HIGH = float.fromhex("0x1.62e42feep-1")  # its products with whole numbers below 2^20 are exact
+_LN2_LOW = 1.9082149292705877e-10
+_ROUND64 = 6755399441055744.0  # 1.5 * 2^52, as `_ROUND`
 
 
 class Lanes(types.Type):
@@ -285,11 +292,6 @@ def negated_magnitude(builder: Any, x: Any) -> Any:
     return builder.fneg(_lanewise(builder, "fabs", x))
 
 
-# 2^f on [-0.5, 0.5], least largest relative error with 2^0 exact: 9e-8 before rounding.
-_EXP2 = (1.0, 0.693146977594, 0.240222420792, 0.055507337491, 0.00967151301, 0.00132647263)
-_ROUND = 12582912.0  # 1.5 * 2^23: adding it rounds to an integer kept in the low bits
-
-
 @_unary
 def exp2(builder: Any, x: Any) -> Any:
     """2^value for -126 < value < 127, relative error 2e-7; outside, any number (mask it)."""
@@ -358,12 +360,6 @@ def store_some(typingctx: Any, array: Any, index: Any, value: Any, count: Any) -
         return context.get_dummy_value()
 
     return types.void(array, types.intp, f32x16, types.intp), codegen
-
-
-_LN2 = math.log(2.0)
-_LN2_HIGH = float.fromhex("0x1.62e42feep-1")  # its products with whole numbers below 2^20 are exact
-_LN2_LOW = 1.9082149292705877e-10
-_ROUND64 = 6755399441055744.0  # 1.5 * 2^52, as `_ROUND`
 
 
 @_unary

@@ -32,6 +32,9 @@ from ambiguous_wild.splat.rendered import (
 )
 from ambiguous_wild.splat.step import TrainData, ViewContext
 
+# which function of a recipe fills which hook
+_FILLED_BY = {"model": "change", "shade": "forward", "image": "tone"}
+
 
 @dataclass(frozen=True)
 class Leaf:
@@ -230,10 +233,6 @@ class Learnt(Effect):
     def load_state_dict(self, state: State) -> None:
         for name, adam in self._adam.items():
             adam.load_state_dict(state[name])
-
-
-# which function of a recipe fills which hook
-_FILLED_BY = {"model": "change", "shade": "forward", "image": "tone"}
 
 
 class _Graph:

@@ -15,6 +15,18 @@ from ambiguous_wild.splat.effects.autograd_effect import Leaf
 from ambiguous_wild.splat.effects.device_cameras import on_device
 from ambiguous_wild.splat.gaussians import SH_C0
 
+# constants of the harmonics by degree: 1 to 3 as in 3DGS, 4 as in svox2 and gsplat
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
+    1.445305721320277, -0.5900435899266435,
+)  # fmt: skip
+_C4 = (
+    2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435572892, 0.10578554691520431,
+    -0.6690465435572892, 0.47308734787878004, -1.7701307697799304, 0.6258357354491761,
+)  # fmt: skip
+
 
 def pose_like(camera: Camera, like: Tensor) -> Tensor:
     """Return cam_from_world [3, 4] in the type and on the device of `like`."""
@@ -109,19 +121,6 @@ def with_penalty(values: Tensor, loss: Tensor) -> Tensor:
     """Return the values; a backward pass through them also adds the gradient of `loss` [], with weight 1."""
     tied: Tensor = _Penalty.apply(values, loss)
     return tied
-
-
-# constants of the harmonics by degree: 1 to 3 as in 3DGS, 4 as in svox2 and gsplat
-_C1 = 0.4886025119029199
-_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-_C3 = (
-    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
-    1.445305721320277, -0.5900435899266435,
-)  # fmt: skip
-_C4 = (
-    2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435572892, 0.10578554691520431,
-    -0.6690465435572892, 0.47308734787878004, -1.7701307697799304, 0.6258357354491761,
-)  # fmt: skip
 
 
 def harmonics(directions: Tensor, degree: int) -> Tensor:

@@ -30,6 +30,11 @@ COUNT = 4000  # points on the whole sphere, some 3 degrees apart; those in a pho
 LEAST = 100  # a sphere with fewer points is not used
 BLUR = 0.05  # size of the window that a colour is averaged over, as a share of a photo's longer side
 PHOTOS = 200  # largest number of photos that colours are read from
+SHARE = 0.6  # share of the depth of the nearest points below which nothing belongs
+NEAREST = 0.02  # quantile of depths that counts as that depth
+FEW_POINTS = 20  # cameras with fewer points are ignored
+EVERY = 50  # iterations
+GONE = -9.0  # logit of opacity, so low that density control removes the Gaussian before Adam can raise it
 
 
 class Skybox(Effect):
@@ -114,13 +119,6 @@ def _colours(
         by_photo[k, rows] = cv2.blur(photo, (side, side))[v, u]
     median = np.ma.median(np.ma.masked_invalid(by_photo), axis=0).filled(0.0)
     return np.clip(np.rint(median * 255.0), 0, 255).astype(np.uint8)
-
-
-SHARE = 0.6  # share of the depth of the nearest points below which nothing belongs
-NEAREST = 0.02  # quantile of depths that counts as that depth
-FEW_POINTS = 20  # cameras with fewer points are ignored
-EVERY = 50  # iterations
-GONE = -9.0  # logit of opacity, so low that density control removes the Gaussian before Adam can raise it
 
 
 class NearSpace(Effect):

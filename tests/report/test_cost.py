@@ -29,8 +29,8 @@ from ambiguous_wild.report.cost_plots import draw_all, spread_out
 from ambiguous_wild.report.cost_report import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, read_cost_runs
 from ambiguous_wild.report.cost_targets import first_time, times_to_reach
-from tests.harness.fake_cost import cost_run
 from tests.harness.fake_runs import failed
+from tests.report.fake_cost import cost_run
 
 RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]
 HOSTILE = "=cmd|$x_1$<script>\x1b[31m"

@@ -19,7 +19,7 @@ from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, 
 from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text
 from ambiguous_wild.report.cost_runs import CostRuns, read_cost_runs
 from ambiguous_wild.report.cost_targets import answers
-from tests.harness.fake_cost import cost_run
+from tests.report.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene
 
 RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]

@@ -15,8 +15,8 @@ from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.report.board_edit import check, remove
 from ambiguous_wild.report.board_publish import publish
 from tests.chromium import Browser, needs_chromium
-from tests.harness.board_page import choose, column, heads, names, said, type_in
-from tests.harness.board_runs import write_run
+from tests.report.board_page import choose, column, heads, names, said, type_in
+from tests.report.board_runs import write_run
 from tests.tiny_scene import write_tiny_scene
 
 GOOD = {"iou": 0.8, "precision": 0.9, "recall": 0.85, "images": 6}

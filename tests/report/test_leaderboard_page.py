@@ -17,8 +17,8 @@ from ambiguous_wild.report import board_publish as publishing
 from ambiguous_wild.report.board import read_board
 from ambiguous_wild.report.board_publish import Reported, facts
 from tests.chromium import Browser, needs_chromium
-from tests.harness.board_page import choose, column, heads, names, ranks, said, tick, type_in
-from tests.harness.board_runs import write_run, write_scene
+from tests.report.board_page import choose, column, heads, names, ranks, said, tick, type_in
+from tests.report.board_runs import write_run, write_scene
 
 HOSTILE = '=1+1</script><img src=x onerror="alert(1)">/../../etc'
 REPORTED = (

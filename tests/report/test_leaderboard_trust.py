@@ -26,7 +26,7 @@ from ambiguous_wild.report.board import read_board, write_board
 from ambiguous_wild.report.board_edit import check, remove
 from ambiguous_wild.report.board_publish import publish
 from ambiguous_wild.report.board_reproduce import command as command_of
-from tests.harness.board_runs import change_result, write_run, write_scene
+from tests.report.board_runs import change_result, write_run, write_scene
 
 
 def add(board: Path, *words: object) -> Result:

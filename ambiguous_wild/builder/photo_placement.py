@@ -9,7 +9,6 @@ in a small part of the picture.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,27 +21,25 @@ from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.overlap_graph import bridges, graph_of, groups
 from ambiguous_wild.builder.point_lookup import PointLookup
+from ambiguous_wild.builder.pose_hypothesis import (
+    AGREE,
+    AGREE_NEW,
+    AREA_NEW,
+    PoseHypothesis,
+    reason_against,
+)
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FITS = 0.5  # share of a motion's matches that must fit for a partner to agree
 LEAST_PHOTOS = 3  # smallest number of photos of a model
-AGREE = 2  # smallest number of partners that agree with a photo's place
-AGREE_NEW = 3  # the same for a photo that COLMAP did not place, if less than `AREA_NEW` of it agrees
-RIVAL = 0.7  # relative weight of a second place from which on a photo has two places
 ALIKE_DEG, SAME_DEG = 5.0, 1.0  # largest angle of rotations that agree, and of poses that are one place
 NEAR_DEG = 3.0  # largest angle of poses that may be one place found twice
 SAME_SHARE = 0.1  # of the path's radius: largest distance of positions that are one place
 GRID = 12  # cells a side of the grid on which the area of matches is measured
-LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a distractor
-# The same if all placed photos that share a motion with it agree, and the matches are spread over the photo
-# at least so much of what as many features drawn at random would be: those of a distractor are crowded.
-LITTLE_AREA, LITTLE_SPREAD = 0.05, 0.2
 FIRMLY_JOINED = 4  # pairs across two parts of a capture; with fewer, the smaller part is provisional
-CROWDED = 0.28  # spread of matches below which `AREA_NEW` of a photo must agree
 LEAST_POINTS = 6  # points, which two others observe, that fix how far a photo with one partner is from it
-AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two partners are enough
 PLACES = 3  # largest number of places tried for a photo
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of the points of a place
 ROUNDS = 8  # rounds of placing anew, besides those that only add photos
@@ -53,27 +50,6 @@ COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
 UNSURE_DEG = 0.33  # standard deviation of a rotation above which the photo is provisional: 1 degree is three
 ADJUSTMENTS = 3  # joint adjustments at most
 STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
-
-
-@dataclass(frozen=True)
-class PoseHypothesis:
-    """A possible pose of a photo, and the evidence for it."""
-
-    pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
-    partners: frozenset[int]  # placed photos that agree with it
-    area: float  # share of the photo's textured part that their matches cover
-    spread: float = 1.0  # cells with matches, relative to as many features drawn at random
-    evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)  # motion -> its features
-
-    @property
-    def weight(self) -> float:
-        """Partners times area, because a distractor may have partners but covers little of the photo."""
-        return len(self.partners) * self.area
-
-    @property
-    def crowded(self) -> bool:
-        """Whether the matches are all in a small part of the photo: they may show a distractor."""
-        return self.area < LITTLE_AREA or self.spread < LITTLE_SPREAD
 
 
 class Placement:
@@ -263,7 +239,7 @@ class Placement:
             if best.pose is not None and best.partners:
                 self.hypotheses[photo] = best.pose
             few = pose_now is None and best.area < AREA_NEW
-            reason = _reason(best, rival, AGREE_NEW if few else AGREE)
+            reason = reason_against(best, rival, AGREE_NEW if few else AGREE)
             if reason is None and len(best.partners) < AGREE_NEW:
                 self.provisional.add(photo)
             if reason is not None and self._unopposed(photo, best, rival, points):
@@ -472,21 +448,6 @@ class Placement:
         centres = np.array([centre_of(pose) for pose in self.poses.values()]).reshape(-1, 3)
         apart = np.linalg.norm(centres - np.median(centres, axis=0), axis=1) if len(centres) else np.zeros(1)
         self.radius = float(np.median(apart))  # radius of the path of cameras
-
-
-def _reason(best: PoseHypothesis, rival: PoseHypothesis, needed: int) -> str | None:
-    """Return why a photo cannot stay at its best place; None if it can."""
-    if not best.partners:
-        return "no placed photo agrees with it on a place"
-    if len(best.partners) == 1 < needed:
-        return "only one placed photo agrees with it on a place"
-    if len(best.partners) < needed:
-        return f"only {len(best.partners)} placed photos agree with it on a place"
-    if best.area < LEAST_AREA or (best.area < AREA_NEW and best.spread < CROWDED):
-        return f"only a small part of it agrees with {len(best.partners)} placed photos"
-    if len(rival.partners) >= AGREE and rival.weight > RIVAL * best.weight:
-        return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
-    return None
 
 
 def _cells(features: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -14,9 +14,10 @@ from ambiguous_wild.builder import sfm
 from ambiguous_wild.builder.adjustment import adjustment_options
 from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
 from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
+from ambiguous_wild.builder.photo_placement import Placement
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.placement import Placement, PoseHypothesis, _reason
 from ambiguous_wild.builder.point_lookup import PointLookup
+from ambiguous_wild.builder.pose_hypothesis import PoseHypothesis, reason_against
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -176,16 +177,18 @@ def test_a_photo_without_a_clear_place_is_named_with_the_reason():
         return PoseHypothesis(np.eye(4)[:3], frozenset(range(partners)), area)
 
     nowhere = place(0, 0)
-    assert _reason(place(9, 0.6), place(7, 0.15), 2) is None
-    assert "two places: 6 photos agree on one, 5 on another" in str(_reason(place(6, 0.2), place(5, 0.19), 2))
-    assert "no placed photo" in str(_reason(nowhere, nowhere, 2))
-    assert "only 2 placed photos" in str(_reason(place(2, 0.4), nowhere, 3))
-    assert "small part" in str(_reason(place(5, 0.07), nowhere, 2))
+    assert reason_against(place(9, 0.6), place(7, 0.15), 2) is None
+    assert "two places: 6 photos agree on one, 5 on another" in str(
+        reason_against(place(6, 0.2), place(5, 0.19), 2)
+    )
+    assert "no placed photo" in str(reason_against(nowhere, nowhere, 2))
+    assert "only 2 placed photos" in str(reason_against(place(2, 0.4), nowhere, 3))
+    assert "small part" in str(reason_against(place(5, 0.07), nowhere, 2))
     crowded = PoseHypothesis(
         np.eye(4)[:3], frozenset(range(5)), 0.25, 0.2
     )  # as the matches of a distractor are
-    assert "small part" in str(_reason(crowded, nowhere, 2))
-    assert _reason(place(5, 0.25), nowhere, 2) is None
+    assert "small part" in str(reason_against(crowded, nowhere, 2))
+    assert reason_against(place(5, 0.25), nowhere, 2) is None
 
 
 def test_only_many_photos_are_adjusted_iteratively():

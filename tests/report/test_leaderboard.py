@@ -26,7 +26,7 @@ from ambiguous_wild.report.board import (
     unique_slug,
 )
 from ambiguous_wild.report.board_edit import check
-from tests.harness.board_runs import change_result, write_run, write_scene
+from tests.report.board_runs import change_result, write_run, write_scene
 
 HOSTILE = '=HYPERLINK("x")</script><img src=x onerror=alert(1)>/../../etc'
 

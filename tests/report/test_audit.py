@@ -15,7 +15,7 @@ from ambiguous_wild.cli.table import audit_command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.report.audit import audit
 from ambiguous_wild.report.audit_numbers import AuditFinding, read_tables
-from tests.harness.clean_tables import COLUMNS, Row, clean_tables, write
+from tests.report.clean_tables import COLUMNS, Row, clean_tables, write
 
 ROOT = Path(__file__).resolve().parents[2]
 REPORTED = ROOT / "ambiguous_wild/report/reported"

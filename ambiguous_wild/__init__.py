@@ -17,7 +17,7 @@ __version__ = "0.1.0"
 # imported when they are asked for: the package itself stays quick to import
 _OFFERED = {
     "Metric": "harness.measures",
-    "bench": "harness.bench",
+    "bench": "harness.benchmark",
     "build_scene": "builder.pipeline",
     "open_run": "harness.replay",
     "plan": "harness.mask_plan",

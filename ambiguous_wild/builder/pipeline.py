@@ -19,10 +19,10 @@ from ambiguous_wild.builder.records import SceneRecord
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import SfmCrash
 from ambiguous_wild.builder.stages import Stages
-from ambiguous_wild.builder.workspace import Workspace, build_lock
+from ambiguous_wild.builder.workspace import Workspace
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.io.files import check_output, refuse_foreign_files
+from ambiguous_wild.io.files import check_output, folder_lock, refuse_foreign_files
 from ambiguous_wild.io.scene_folder import read_scene_json, verify_files
 
 # Full disk, quota, permissions, read-only disk, broken disk: the user can repair these.
@@ -90,7 +90,7 @@ def build_scene(
     mask_folder = Path(masks).resolve() if masks is not None else None
     capture = collect(raw, count, mask_folder)
     target = check_output(target)
-    with build_lock(target):
+    with folder_lock(target, "aw build-scene"):
         stages = Stages(
             capture,
             settings,

@@ -13,7 +13,7 @@ PlainSettings = dict[str, str | int | bool | None]  # `BuildSettings` as JSON
 
 
 class ExifRecord(TypedDict, total=False):
-    """`io.exif.Exif` without the values that the file does not state."""
+    """`io.photos.Exif` without the values that the file does not state."""
 
     make: str
     model: str

@@ -12,8 +12,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Any, Generic, TypeVar
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, installed
-from ambiguous_wild.io.files import Held, atomic_dir, file_lock, lock_path, write_json
+from ambiguous_wild.io.files import atomic_dir, write_json
 
 BUILDER = 19  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
@@ -112,23 +111,3 @@ class Workspace:
     def remove(self) -> None:
         """Delete the work folder and everything in it."""
         shutil.rmtree(self.root, ignore_errors=True)
-
-
-@contextmanager
-def build_lock(target: Path) -> Iterator[None]:
-    """Lock `target` for this process.
-
-    Raises:
-        AwError: another process builds the same folder; names it.
-    """
-    with ExitStack() as stack:
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            text = f"process {os.getpid()} since {time.strftime('%H:%M:%S')}"
-            stack.enter_context(file_lock(lock_path(target), text))
-        except OSError as error:
-            raise AwError(f"cannot write beside {target}: {error.strerror}; choose another -o") from error
-        except Held as held:
-            holder = str(held) or "another process"
-            raise AwError(f"{target} is being built by {holder}; wait for it or choose another -o") from None
-        yield

@@ -1,7 +1,4 @@
-"""`aw`: parse, call, print. A command's module is imported only when that command runs.
-
-An option that was renamed since the last version still works under its old name, with a note.
-"""
+"""`aw`: parse, call, print. A command's module is imported only when that command runs."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -22,34 +18,6 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, disk_line, logged_to, unknown
 from ambiguous_wild.core.names import plain
 
-POSITIONAL, GONE = "", None  # new names: only the value is kept; neither name nor value is kept
-_OUT = {"--out": "--output"}
-_JOBS = {"--jobs": "--threads"}
-_SCENE = {"--scene": "--only", "--scene-folder": "--scene"}
-
-# Command -> old name of an option -> present name.
-RENAMED: dict[str, dict[str, str | None]] = {
-    "simulate": {**_OUT, "--sheet": "--pictures", "--no-sheet": "--no-pictures"},
-    "plan": {**_OUT, "--iterations": GONE},
-    "ambiguity-report": {**_OUT, "--masks": "--distractor-masks", "--masks-white": GONE},
-    "capture": {**_JOBS},
-    "screen": {**_JOBS},
-    "build-scene": {**_JOBS, "--masks": "--keep-masks"},
-    "import": {**_JOBS},
-    "package": {**_JOBS},
-    "table": {"--scene": "--only"},
-    "cost": {"--scene": "--only"},
-    "view": {**_SCENE},
-    "video": {**_SCENE},
-    "export": {"--scene-folder": "--scene"},
-    "leaderboard add": {"--scenes": "--scene", "--replace": "--overwrite"},
-    "leaderboard remove": {"--scene": "--only"},
-    "leaderboard publish": {**_OUT},
-    "study make": {**_OUT, "--runs": POSITIONAL, "--only-scene": "--only", "--force": "--overwrite"},
-    "study score": {**_OUT},
-    "weights get": {"--again": "--overwrite"},
-}
-_NAMES_OR_FOLDERS = {"view", "video"}  # --scene was the name of a scene, and is a folder now
 # Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
 # `aw --help` imports no command.
 SECTIONS = {
@@ -111,35 +79,6 @@ _LITTLE = "too little memory; close other programs, raise ulimit -v, or use fewe
 _THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
-def with_new_names(args: Sequence[str]) -> list[str]:
-    """Replace old names of options in the words after `aw`, with a line on stderr for each old name."""
-    length = next((n for n in (2, 1) if " ".join(args[:n]) in RENAMED), 0)
-    command = " ".join(args[:length])
-    names, words = dict(RENAMED.get(command, {})), list(args)
-    if command == "ambiguity-report" and {"keep", "--masks-white=keep"} & {*words}:
-        names["--masks"] = "--keep-masks"
-    renamed, notes = words[:length], dict[str, str]()
-    words = words[length:]
-    while words and words[0] != "--":
-        old, equals, value = words.pop(0).partition("=")
-        following = value or "".join(words[:1])
-        folder = "/" in following or os.path.isdir(following)  # pathlib raises on a long word
-        if old not in names or (command in _NAMES_OR_FOLDERS and old == "--scene" and folder):
-            renamed.append(old + equals + value)
-            continue
-        new = names[old]
-        notes[old] = "not needed any more" if new is GONE else new or "given without a name"
-        if new:
-            renamed.append(new + equals + value)
-        elif new == POSITIONAL and equals:
-            renamed.append(value)
-        elif new is GONE and not equals:
-            del words[:1]
-    for old, new_name in notes.items():
-        click.echo(f"{old} is now {new_name}; the old name works in this version only", err=True)
-    return renamed + words
-
-
 class _LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -157,7 +96,6 @@ class _LazyGroup(click.Group):
         return super().parse_args(ctx, [*for_all, *(w for w in args[:end] if w not in for_all), *args[end:]])
 
     def resolve_command(self, ctx: click.Context, args: list[str]):
-        args = with_new_names(args)
         if args[:1] == ["help"]:  # as in git
             if not args[1:]:
                 click.echo(ctx.get_help())

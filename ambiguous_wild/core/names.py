@@ -50,6 +50,12 @@ def plain(text: str) -> str:
     return "".join(c.encode("unicode_escape").decode() if _unprintable(c) else c for c in str(text))
 
 
+def csv_text(text: str) -> str:
+    """Return a cell that spreadsheets take for text: a leading formula character gets an apostrophe."""
+    text = plain(text) if not str(text).startswith("\t") else "'" + plain(text)
+    return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") else text
+
+
 def _unprintable(char: str) -> bool:
     """Whether it is a control, format or surrogate character, or a line or paragraph separator."""
     return unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")

@@ -22,10 +22,9 @@ from typing import Any, TypedDict
 from urllib.parse import urlsplit
 
 from ambiguous_wild import __version__
-from ambiguous_wild.builder.workspace import build_lock
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io.archive import extract
-from ambiguous_wild.io.files import check_output, own_json, sha256_file, write_json
+from ambiguous_wild.io.files import check_output, folder_lock, own_json, sha256_file, write_json
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 CATALOGUE = Path(__file__).with_name("public.yaml")
@@ -130,7 +129,7 @@ def fetch(
     folder = output / "archives"
     check_output(folder / "file")
     archive = folder / _file_name(data)
-    with build_lock(archive):
+    with folder_lock(archive, "aw fetch"):
         prior = _read_record(folder).get(data.name)
         digest = data.sha256 or (prior["sha256"] if prior is not None else "")
         moved, first = 0, False

@@ -19,7 +19,7 @@ from typing import Any
 
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import check_name
+from ambiguous_wild.core.names import check_name, csv_text
 from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
 from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
@@ -249,5 +249,4 @@ def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 def _cell(value: Any) -> Any:
     if isinstance(value, int):
         return value
-    text = "".join(c if c.isprintable() else " " for c in str(value))
-    return "'" + text if text[:1] in ("=", "+", "-", "@") else text
+    return csv_text("".join(c if c.isprintable() else " " for c in str(value)))

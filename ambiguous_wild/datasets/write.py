@@ -18,7 +18,7 @@ from ambiguous_wild.builder.keep_masks import mask_warnings
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.scene_package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.scene_record import point_checks
-from ambiguous_wild.builder.workspace import build_lock, content_key, versions
+from ambiguous_wild.builder.workspace import content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split
@@ -36,7 +36,14 @@ from ambiguous_wild.datasets.readers import read_foreign
 from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
-from ambiguous_wild.io.files import check_output, refuse_foreign_files, sweep, write_json, write_text
+from ambiguous_wild.io.files import (
+    check_output,
+    folder_lock,
+    refuse_foreign_files,
+    sweep,
+    write_json,
+    write_text,
+)
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
 
@@ -145,7 +152,7 @@ def import_scene(
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)
     target = check_output(target)
-    with build_lock(target):
+    with folder_lock(target, "aw import"):
         existing = _existing(target, key, overwrite)
         if existing is not None:
             return ImportResult(target, existing, why, True)

@@ -55,11 +55,12 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
 
     Raises:
         Busy: another process holds it.
+        AwError: nothing can be written there.
     """
     folder = Path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
             stack.enter_context(file_lock(lock_path(folder), f"{doing} (process {os.getpid()})"))
         except Held as held:
             holder = str(held) or Busy.holder
@@ -68,6 +69,8 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
             )
             busy.holder = holder
             raise busy from None
+        except OSError as error:
+            raise AwError(f"cannot write beside {folder}: {error.strerror}; choose another -o") from error
         yield
 
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, rotation_matrices, shaped
-from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, shaped
+from ambiguous_wild.splat.gaussians import Gaussians, rotation_matrices
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients

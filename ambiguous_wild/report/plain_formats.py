@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.core.names import plain
+from ambiguous_wild.core.names import csv_text, plain
 from ambiguous_wild.harness.measures import MEASURES, Measure
 from ambiguous_wild.report.table_layout import ARROWS, TIE, Column, Row, Table, TableCell
 
@@ -154,12 +154,6 @@ def _markdown(cell: TableCell, column: Column) -> str:
         return text
     value, _, mark = text.rpartition(" (")
     return f"**{value}** ({mark}"
-
-
-def csv_text(text: str) -> str:
-    """Return a cell that spreadsheets take for text: a leading formula character gets an apostrophe."""
-    text = plain(text) if not str(text).startswith("\t") else "'" + plain(text)
-    return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") else text
 
 
 def exact(value: float) -> str:

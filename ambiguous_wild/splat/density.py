@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import State, check_limits
-from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.gaussians import rotation_matrices as rotation_matrices
+from ambiguous_wild.splat.gaussians import Gaussians, rotation_matrices
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
 from ambiguous_wild.splat.training_records import DensityLog

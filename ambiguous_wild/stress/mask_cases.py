@@ -1,4 +1,4 @@
-"""Rows 11 to 24: entropy, thresholds, masks, regulariser, printed formulas, merging, metrics, statistics."""
+"""Mask cases: entropy, thresholds, masks, regulariser, printed formulas, merging, metrics, statistics."""
 
 from __future__ import annotations
 

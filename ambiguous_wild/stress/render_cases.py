@@ -1,4 +1,4 @@
-"""Rows 1 to 7: projection, blending and their gradients."""
+"""Render cases: projection, blending and their gradients."""
 
 from __future__ import annotations
 

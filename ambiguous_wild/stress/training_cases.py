@@ -1,4 +1,4 @@
-"""Rows 8 to 10: repeatability, Adam, density control, photos without gradient."""
+"""Training cases: repeatability, Adam, density control, photos without gradient."""
 
 from __future__ import annotations
 

@@ -213,7 +213,8 @@ def test_motions_come_back_from_their_file(tmp_path):
 
 def set_in_worker(monkeypatch, statement: str) -> None:
     """Run a statement in COLMAP's process before its task."""
-    worker = "import sys; from ambiguous_wild.builder import matched, placing, sfm_worker; "
+    worker = "import sys; from ambiguous_wild.builder import matched, photo_placement, pose_hypothesis; "
+    worker += "from ambiguous_wild.builder import sfm_worker; "
     worker += f"{statement}; sys.argv = ['worker', sys.argv[1]]; sfm_worker.main()"
     real = sfm.subprocess.Popen
 
@@ -294,7 +295,9 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
 def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypatch):
     """Photos are taken out until too few are left: one line, not a crash of COLMAP."""
     write_capture(tmp_path / "raw", 6)
-    set_in_worker(monkeypatch, "placing.AGREE = placing.AGREE_NEW = placing.LITTLE_AREA = 99")
+    set_in_worker(
+        monkeypatch, "photo_placement.AGREE = photo_placement.AGREE_NEW = pose_hypothesis.LITTLE_AREA = 99"
+    )
     with pytest.raises(AwError, match="placed 0 of 6 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500, sfm="fast"))
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from ambiguous_wild.builder.workspace import Workspace, build_lock, content_key
+from ambiguous_wild.builder.workspace import Workspace, content_key
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.files import folder_lock
 
 
 def test_a_stage_runs_once_for_the_same_inputs(tmp_path):
@@ -75,21 +76,10 @@ def test_keys_see_every_part_and_not_the_order_of_dicts():
     assert len({content_key("a", 1), content_key("a", 2), content_key("b", 1), content_key("a", "1")}) == 4
 
 
-def test_one_builder_at_a_time(tmp_path):
-    target = tmp_path / "scene"
-    with build_lock(target):
-        with pytest.raises(AwError, match=f"being built by process {os.getpid()}"), build_lock(target):
-            pass
-        assert (tmp_path / ".scene.lock").exists()
-    assert list(tmp_path.iterdir()) == []
-    with build_lock(target):
-        pass
-
-
 def test_a_lock_file_left_by_a_kill_does_not_block(tmp_path):
     (tmp_path / ".scene.lock").write_text("process 1 since 00:00:00")
     with (
-        build_lock(tmp_path / "scene"),
+        folder_lock(tmp_path / "scene", "aw build-scene"),
         open(tmp_path / ".scene.lock") as handle,
         pytest.raises(BlockingIOError),
     ):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from pathlib import Path
 
 import click
 import pytest
 
-from ambiguous_wild.cli.main import RENAMED, cli, with_new_names
+from ambiguous_wild.cli.main import cli
 
 
 def _walk(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
@@ -70,37 +69,3 @@ def test_overwrite_alone_replaces_what_is_there(name: str) -> None:
     command = click.Command("any", params=[option])
     values = command.make_context("any", ["--overwrite"]).params
     assert values[option.name or ""] in (True, "always")
-
-
-@pytest.mark.parametrize("command", RENAMED)
-def test_old_names_lead_to_options_of_today_and_say_so(
-    command: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for old, new in RENAMED[command].items():
-        assert old not in OPTIONS[command] or (old == "--scene" and "--scene-folder" in RENAMED[command])
-        assert not new or new in OPTIONS[command]
-        kept = [new] if new else []
-        value = [] if new is None else ["x"]
-        assert with_new_names([*command.split(), old, "x", "y"]) == [*command.split(), *kept, *value, "y"]
-        told = capsys.readouterr().err
-        assert told.startswith(f"{old} is now") and told.count("\n") == 1
-
-
-def test_other_words_stay_as_they_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "hall").mkdir()
-    many = ["bench", "--method", ",".join(["refinesplat"] * 30)]  # longer than a file's name may be
-    for words in (
-        ["bench", "--jobs", "2"],
-        ["view", "r", "--scene", "hall"],
-        ["plan", "--", "--out"],
-        many,
-        [],
-    ):
-        assert with_new_names(words) == words
-    assert capsys.readouterr().err == ""
-    assert with_new_names(["plan", "s", "--out=p"]) == ["plan", "s", "--output=p"]
-    old = ["ambiguity-report", "s", "--masks", "m", "--masks-white", "keep"]
-    assert with_new_names(old) == ["ambiguity-report", "s", "--keep-masks", "m"]

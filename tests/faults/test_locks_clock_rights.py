@@ -10,36 +10,25 @@ from contextlib import contextmanager
 
 import pytest
 
-from ambiguous_wild.builder.workspace import build_lock
 from ambiguous_wild.cli import main
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import folder_lock
 from tests.faults.small_disks import read_only, small_disk, writable
 
-LOCKS = {
-    "bench": (
-        lambda folder: folder_lock(folder, "aw bench --method 3dgs"),
-        "from ambiguous_wild.io.files import folder_lock as lock; doing = ('aw bench --method 3dgs',)",
-    ),
-    "build-scene": (
-        build_lock,
-        "from ambiguous_wild.builder.workspace import build_lock as lock; doing = ()",
-    ),
-}
 _HOLD = """
 import sys
 from pathlib import Path
-{lock}
-with lock(Path(sys.argv[1]), *doing):
+from ambiguous_wild.io.files import folder_lock
+with folder_lock(Path(sys.argv[1]), "aw bench --method 3dgs"):
     print("held", flush=True)
     sys.stdin.read()
 """
 
 
 @contextmanager
-def holder(script, folder):
+def holder(folder):
     """A process that holds the folder until it is killed."""
-    words = [sys.executable, "-c", _HOLD.format(lock=script), str(folder)]
+    words = [sys.executable, "-c", _HOLD, str(folder)]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout.readline() == "held\n"
@@ -51,17 +40,18 @@ def holder(script, folder):
         process.stdout.close()
 
 
-@pytest.mark.parametrize("command", LOCKS)
-def test_the_second_command_is_told_who_works_and_takes_over_when_that_one_is_dead(tmp_path, command):
-    lock, script = LOCKS[command]
+def test_the_second_command_is_told_who_works_and_takes_over_from_the_dead(tmp_path):
     folder = tmp_path / "there"
-    with holder(script, folder) as process:
-        with pytest.raises(AwError, match=rf"process {process.pid}.*(wait|another)"), lock(folder):
+    with holder(folder) as process:
+        with (
+            pytest.raises(AwError, match=rf"process {process.pid}.*(wait|another)"),
+            folder_lock(folder, "aw bench"),
+        ):
             pass
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         assert (tmp_path / ".there.lock").exists()  # what the dead one leaves holds nobody up
-        with lock(folder):
+        with folder_lock(folder, "aw bench"):
             pass
     assert list(tmp_path.iterdir()) == []
 
@@ -87,7 +77,7 @@ def bench_words(scene, out):
 def test_a_bench_that_meets_another_ends_with_one_line_and_touches_nothing(scene, tmp_path, capsys):
     run = tmp_path / "runs" / "scene" / "3dgs" / "seed0"
     run.parent.mkdir(parents=True)
-    with holder(LOCKS["bench"][1], run) as process:
+    with holder(run) as process:
         code, lines = aw(capsys, *bench_words(scene, tmp_path / "runs"))
         assert code == 2
         assert len(lines) == 1 and f"process {process.pid}" in lines[0]

@@ -217,8 +217,8 @@ def test_runs_count_each_other_and_forget_the_dead(tmp_path):
         assert one.count() == 1
     code = (
         "import os, sys\nfrom pathlib import Path\n"
-        "from ambiguous_wild.harness.meter import Presence\n"
-        "p = Presence('cpu', Path(sys.argv[1]))\np.announced().__enter__()\nprint(p.count(), flush=True)\n"
+        "from ambiguous_wild.harness.meter import ActiveRuns\n"
+        "p = ActiveRuns('cpu', Path(sys.argv[1]))\np.announced().__enter__()\nprint(p.count(), flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)

@@ -135,7 +135,7 @@ class FakeTime:
 @pytest.fixture
 def fake_time(monkeypatch):
     clock = FakeTime()
-    for module in ("run", "records"):
+    for module in ("run", "training_records"):
         monkeypatch.setattr(f"ambiguous_wild.splat.{module}.time", clock)
     return clock
 

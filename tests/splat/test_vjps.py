@@ -76,7 +76,7 @@ def tensors(gradients: Gradients) -> dict[str, torch.Tensor]:
     """Everything in it, by name."""
     found = {f.name: getattr(gradients, f.name) for f in fields(gradients)}
     found |= dict(found.pop("attributes"))
-    for name, own in found.pop("own").items():
+    for name, own in found.pop("effect_grads").items():
         found |= {f"{name} {key}": value for key, value in own.items()}
     for name, other in found.pop("fields").items():
         found |= {f"{name} {key}": value for key, value in tensors(other).items()}

@@ -80,7 +80,7 @@ def test_without_a_variable_the_default_folder_is_searched(
 
 def test_the_registry_imports_neither_torch_nor_transformers() -> None:
     code = (
-        "import sys; from ambiguous_wild.vision import weights; weights.status();"
+        "import sys; from ambiguous_wild.vision import weight_registry; weight_registry.status();"
         "sys.exit(any(m in sys.modules for m in ('torch', 'transformers', 'safetensors')))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

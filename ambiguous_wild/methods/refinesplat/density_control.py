@@ -24,9 +24,8 @@ from ambiguous_wild.splat.density import (
     NO_SIZE_PRUNING,
     DensityConfig,
     DensityControl,
-    rotation_matrices,
 )
-from ambiguous_wild.splat.gaussians import Gaussians
+from ambiguous_wild.splat.gaussians import Gaussians, rotation_matrices
 from ambiguous_wild.splat.rendered import Gradients
 
 if TYPE_CHECKING:

@@ -22,8 +22,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.density import rotation_matrices
-from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
+from ambiguous_wild.splat.gaussians import SH_C0, Gaussians, rotation_matrices
 
 Overlap = Literal["normalised", "literal"]
 EIGEN_FLOOR = 1e-14  # least eigenvalue, as a share of the largest: needles up to 1e7 to 1

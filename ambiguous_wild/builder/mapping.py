@@ -167,7 +167,7 @@ def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[
             part = waiting.pop()
             part.run()
             parts.append(part)
-            for poses in part.apart:
+            for poses in part.split_off:
                 if poses.keys() <= started:  # it grew into the photos that it was taken out of
                     continue
                 started |= poses.keys()

@@ -206,9 +206,9 @@ class Matched:
             mapped = _well_connected(agreed)
             agreed = {pair: found for pair, found in agreed.items() if mapped.issuperset(pair)}
         verified = {}
-        for pair, (number, way) in agreed.items():
+        for pair, (number, decomposition) in agreed.items():
             motion = self.motions[pair][number]
-            pose = np.column_stack([motion.rotations[way], motion.translations[way]])
+            pose = np.column_stack([motion.rotations[decomposition], motion.translations[decomposition]])
             verified[pair] = pose, motion.matches
         self.write_verified(database, verified)
 
@@ -229,9 +229,9 @@ class Matched:
         with np.load(path, allow_pickle=False) as file:
             cuts = np.cumsum(file["counts"], axis=0)[:-1]
             matches = np.split(file["matches"], cuts[:, 0])
-            ways = (np.split(file[name], cuts[:, 1]) for name in ("rotations", "translations"))
+            decompositions = (np.split(file[name], cuts[:, 1]) for name in ("rotations", "translations"))
             self.motions = {pair: [] for pair in self.matches}
-            for (a, b), *motion in zip(file["pairs"].tolist(), matches, *ways):
+            for (a, b), *motion in zip(file["pairs"].tolist(), matches, *decompositions):
                 self.motions[a, b].append(Motion(*motion))
 
 

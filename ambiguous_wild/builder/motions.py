@@ -22,7 +22,7 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 LEAST = 15  # smallest number of matches of a motion
 MOTIONS = 3  # largest number of motions of a pair
-WAYS = 3  # poses that explain one motion: a plane allows two more
+DECOMPOSITIONS = 3  # poses that explain one motion: a plane allows two more
 ERROR_PX = 2.0  # largest distance of a match from its motion
 CLOSED_DEG = 4.0  # largest rotation left over around a closed triplet
 ROUNDS = 4  # rounds of voting
@@ -99,24 +99,30 @@ def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]
             break
         inside = mask.ravel() > 0
         _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
-        ways = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:WAYS]
-        ways = [_refined(way, a[inside], b[inside]) for way in ways]
-        models.append(Motion(left[inside], np.array([r for r, _ in ways]), np.array([t for _, t in ways])))
+        poses = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:DECOMPOSITIONS]
+        poses = [_refined(pose, a[inside], b[inside]) for pose in poses]
+        models.append(
+            Motion(
+                left[inside],
+                np.array([r for r, _ in poses]),
+                np.array([t for _, t in poses]),
+            )
+        )
         left = left[~inside]
     return models
 
 
 def _refined(
-    way: tuple[np.ndarray, np.ndarray], a: np.ndarray, b: np.ndarray
+    pose: tuple[np.ndarray, np.ndarray], a: np.ndarray, b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine a pose to the least error: with a long lens, RANSAC's is off by several degrees."""
     first, second = (np.column_stack([x, np.ones(len(x))]) for x in (a, b))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second /= np.linalg.norm(second, axis=1, keepdims=True)
-    start = pycolmap.Rigid3d(np.column_stack(way))
+    start = pycolmap.Rigid3d(np.column_stack(pose))
     refined = pycolmap.refine_relative_pose(start, first, second, np.ones(len(a), bool))
     if refined is None:
-        return way
+        return pose
     pose = np.asarray(refined["cam2_from_cam1"].matrix())
     return pose[:, :3], pose[:, 3]
 
@@ -241,14 +247,14 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
     """
     connected = sorted(pair for pair, found in pairs.items() if found)
     at = {pair: k for k, pair in enumerate(connected)}
-    rotations = np.full((len(connected), MOTIONS * WAYS, 3, 3), np.nan)
-    prior = np.zeros((len(connected), MOTIONS * WAYS))
+    rotations = np.full((len(connected), MOTIONS * DECOMPOSITIONS, 3, 3), np.nan)
+    prior = np.zeros((len(connected), MOTIONS * DECOMPOSITIONS))
     for pair, k in at.items():
         total = sum(len(motion.matches) for motion in pairs[pair])
         for m, motion in enumerate(pairs[pair]):
-            ways = slice(m * WAYS, m * WAYS + len(motion.rotations))
-            rotations[k, ways] = motion.rotations
-            prior[k, ways] = len(motion.matches) / total
+            columns = slice(m * DECOMPOSITIONS, m * DECOMPOSITIONS + len(motion.rotations))
+            rotations[k, columns] = motion.rotations
+            prior[k, columns] = len(motion.matches) / total
     exists = ~np.isnan(rotations[:, :, 0, 0])
     edges = _triplets(connected, at)
     closings = [_closed(rotations, edges, start) for start in range(0, len(edges), _CHUNK)]
@@ -256,7 +262,7 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
     votes = exists.astype(float)
     for _ in range(ROUNDS):
         votes = _vote(votes, prior, edges, rows)
-    return {pair: votes[k].reshape(MOTIONS, WAYS) for pair, k in at.items()}
+    return {pair: votes[k].reshape(MOTIONS, DECOMPOSITIONS) for pair, k in at.items()}
 
 
 def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
@@ -269,7 +275,7 @@ def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
 
 
 def _closed(rotations: np.ndarray, edges: np.ndarray, start: int) -> np.ndarray:
-    """Return [R, 4]: row of `edges` from `start` on, and one motion of each of its pairs that close it."""
+    """Return the triplets whose rotations compose to the identity, [R, 4]: triplet, motion of each edge."""
     first, second, direct = rotations[edges[start : start + _CHUNK].T]
     around = np.einsum("tbxz,tazy->tabxy", second, first)
     trace = np.einsum("tabxy,tcxy->tabc", around, direct)
@@ -279,14 +285,14 @@ def _closed(rotations: np.ndarray, edges: np.ndarray, start: int) -> np.ndarray:
 
 def _vote(votes: np.ndarray, prior: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:
     best = votes.max(axis=1)
-    count, ways = votes.shape
-    gained, possible = np.zeros((count, ways)), np.zeros(count)
+    count, columns = votes.shape
+    gained, possible = np.zeros((count, columns)), np.zeros(count)
     for k in range(3):
         p, q = (x for x in range(3) if x != k)
         np.add.at(possible, edges[:, k], best[edges[:, p]] * best[edges[:, q]])
         rows = closed[:, 0]
         weight = votes[edges[rows, p], closed[:, 1 + p]] * votes[edges[rows, q], closed[:, 1 + q]]
-        top = np.zeros((len(edges), ways))
+        top = np.zeros((len(edges), columns))
         np.maximum.at(top, (rows, closed[:, 1 + k]), weight)
         np.add.at(gained, edges[:, k], top)
     return (gained + PRIOR * prior) / (possible[:, None] + PRIOR)
@@ -296,7 +302,7 @@ def agreed_motions(
     pairs: Mapping[Pair, Sequence[Motion]],
     votes: Mapping[Pair, np.ndarray],  # as `cycle_votes` returns them
 ) -> dict[Pair, tuple[int, int]]:
-    """Return the motion of each pair, and its way, that agrees with the rotations of its two photos.
+    """Return of each pair the motion, and its decomposition, that is closest to the global rotations.
 
     Rotations are chosen photo by photo, as most votes of the partners want it, until none changes. Every
     partner counts once, however many matches it has. Pairs without such a motion are left out.

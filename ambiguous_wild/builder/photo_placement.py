@@ -68,24 +68,24 @@ class Placement:
         self.left_out: dict[int, str] = {}  # photo -> reason
         self.provisional: set[int] = set()  # placed photos with little evidence
         self.hypotheses: dict[int, np.ndarray] = {}  # best pose of photos, those left out among them
-        self.apart: list[dict[int, np.ndarray]] = []  # poses of photos that agree among themselves alone
+        self.split_off: list[dict[int, np.ndarray]] = []  # poses of photos that agree among themselves alone
         self.joined: list[frozenset[int]] = []  # photos of parts that were placed alone and then joined
         self._use_model(model)
 
     def run(self) -> None:
         """Place all photos anew, one after another, until none moves, or hardly any of many."""
-        outs = [0] * len(self.matched.ids)
+        times_out = [0] * len(self.matched.ids)
         for _ in range(SPLITS):
             if len(self.poses) < LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
                 break
-            self._settle(outs)
+            self._place_until_stable(times_out)
             parts = self._keep_largest()
             if not parts and len(self.poses) >= LEAST_PHOTOS:
                 self._triangulate_and_adjust(final=True)
                 parts = self._keep_largest()
             if not parts:
                 break
-            self.apart += [part for part in parts if len(part) >= LEAST_PHOTOS]
+            self.split_off += [part for part in parts if len(part) >= LEAST_PHOTOS]
         else:
             if len(self.poses) >= LEAST_PHOTOS:
                 self._triangulate_and_adjust(final=True)
@@ -97,17 +97,17 @@ class Placement:
             if sum((a in part) != (b in part) for a, b in links) < FIRMLY_JOINED:
                 smaller = min(part & self.poses.keys(), self.poses.keys() - part, key=len)
                 self.provisional |= smaller
-        for photo in range(len(outs)):
+        for photo in range(len(times_out)):
             if photo not in self.poses:
                 self.left_out.setdefault(photo, "too few placed photos agree with it in the end")
 
-    def _settle(self, outs: list[int]) -> None:
-        """Place all photos anew until none moves; `outs` counts how often each was taken out."""
+    def _place_until_stable(self, times_out: list[int]) -> None:
+        """Place all photos anew until none moves; `times_out` counts how often each was taken out."""
         rounds, moved, pairs = 0, True, False
         while moved and rounds <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
             before = set(self.poses)
             self._triangulate_and_adjust(final=False, pairs=pairs)
-            moved = self._place_all(outs, only_out=rounds == ROUNDS)
+            moved = self._place_all(times_out, only_out=rounds == ROUNDS)
             rounds += not set(self.poses) > before
             if not moved and not pairs and self.left_out:
                 # Where photos overlap little, points that two of them observe are all that a third has.
@@ -228,7 +228,7 @@ class Placement:
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
         return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
 
-    def _place_all(self, outs: list[int], only_out: bool) -> bool:
+    def _place_all(self, times_out: list[int], only_out: bool) -> bool:
         """Place all photos; tell whether more than a few changed, or an added one may help others in."""
         rays, points = self.matched.rays(), PointLookup.read(self.matched, self.model)
         moves: dict[int, np.ndarray | None] = {}
@@ -245,13 +245,13 @@ class Placement:
             if reason is not None and self._unopposed(photo, best, rival, points):
                 self.provisional.add(photo)
                 reason = None
-            if reason is None and pose_now is None and (only_out or outs[photo] >= TAKEN_OUT):
+            if reason is None and pose_now is None and (only_out or times_out[photo] >= TAKEN_OUT):
                 reason = "its partners do not settle on a place"
             if reason is not None:
                 self.left_out[photo] = reason
                 if pose_now is not None:
                     moves[photo] = None
-                    outs[photo] += 1
+                    times_out[photo] += 1
                 continue
             self.places[photo] = best
             if not only_out and not self._same(best.pose, pose_now):
@@ -328,7 +328,7 @@ class Placement:
         return PoseHypothesis(pose, partners, self._area(photo, rows), self._spread(photo, rows), evidence)
 
     def _rival_by_motions(self, photo: int, agree: frozenset[int]) -> PoseHypothesis:
-        """Return the place that most other placed partners imply, by motions that turn the photo alike."""
+        """Return the strongest rival: the largest cluster of relative poses that agree in rotation."""
         owners, turns, rows = [], [], []
         for pair in self.pairs[photo]:
             other = pair[0] + pair[1] - photo

@@ -324,13 +324,15 @@ def _check_effects(
     methods: Collection[MethodEntry],
 ) -> None:
     """Raise AwError for an unknown effect, or effects or a plan that no method would use."""
-    from ambiguous_wild.harness.chosen_effects import NOT_OURS, check_wanted, takes_effects
+    from ambiguous_wild.harness.chosen_effects import check_wanted, takes_effects
 
     for wanted in choices:
         check_wanted(wanted)
         if wanted not in ("auto", "none") and not any(map(takes_effects, methods)):
             names = ", ".join(method.name for method in methods)
-            raise AwError(f"--effects {wanted} would not be used by {names}: {NOT_OURS}; leave it out")
+            raise AwError(
+                f"--effects {wanted} would not be used by {names}: {EXTERNAL_NO_EFFECTS}; leave it out"
+            )
     if plan is None:
         return
     name = plan if isinstance(plan, str | Path) else plan.scene
@@ -345,13 +347,13 @@ def _check_effects(
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
     """Return a line for each set of effects, each method that cannot take them, each warning of a scene."""
-    from ambiguous_wild.harness.chosen_effects import NOT_OURS, takes_effects
+    from ambiguous_wild.harness.chosen_effects import takes_effects
 
     lines = []
     effects = dict.fromkeys((c.scene.name, c.chosen.effects) for c in cells if c.chosen.effects)
     lines += [f"{scene}: all methods train with the effects {', '.join(names)}" for scene, names in effects]
     without = {c.method.name: c.method for c in cells if effects and not takes_effects(c.method)}
-    lines += [f"{name} trains without effects: {NOT_OURS}" for name in without]
+    lines += [f"{name} trains without effects: {EXTERNAL_NO_EFFECTS}" for name in without]
     for scene in {cell.scene.name: cell.scene for cell in cells}.values():
         lines += [f"warning: {scene.name}: {warning}" for warning in scene.info.get("warnings", ())]
     return lines

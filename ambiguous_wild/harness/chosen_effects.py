@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 MIXED = "test photos may hold distractors"  # begins the note on such a scene in results, tables and pages
 WORDS = ("auto", "none", "all")
-NOT_OURS = "an external program takes none"  # why a method trains without the effects that others have
+EXTERNAL_NO_EFFECTS = (
+    "an external program takes none"  # why a method trains without the effects that others have
+)
 
 
 def scene_protocol(scene: Scene) -> Literal["full", "half"]:

@@ -22,7 +22,7 @@ from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_c
 LEAST = 50  # observations; fewer give no evidence
 LEAST_VIEWS = 6  # photos of a point, to fit four numbers to its colour
 OUTLYING = 4.5  # median deviations from a point's median colour: three standard deviations of noise
-RELIT = 0.5  # if more of a photo's points than this share are far from their medians, its light differs
+RELIT = 0.5  # share of a photo's points far from their median colours above which it counts as relit
 LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they are all at one place
 LEAST_SPREAD = 0.01  # of the colour range, or of the logarithm: smallest median deviation that is used
 MOST = 20_000  # number of points whose view dependence is fitted; more do not change a median

@@ -17,7 +17,7 @@ from ambiguous_wild.core import UNMOVED, AwError, Scene, View
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.callbacks import allowed_cores
 from ambiguous_wild.harness.cell import Cell
-from ambiguous_wild.harness.chosen_effects import NOT_OURS
+from ambiguous_wild.harness.chosen_effects import EXTERNAL_NO_EFFECTS
 from ambiguous_wild.harness.meter import Meter, own_s
 from ambiguous_wild.harness.result_file import Cost, MaskScores, RunResult
 from ambiguous_wild.io.files import atomic_path
@@ -62,7 +62,7 @@ def run_program(cell: Cell, folder: Path) -> RunResult:
         missing=missing,
         masks=_masks(cell.scene, produced.masks, folder / "masks"),
         facts=dict(produced.facts)
-        | {"no_effects": NOT_OURS}
+        | {"no_effects": EXTERNAL_NO_EFFECTS}
         | ({"drawn_by": "ambiguous_wild"} if produced.drawn_by_us else {})
         | ({} if cell.protocol == "full" else {"protocol": cell.protocol}),
         cost=cast(

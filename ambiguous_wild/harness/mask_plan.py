@@ -97,7 +97,7 @@ def _smaller(keep: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     return -torch.nn.functional.adaptive_max_pool2d(-keep[None, None], size)[0, 0]
 
 
-def unexplained(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def residual_mask(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return where a window's mean of photo - render is large, [H, W] bool.
 
     Args:
@@ -131,7 +131,7 @@ def seen_by_others(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarra
     return maximum_filter(near, max(round(WINDOW * max(size)), 3))
 
 
-def supported(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
+def has_sparse_points(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarray:
     """Return the pixels within a window of an SfM point that this and two other photos see, [H, W] bool.
 
     What is visible there is static.
@@ -191,19 +191,19 @@ def occlusion(
             keep = data.user_keep[view]
             seen &= seen_by_others(scene, places[view], (photo.shape[0], photo.shape[1]))
             seen &= True if keep is None else keep.numpy() > 0.5
-            patch = unexplained(photo.numpy(), np.clip(rendered.image.numpy(), 0, 1), seen)
+            patch = residual_mask(photo.numpy(), np.clip(rendered.image.numpy(), 0, 1), seen)
             patches.append(patch)
-            counted.append(patch & ~supported(scene, places[view], patch.shape))
+            counted.append(patch & ~has_sparse_points(scene, places[view], patch.shape))
         return dataclasses.replace(summarise(counted), patches=tuple(patches))
 
 
-def persists(
+def measure_occlusion(
     scene: Scene,
     effects: tuple[str, ...] = (),
     *,
     bar: Callable[..., AbstractContextManager[Any]],
 ) -> Occlusion:
-    """Measure what a probe of `ITERATIONS` cannot explain and, where that is much, one of `SETTLED`.
+    """Train a probe of `ITERATIONS`; where its residual mask is large, one of `SETTLED` iterations counts.
 
     Fine texture is learnt late, a distractor in one photo never. Example: drone photos of fields have 1.5 %
     after 300 iterations and 0.2 % after 1200, a thin distractor in a courtyard 1.5 and 1.4 %.
@@ -370,7 +370,7 @@ def with_masks(plan: EffectsPlan, scene: Scene, bar: Bar = NO_BAR) -> EffectsPla
         AwError: a photo cannot be read.
     """
     colour = plan.effects(("exposure", "appearance"))
-    found = persists(scene, colour, bar=bar)
+    found = measure_occlusion(scene, colour, bar=bar)
     plan = with_occlusion(plan, found)
     if found.share < OCCLUSION:
         return plan

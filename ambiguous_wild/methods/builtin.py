@@ -87,7 +87,7 @@ BUILTIN = (
     ),
     MethodEntry(
         name="desplat",
-        summary="every photo has Gaussians of its own in front of its camera for what only it shows",
+        summary="per-image Gaussians in front of the camera model the transients",
         recipe="ambiguous_wild.methods.desplat:build",
         paper="DeSplat, CVPR 2025 (arXiv 2411.19756)",
     ),

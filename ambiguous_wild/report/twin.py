@@ -1,4 +1,4 @@
-"""A simulated capture like a real one: the evidence of a scene, and the spec that calls for the same effects.
+"""Fit a simulator spec whose measured effects match those of a real scene.
 
 What the scene does not show above the simulator's own values is not named in the spec.
 """

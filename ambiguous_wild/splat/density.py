@@ -1,4 +1,4 @@
-"""3DGS's adaptive density control: clone, split, prune, and an opacity reset that fires.
+"""Adaptive density control of 3DGS: clone, split, prune, reset opacity.
 
 Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5; constants as in gsplat's DefaultStrategy.
 """

@@ -1,7 +1,6 @@
-"""The places of the training loop that a method can fill, and what each of them is given.
+"""Hooks of the training loop that a method can implement, and their arguments.
 
-The loop is short and fixed (see `trainer.py`). A method is a set of parts that fill its places; a part that
-is missing is never called and allocates nothing.
+The loop is short and fixed (see `trainer.py`). A hook that is missing is never called and allocates nothing.
 """
 
 from __future__ import annotations

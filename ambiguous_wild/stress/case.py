@@ -45,7 +45,7 @@ class CaseResult:
     error: float  # worst relative error against float64, or the number of failed checks
     tolerance: float
     why: str  # reason for the tolerance
-    comes_out: str  # the correct result
+    expected: str  # the correct result
     condition: float | None = None  # condition number: relative change of the result over that of the input
 
 
@@ -72,7 +72,7 @@ class StressLine:
     error: float
     tolerance: float
     why: str
-    comes_out: str
+    expected: str
     condition: float | None
     passed: bool
     failure: str = ""  # the error, if the case raised one
@@ -103,14 +103,14 @@ def run(chosen: Case, device: str) -> StressLine:
         text = str(error) if isinstance(error, AwError) else traceback.format_exc(limit=-2)
         return StressLine(chosen.key, device, float("nan"), 0.0, "", "", None, False, text)
     passed = m.error <= m.tolerance  # false for NaN
-    return StressLine(chosen.key, device, m.error, m.tolerance, m.why, m.comes_out, m.condition, bool(passed))
+    return StressLine(chosen.key, device, m.error, m.tolerance, m.why, m.expected, m.condition, bool(passed))
 
 
-def failed_checks(checks: dict[str, bool], comes_out: str) -> CaseResult:
+def failed_checks(checks: dict[str, bool], expected: str) -> CaseResult:
     """A case of exact checks: the error is the number of checks that fail; the tolerance is 0."""
     bad = [name for name, holds in checks.items() if not holds]
     why = "exact" + (f"; wrong: {', '.join(bad)}" if bad else f", {len(checks)} checks")
-    return CaseResult(float(len(bad)), 0.0, why, comes_out)
+    return CaseResult(float(len(bad)), 0.0, why, expected)
 
 
 def worst(parts: Iterable[CaseResult]) -> CaseResult:
@@ -174,7 +174,7 @@ def agree(
     g: Gaussians,
     camera: Camera,
     device: str,
-    comes_out: str,
+    expected: str,
     *,
     layers: int | None = None,  # most Gaussians over one pixel; None = all
     **options: Any,  # passed to `render`
@@ -202,7 +202,7 @@ def agree(
     if not backend_of(device).kernels:
         lost = _lost_by_determinants(parameters, camera, **options)
         bound, why = bound * FAST_MATH * lost, f"{why} x {FAST_MATH} x determinant {lost:.1e}"
-    return CaseResult(error, bound, why, comes_out, condition)
+    return CaseResult(error, bound, why, expected, condition)
 
 
 def _lost_by_determinants(parameters: dict[str, Tensor], camera: Camera, **options: Any) -> float:

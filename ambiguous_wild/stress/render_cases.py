@@ -85,14 +85,14 @@ def not_finite(device: str) -> CaseResult:
     return _others_unchanged(bad, device)
 
 
-def _each_alone(device: str, comes_out: str, *changes: dict[str, object]) -> CaseResult:
+def _each_alone(device: str, expected: str, *changes: dict[str, object]) -> CaseResult:
     """Apply each change to a single Gaussian, so that no other Gaussian hides its error."""
     parts = []
     for change in changes:
         g = stacked_gaussians()
         for name, value in change.items():
             getattr(g, name)[0] = torch.as_tensor(value, dtype=torch.float32)
-        parts.append(agree(g, camera(), device, comes_out, sh_degree=0))
+        parts.append(agree(g, camera(), device, expected, sh_degree=0))
     return worst(parts)
 
 
@@ -186,8 +186,8 @@ def opaque_stack(device: str) -> CaseResult:
     g.opacity_logits[:] = math.log(0.99 / 0.01) - 1e-3  # just below the clamp
     g.log_scales[:] = 2.0
     # two layers at the clamp leave a transmittance of 1e-4, where a pixel stops: at most three are drawn
-    comes_out = "as in float64, though backward divides by 1 - alpha"
-    return agree(g, camera(2, 2), device, comes_out, layers=3, sh_degree=0)
+    expected = "as in float64, though backward divides by 1 - alpha"
+    return agree(g, camera(2, 2), device, expected, layers=3, sh_degree=0)
 
 
 @case(5, "pictures of 1x1, 1xN, no multiple of the tile", devices=BOTH)
@@ -238,7 +238,7 @@ def cameras(device: str) -> CaseResult:
     tele.means[:, :2] *= 1e-4
     tele.log_scales -= 8
     parts.append(agree(tele, Camera(20, 20, 1e5, 1e5, 10.0, 10.0, np.eye(4)), device, "", sh_degree=1))
-    return dataclasses.replace(worst(parts), comes_out="as in float64")
+    return dataclasses.replace(worst(parts), expected="as in float64")
 
 
 @case(7, "gradients against finite differences, on both sides of clamp, cut and stop", devices=BOTH)

@@ -55,7 +55,7 @@ def row(o: StressLine) -> tuple[str, ...]:
     condition = "" if o.condition is None else f"{o.condition:.1e}"
     verdict = "passed" if o.passed else "FAILED"
     return (
-        o.key, o.device, o.comes_out, _figure(o.error), _figure(o.tolerance), o.why, condition, verdict
+        o.key, o.device, o.expected, _figure(o.error), _figure(o.tolerance), o.why, condition, verdict
     )  # fmt: skip
 
 

@@ -269,7 +269,7 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
             self.matched = SimpleNamespace(ids=range(1000), motions=defaultdict(lambda: [1]), rays=list)
             self.pairs = [[(k - 1, k)] * (k > 0) + [(k, k + 1)] * (k < 999) for k in range(1000)]
             self.poses = dict.fromkeys(range(980), np.eye(3, 4))
-            self.apart, self.joined = [], []
+            self.split_off, self.joined = [], []
 
         def _best(self, photo, now, rays, points):
             pose = None if photo > len(self.poses) else np.eye(3, 4)

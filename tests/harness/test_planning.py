@@ -24,7 +24,7 @@ from ambiguous_wild.harness.effects_plan import (
     read_plan,
 )
 from ambiguous_wild.harness.grid import cell_folder, choose, plan_cells, run_cells
-from ambiguous_wild.harness.mask_plan import Occlusion, summarise, unexplained, with_occlusion
+from ambiguous_wild.harness.mask_plan import Occlusion, residual_mask, summarise, with_occlusion
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
@@ -233,13 +233,13 @@ def test_what_a_probe_leaves():
     render = rng.uniform(0.2, 0.8, (90, 160, 3))
     everywhere = np.ones((90, 160), bool)
     photo = np.clip(render + rng.normal(size=render.shape) * 0.1, 0, 1)  # detail that was not learnt
-    assert not unexplained(photo, render, everywhere).any()
+    assert not residual_mask(photo, render, everywhere).any()
     photo[30:60, 40:80] = render[30:60, 40:80] + 0.3
-    patch = unexplained(photo, render, everywhere)
+    patch = residual_mask(photo, render, everywhere)
     truth = np.zeros_like(patch)
     truth[30:60, 40:80] = True
     assert (patch & truth).sum() > 0.9 * truth.sum() and (patch & ~truth).sum() < 0.35 * truth.sum()
-    assert not unexplained(photo, render, ~truth)[truth].any()
+    assert not residual_mask(photo, render, ~truth)[truth].any()
     found = summarise([patch] + [np.zeros_like(patch)] * 9)
     assert found.share == pytest.approx(patch.mean() / 10) and found.worst == pytest.approx(patch.mean())
     assert found.compact == 0.0  # larger than a twentieth of the photo
@@ -265,7 +265,7 @@ def test_what_stands_out_must_stay_when_a_longer_probe_has_learnt_the_rest(monke
         yield SimpleNamespace(update=lambda: ticks.append(total))
 
     monkeypatch.setattr(mask_plan, "occlusion", instead)
-    left = mask_plan.persists("scene", ("exposure",), bar=bar)
+    left = mask_plan.measure_occlusion("scene", ("exposure",), bar=bar)
     assert left.share == share
     assert made == [("scene", ("exposure",), n) for n in rounds]
     assert ticks == rounds

@@ -46,15 +46,17 @@ def test_covered_is_what_was_hidden_in_at_least_half_of_the_views(tmp_path: Path
     assert list(regions.missing) == ["psnr_valid"]
 
 
-@pytest.mark.parametrize(("hidden", "supported"), [(3, True), (4, False)])
-def test_supported_is_what_three_train_views_show(tmp_path: Path, hidden: int, supported: bool) -> None:
+@pytest.mark.parametrize(("hidden", "has_sparse_points"), [(3, True), (4, False)])
+def test_supported_is_what_three_train_views_show(
+    tmp_path: Path, hidden: int, has_sparse_points: bool
+) -> None:
     """Of six train views that all look at a part of the wall."""
     scene = load_scene(scene_with_part_hidden(tmp_path / "scene", hidden))
     regions = find_regions(scene)
     for view in scene.test:
         part, got = part_of_wall(view.camera), regions.pixels["psnr_supported"][view.name]
         inner = cv2.erode(part.astype(np.uint8), np.ones((7, 7))).astype(bool)
-        assert got[inner].mean() == pytest.approx(float(supported), abs=0.1)
+        assert got[inner].mean() == pytest.approx(float(has_sparse_points), abs=0.1)
         assert got[~part].any()
 
 

@@ -12,7 +12,7 @@ def test_row(case):
     outcome = run(case, "cpu")
     assert outcome.failure == ""
     assert outcome.passed, (outcome.error, outcome.tolerance, outcome.why)
-    assert outcome.comes_out
+    assert outcome.expected
 
 
 @pytest.mark.gpu

@@ -29,7 +29,7 @@ from ambiguous_wild.splat.backend import backend_of
 if TYPE_CHECKING:
     from ambiguous_wild.splat.step import Step
 
-PRICE = 3.0  # price of a masked pixel in robust deviations above the median distance, if `disagree` is off
+PRICE = 3.0  # cost of a masked pixel, in MADs above the median distance, if `disagree` is off
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 LEAST = 15  # smallest number of matches of a motion
 MOTIONS = 3  # largest number of motions of a pair
-DECOMPOSITIONS = 3  # poses that explain one motion: a plane allows two more
+MOST_POSES = 3  # poses that explain one motion: a plane allows two more
 ERROR_PX = 2.0  # largest distance of a match from its motion
 CLOSED_DEG = 4.0  # largest rotation left over around a closed triplet
 ROUNDS = 4  # rounds of voting
@@ -99,7 +99,7 @@ def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]
             break
         inside = mask.ravel() > 0
         _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
-        poses = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:DECOMPOSITIONS]
+        poses = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:MOST_POSES]
         poses = [_refined(pose, a[inside], b[inside]) for pose in poses]
         models.append(
             Motion(
@@ -123,8 +123,8 @@ def _refined(
     refined = pycolmap.refine_relative_pose(start, first, second, np.ones(len(a), bool))
     if refined is None:
         return pose
-    pose = np.asarray(refined["cam2_from_cam1"].matrix())
-    return pose[:, :3], pose[:, 3]
+    matrix = np.asarray(refined["cam2_from_cam1"].matrix())
+    return matrix[:, :3], matrix[:, 3]
 
 
 def _plane_poses(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -247,12 +247,12 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
     """
     connected = sorted(pair for pair, found in pairs.items() if found)
     at = {pair: k for k, pair in enumerate(connected)}
-    rotations = np.full((len(connected), MOTIONS * DECOMPOSITIONS, 3, 3), np.nan)
-    prior = np.zeros((len(connected), MOTIONS * DECOMPOSITIONS))
+    rotations = np.full((len(connected), MOTIONS * MOST_POSES, 3, 3), np.nan)
+    prior = np.zeros((len(connected), MOTIONS * MOST_POSES))
     for pair, k in at.items():
         total = sum(len(motion.matches) for motion in pairs[pair])
         for m, motion in enumerate(pairs[pair]):
-            columns = slice(m * DECOMPOSITIONS, m * DECOMPOSITIONS + len(motion.rotations))
+            columns = slice(m * MOST_POSES, m * MOST_POSES + len(motion.rotations))
             rotations[k, columns] = motion.rotations
             prior[k, columns] = len(motion.matches) / total
     exists = ~np.isnan(rotations[:, :, 0, 0])
@@ -262,7 +262,7 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
     votes = exists.astype(float)
     for _ in range(ROUNDS):
         votes = _vote(votes, prior, edges, rows)
-    return {pair: votes[k].reshape(MOTIONS, DECOMPOSITIONS) for pair, k in at.items()}
+    return {pair: votes[k].reshape(MOTIONS, MOST_POSES) for pair, k in at.items()}
 
 
 def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:

@@ -324,7 +324,7 @@ def _check_effects(
     methods: Collection[MethodEntry],
 ) -> None:
     """Raise AwError for an unknown effect, or effects or a plan that no method would use."""
-    from ambiguous_wild.harness.chosen_effects import check_wanted, takes_effects
+    from ambiguous_wild.harness.chosen_effects import EXTERNAL_NO_EFFECTS, check_wanted, takes_effects
 
     for wanted in choices:
         check_wanted(wanted)
@@ -347,7 +347,7 @@ def _check_effects(
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
     """Return a line for each set of effects, each method that cannot take them, each warning of a scene."""
-    from ambiguous_wild.harness.chosen_effects import takes_effects
+    from ambiguous_wild.harness.chosen_effects import EXTERNAL_NO_EFFECTS, takes_effects
 
     lines = []
     effects = dict.fromkeys((c.scene.name, c.chosen.effects) for c in cells if c.chosen.effects)

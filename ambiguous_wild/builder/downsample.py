@@ -19,6 +19,7 @@ from PIL import Image
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import DownsampleResult
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.srgb import linear_to_srgb, srgb_to_linear
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.photos import MIN_SIDE
 
@@ -28,15 +29,11 @@ FILTER = Image.Resampling.BICUBIC  # antialiased: that of gsplat and NerfBaselin
 
 
 def _decode_table() -> np.ndarray:
-    srgb = np.arange(256) / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
+    return srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
 def _encode_table() -> np.ndarray:
-    linear = np.arange(65536) / 65535.0
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.round(255 * srgb).astype(np.uint8)
+    return np.round(255 * linear_to_srgb(np.arange(65536) / 65535.0)).astype(np.uint8)
 
 
 # 65536 steps of linear light are finer than the narrowest step of 8-bit sRGB (1 / 3294).

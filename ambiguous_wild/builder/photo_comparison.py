@@ -17,6 +17,7 @@ import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.core.srgb import srgb_to_linear
 
 SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
@@ -85,7 +86,7 @@ def photo_features(
 def _values(small: np.ndarray, gray: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Measure `QUANTITIES` in a patch around each feature, [F, 4]."""
     codes = small.astype(np.float32) / 255
-    linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    linear = srgb_to_linear(codes)
     size = (2 * _PATCH + 1, 2 * _PATCH + 1)
     colour = cv2.blur(linear, size)
     laplacian = cv2.Laplacian(gray, cv2.CV_32F)

@@ -118,7 +118,7 @@ class SplatfactoColours(Learnt):
         return 0.5 + basis[:, :1] * mlp(hidden, leaf, "dc") + (basis[:, 1:, None] * rest).sum(dim=1)
 
     def background(self, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
-        """Return the background [H, W, 3] of the shot's photo, without an offset."""
+        """Return the background [H, W, 3] of the view context's photo, without an offset."""
         height, width = context.camera.height, context.camera.width
         small = (max(height // 4, 1), max(width // 4, 1))
         rays = ray_directions(context.camera, *small, leaf["photo"])

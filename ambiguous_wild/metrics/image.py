@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.srgb import srgb_to_linear
 
 WINDOW = 11  # px, Wang et al. 2004
 SIGMA = 1.5  # px
@@ -207,15 +208,10 @@ def flip_map(
     Raises:
         AwError: see `checked_pair`.
     """
-    first, second = (_opponent(_linear(picture)) for picture in checked_pair(a, b))
+    first, second = (_opponent(srgb_to_linear(picture)) for picture in checked_pair(a, b))
     colour = _colour_error(_perceived(first), _perceived(second))
     feature = _feature_error(_luminance(first), _luminance(second))
     return colour ** (1.0 - feature)  # equation 7
-
-
-def _linear(image: np.ndarray) -> np.ndarray:
-    """Convert sRGB to linear RGB."""
-    return np.where(image > 0.04045, ((image + 0.055) / 1.055) ** 2.4, image / 12.92)
 
 
 def _xyz_from_rgb() -> np.ndarray:

@@ -21,6 +21,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.srgb import srgb_to_linear
 from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES, Exif, UnreadablePhoto, read_photo
@@ -39,7 +40,6 @@ from ambiguous_wild.simulate.cutouts import (
 )
 from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
 from ambiguous_wild.simulate.placement import CompositeConfig, natural_heights
-from ambiguous_wild.simulate.tracer import srgb_to_linear
 from ambiguous_wild.simulate.truth_records import Spread, spread
 
 _TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos

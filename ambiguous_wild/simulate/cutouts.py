@@ -14,9 +14,9 @@ import numpy as np
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.srgb import linear_to_srgb, srgb_to_linear
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
-from ambiguous_wild.simulate.tracer import linear_to_srgb, srgb_to_linear
 
 SMALLEST_PX = 8  # shorter side
 LARGEST_PX = 1200  # longer side; larger files are reduced
@@ -84,7 +84,9 @@ def premultiplied(rgba: np.ndarray) -> np.ndarray:
         rgba: [H, W, 4] float32 in [0, 1], not premultiplied.
     """
     alpha = rgba[..., 3:]
-    light = np.concatenate([srgb_to_linear(rgba[..., :3]) * alpha, alpha], axis=2).astype(np.float32)
+    light = np.concatenate([srgb_to_linear(rgba[..., :3]).astype(np.float32) * alpha, alpha], axis=2).astype(
+        np.float32
+    )
     return np.pad(light, ((1, 1), (1, 1), (0, 0)))
 
 

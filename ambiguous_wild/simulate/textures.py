@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.simulate.tracer import srgb_to_linear
+from ambiguous_wild.core.srgb import srgb_to_linear
 
 # CC0, public domain or without known restrictions by the docstrings of skimage.data; all in its wheel.
 PHOTOGRAPHS = {
@@ -282,4 +282,4 @@ def poster(name: str) -> np.ndarray:
     scale = 512 / image.shape[1]
     resized = cv2.resize(image, (512, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
     framed = cv2.copyMakeBorder(resized, 18, 18, 18, 18, cv2.BORDER_CONSTANT, value=(0.93, 0.92, 0.88))
-    return srgb_to_linear(framed[::-1]) * np.float32(0.85)
+    return srgb_to_linear(framed[::-1]).astype(np.float32) * np.float32(0.85)

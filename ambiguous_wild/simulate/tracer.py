@@ -34,17 +34,6 @@ class Atlas:
     index: Mapping[str, int]
 
 
-def srgb_to_linear(image: np.ndarray) -> np.ndarray:
-    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def linear_to_srgb(image: np.ndarray) -> np.ndarray:
-    """Convert linear light to sRGB, clipped to [0, 1] (IEC 61966-2-1)."""
-    clipped = np.clip(image, 0.0, 1.0)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-
-
 def build_atlas(textures: Mapping[str, np.ndarray]) -> Atlas:
     """Build mip pyramids by area averaging, in linear light.
 

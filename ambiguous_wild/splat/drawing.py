@@ -1,4 +1,4 @@
-"""One call that draws a shot as the run does: with its effects, fields, SH degree, background and filter."""
+"""One call that draws as the run does: with its effects, fields, SH degree, background and filter."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class SceneRenderer:
     # -- pictures ---------------------------------------------------------------------------------
 
     def __call__(self, gaussians: Gaussians, context: ViewContext, without: Collection[str] = ()) -> Rendered:
-        """Draw the model; effects have already changed the shot's camera."""
+        """Draw the model; effects have already changed the view context's camera."""
         return self.effects.render(gaussians, context, self._compose, without)
 
     def again(self, gaussians: Gaussians, context: ViewContext, without: Collection[str] = ()) -> Rendered:

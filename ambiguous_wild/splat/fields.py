@@ -104,7 +104,7 @@ class Composite:
             fields: the method's fields, which compose.
             drawn: renders of `STATIC` and of the other fields.
             needs: statistics of the backward pass that each other field asks for.
-            context: the shot that was drawn.
+            context: the view context that was drawn.
             vjps: vjps of `Fields.deform`, by field.
         """
         self._deform_vjps = vjps

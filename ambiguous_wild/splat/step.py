@@ -1,4 +1,4 @@
-"""What a part of the training loop is given: the training side of the scene, a shot, and one step."""
+"""What a part of the training loop is given: the training side of the scene, a view context, and one step."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class TrainData:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewContext:
-    """View, camera, photo and time of one picture; every hook gets a shot."""
+    """View, camera, photo and time of one picture; every hook gets a view context."""
 
     iteration: int  # counts from 1; 0 while a test photo is fitted
     nominal: float  # progress of the run times NOMINAL_ITERATIONS, the unit of schedules
@@ -79,7 +79,7 @@ class ViewContext:
         return photos if self.fitting else self.view
 
 
-# draws Gaussians for a shot, without the effects that the last argument names
+# draws Gaussians for a view context, without the effects that the last argument names
 Drawer = Callable[[Gaussians, ViewContext, Collection[str]], Rendered]
 
 

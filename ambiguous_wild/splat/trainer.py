@@ -118,7 +118,7 @@ class Trainer(Run):
         super().load_state(state)
 
     def context(self, camera: Camera, *, fitting: bool = False) -> ViewContext:
-        """Return the shot of a camera that belongs to no train photo, at the present time of the run."""
+        """Return the view context, at the present time of the run, of a camera without a train photo."""
         progress = self.progress(self.iteration)
         nominal = progress * NOMINAL_ITERATIONS
         return ViewContext(

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.core.srgb import linear_to_srgb, srgb_to_linear
 from ambiguous_wild.simulate.capture_writer import look_at
 from ambiguous_wild.simulate.kernels import BOX, CAPSULE, CYLINDER, ELLIPSOID, FAR, PLANAR, QUAD, _intersect
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, between, bounding_radius, placed, shape_table
-from ambiguous_wild.simulate.tracer import Light, build_atlas, linear_to_srgb, srgb_to_linear, trace
+from ambiguous_wild.simulate.tracer import Light, build_atlas, trace
 
 HALF = (0.5, 0.5, 0.8)
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ambiguous_wild.core.srgb import linear_to_srgb
 from ambiguous_wild.harness.effects_plan import Evidence
 from ambiguous_wild.report.twin import SPREAD_OF_STOP, Likeness, arc_of, noise_of, spec_like
 from ambiguous_wild.simulate import image_effects as fx
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.spec import Defocus, Effects
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec
-from ambiguous_wild.simulate.tracer import linear_to_srgb
 from tests.command_line import aw
 
 PLAIN = Evidence(0.0, 0.01, 1.2, 0.004, 5000, photos=30, outward=0.5)

@@ -60,7 +60,7 @@ class Visible:
 class Learnt(Effect):
     """An effect with parameters. Override `leaves`, and one or more of `forward`, `change` and `tone`.
 
-    Each gets `leaf`, the leaves by name; of a leaf per photo it gets the row of the shot's photo.
+    Each gets `leaf`, the leaves by name; of a leaf per photo it gets the row of the view context's photo.
     """
 
     # row of a photo that was not trained on: the start of a fit, and the row of a picture without a photo

@@ -94,7 +94,7 @@ class Effect:
 
         Args:
             effect_grads: gradients of the effect's own parameters, as its vjps returned them.
-            context: shot of the step.
+            context: view context of the step.
             skip_step: on an accelerator [1] float32; 1 = change nothing, whatever the gradients are.
         """
 

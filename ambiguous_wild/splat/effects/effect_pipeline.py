@@ -161,7 +161,7 @@ class EffectPipeline:
 
         Args:
             gaussians: the trained model; it does not change.
-            context: shot of the photo, with `fitting`.
+            context: view context of the photo, with `fitting`.
             photo: [H, W, 3] in [0, 1]; it is not read outside of `keep`.
             keep: [H, W], 1 where the fit may read the photo.
             draw: the render call.
@@ -239,7 +239,7 @@ class EffectRender:
             rendered: render of the back end.
             image, alpha: pictures after the image effects.
             drawn: Gaussians that the back end drew.
-            context: shot of the picture.
+            context: view context of the picture.
             model_pulls, frame_pulls: vjps in the order in which the effects acted.
             posing: effects that learn from the camera's gradient.
         """

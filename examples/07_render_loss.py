@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks, RenderLeaves
 from ambiguous_wild.splat.step import Step
 
 
@@ -23,10 +22,9 @@ class Smooth(MaskPolicy):
     def __init__(self, config: Config):
         self.config = config
 
-    def cotangent(self, step: Step, keep: torch.Tensor | None) -> Cotangents:
-        image = step.rendered.image.detach().requires_grad_()  # [H, W, 3]; the renderer has no autograd graph
-        variation = image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean()
-        return Cotangents(image=torch.autograd.grad(self.config.weight * variation, image)[0])
+    def loss(self, render: RenderLeaves, step: Step, keep: torch.Tensor | None) -> torch.Tensor:
+        image = render.image  # [H, W, 3]
+        return self.config.weight * (image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean())
 
 
 def smooth(config: Config) -> MethodHooks:

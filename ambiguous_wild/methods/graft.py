@@ -5,7 +5,7 @@ ones. The places, and what a donor fills them with:
 
 mask         the keep map (`MaskPolicy.keep`, `predict`), and what it learns
 density      the density control and its config
-regulariser  the donor policy's loss on the render (`MaskPolicy.cotangent`), under the host's keep map
+regulariser  the donor policy's loss on the render (`MaskPolicy.loss`), under the host's keep map
 effects      the donor's own effects (`MethodHooks.effects`) instead of the host's
 
 Everything else stays the host's: schedule, how the keep map enters SSIM, which photos. Grafts that cannot

@@ -86,7 +86,8 @@ def _check_mask(host: Member, donor: Member) -> None:
 
 def _check_regulariser(donor: Member) -> None:
     own = type(donor.parts.mask)
-    losses = own.cotangent is not MaskPolicy.cotangent or own.gradients is not MaskPolicy.gradients
+    hooks = ("loss", "cotangent", "gradients")
+    losses = any(getattr(own, n) is not getattr(MaskPolicy, n) for n in hooks)
     if donor.name not in NOTHING and (own.learns_by_gradients or not losses):
         raise AwError(
             f"regulariser={donor.name} would add nothing: {donor.name} has no loss of this kind; name a "

@@ -84,9 +84,7 @@ def premultiplied(rgba: np.ndarray) -> np.ndarray:
         rgba: [H, W, 4] float32 in [0, 1], not premultiplied.
     """
     alpha = rgba[..., 3:]
-    light = np.concatenate([srgb_to_linear(rgba[..., :3]).astype(np.float32) * alpha, alpha], axis=2).astype(
-        np.float32
-    )
+    light = np.concatenate([srgb_to_linear(rgba[..., :3]) * alpha, alpha], axis=2).astype(np.float32)
     return np.pad(light, ((1, 1), (1, 1), (0, 0)))
 
 

@@ -15,13 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.fields import Fields
 from ambiguous_wild.splat.gaussians import LEAST_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR
-from ambiguous_wild.splat.rendered import Cotangents, Gradients
+from ambiguous_wild.splat.rendered import Cotangents, Gradients, Rendered
 from ambiguous_wild.splat.step import Step, TrainData
 
 # Share of the Gaussians that a run may have: `more_points` fill the start up to it, and more points than the
@@ -31,6 +32,50 @@ START_SHARE = 2 / 3
 
 # (data, how many at most) -> xyz [M, 3] and rgb [M, 3] uint8
 MorePoints = Callable[[TrainData, int], tuple[np.ndarray, np.ndarray]]
+
+
+class RenderLeaves:
+    """The pictures of a render as leaves of torch's graph, each made when it is first read."""
+
+    def __init__(self, rendered: Rendered) -> None:
+        self._rendered = rendered
+        self._leaves: dict[str, Tensor] = {}
+
+    def _leaf(self, name: str) -> Tensor:
+        if name not in self._leaves:
+            self._leaves[name] = getattr(self._rendered, name).detach().requires_grad_()
+        return self._leaves[name]
+
+    @property
+    def image(self) -> Tensor:
+        """[H, W, 3] float32, not clamped."""
+        return self._leaf("image")
+
+    @property
+    def alpha(self) -> Tensor:
+        """[H, W] float32 in [0, 1]."""
+        return self._leaf("alpha")
+
+    @property
+    def depth(self) -> Tensor:
+        """[H, W] float32, sum of weight times z; divide by alpha for the expected depth."""
+        return self._leaf("depth")
+
+    def cotangents(self, loss: object, owner: str) -> Cotangents:
+        """Differentiate a loss with respect to the pictures that it used.
+
+        Raises:
+            AwError: it is not one number, or does not depend on them.
+        """
+        if not isinstance(loss, Tensor) or loss.numel() != 1 or not loss.requires_grad:
+            what = f"a tensor {list(loss.shape)}" if isinstance(loss, Tensor) else f"a {type(loss).__name__}"
+            raise AwError(
+                f"loss(render, step, keep) of {owner} gave {what}; it must give one number (a mean) computed "
+                "from render.image, render.alpha or render.depth, not from step.rendered (docs/extend.md)"
+            )
+        found = torch.autograd.grad(loss.reshape(()), list(self._leaves.values()), allow_unused=True)
+        by_name = dict(zip(self._leaves, found))
+        return Cotangents(by_name.get("image"), None, by_name.get("alpha"), by_name.get("depth"))
 
 
 class MaskPolicy:
@@ -62,13 +107,28 @@ class MaskPolicy:
         """Return the keep map for density control, where a composite picture replaces `keep` in the loss."""
         return None
 
+    def loss(self, render: RenderLeaves, step: Step, keep: Tensor | None) -> Tensor | None:
+        """Return a loss of the method's own, one number, that is added to the photo's loss.
+
+        torch differentiates it with respect to `render.image`, `.alpha` and `.depth`.
+        """
+        return None
+
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | Tensor | None:
-        """Return dL/d(picture) of the method's own losses on the step's render.
+        """Return dL/d(picture) of the method's own losses on the step's render: `loss` without autograd.
 
         A tensor [H, W, 3] is the gradient to the image as a second cotangent: its screen-space gradients are
         kept apart for density control (`Cotangents.extra`).
+
+        Raises:
+            AwError: `loss` returned something else than one number that depends on the render.
         """
-        return None
+        if type(self).loss is MaskPolicy.loss:
+            return None
+        render = RenderLeaves(step.rendered)
+        with torch.enable_grad():
+            value = self.loss(render, step, keep)
+        return None if value is None else render.cotangents(value, type(self).__name__)
 
     def gradients(self, step: Step, keep: Tensor | None) -> Gradients | None:
         """Return gradients of losses on further pictures (`Step.draw`); they are added to the step's."""
@@ -79,7 +139,7 @@ class MaskPolicy:
         own = type(self)
         if self.learns_by_gradients:
             return False
-        return own.cotangent is not MaskPolicy.cotangent or own.gradients is not MaskPolicy.gradients
+        return any(getattr(own, n) is not getattr(MaskPolicy, n) for n in ("loss", "cotangent", "gradients"))
 
     def predict(self, step: Step) -> Tensor | None:
         """Return the keep map for pictures and mask metrics: as `keep`, but nothing is learnt or cached."""

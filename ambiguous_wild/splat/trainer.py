@@ -374,9 +374,8 @@ def _refuse_a_loss(value: object, step: Step) -> None:
     if not isinstance(value, Tensor) or list(value.shape) != shape:
         what = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
         raise AwError(
-            f"cotangent(step, keep) of the method's mask policy gave {what}; it must give the gradient of "
-            "the loss, not the loss: Cotangents(image=torch.autograd.grad(loss, image)[0]), "
-            f"{shape} (docs/extend.md)"
+            f"cotangent(step, keep) of the method's mask policy gave {what}; it must give a gradient, "
+            f"{shape}; return a loss from loss(render, step, keep) instead (docs/extend.md)"
         )
 
 

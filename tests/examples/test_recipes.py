@@ -16,7 +16,9 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.data import load_train_data
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.stress.case import run
 from ambiguous_wild.stress.method_cases import case_of
@@ -78,10 +80,51 @@ def test_a_loss_of_ones_own_acts_and_a_loss_in_place_of_its_gradient_is_refused(
         image = trainer.render(scene.test[0].camera).image
         variation.append(float(image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean()))
     assert variation[1] < 0.8 * variation[0]
-    for wrong in (torch.tensor(1.0), 1.0, torch.zeros(2, 2)):
-        parts.mask.cotangent = lambda step, keep, wrong=wrong: wrong
-        with pytest.raises(AwError, match=r"it must give the gradient of the loss, not the loss"):
+    for name, wrong, why in (
+        ("cotangent", torch.tensor(1.0), "it must give a gradient"),
+        ("cotangent", 1.0, "it must give a gradient"),
+        ("loss", torch.tensor(1.0), "computed from render.image"),
+        ("loss", torch.zeros(2, 2, requires_grad=True), r"gave a tensor \[2, 2\]; it must give one number"),
+    ):
+        parts = entry.build(entry.options())
+
+        def hook(self, *given, wrong=wrong):
+            return wrong
+
+        parts = dataclasses.replace(
+            parts, mask=type("Wrong", (type(parts.mask),), {name: hook})(parts.mask.config)
+        )
+        with pytest.raises(AwError, match=why):
             Trainer(data, parts, TrainConfig(iterations=60, probes=0), folder=tmp_path / "w").train()
+
+
+def test_a_loss_by_autograd_is_that_of_its_cotangent(tmp_path):
+    """The same bits, for image, alpha and depth."""
+    scene = load_scene(write_tiny_scene(tmp_path / "scene"))
+
+    def total(image, alpha, depth):
+        return 0.1 * image.square().mean() + 0.2 * alpha.mean() + 0.01 * depth.mean()
+
+    class ByLoss(MaskPolicy):
+        def loss(self, render, step, keep):
+            return total(render.image, render.alpha, render.depth)
+
+    class ByCotangent(MaskPolicy):
+        def cotangent(self, step, keep):
+            r = step.rendered
+            leaves = [x.detach().requires_grad_() for x in (r.image, r.alpha, r.depth)]
+            image, alpha, depth = torch.autograd.grad(total(*leaves), leaves)
+            return Cotangents(image, None, alpha, depth)
+
+    means = []
+    for policy in (ByLoss(), ByCotangent(), MaskPolicy()):
+        data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
+        folder = tmp_path / type(policy).__name__
+        trainer = Trainer(data, MethodHooks(mask=policy), TrainConfig(iterations=20, probes=0), folder=folder)
+        trainer.train()
+        means.append(trainer.gaussians.means.clone())
+        assert policy.regularises() == (type(policy) is not MaskPolicy)
+    assert torch.equal(means[0], means[1]) and not torch.equal(means[0], means[2])
 
 
 def error(trainer: Trainer, scene) -> float:

@@ -23,6 +23,34 @@ _ORDINARY = (0.1, 1000.0)  # scene sizes that suit the nearest depth and the ran
 _SIZE = 4.0  # other scenes are scaled to about this size, which structure from motion often gives
 
 
+@dataclass(frozen=True)
+class SceneTransform:
+    """The change of coordinates from a scene's files to training: ``x -> R (x - centre) * scale``."""
+
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: float = 1.0  # a power of two, so that positions lose no bit
+    turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # R as w, x, y, z; of exports alone
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """R, [3, 3]."""
+        w, x, y, z = np.array(self.turn) / np.linalg.norm(self.turn)
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return np.eye(3) + 2.0 * (w * cross + cross @ cross)
+
+    def inside(self, camera: Camera) -> Camera:
+        """Return a camera of the files' coordinates in those of training."""
+        if self == UNMOVED:
+            return camera
+        pose = camera.cam_from_world.copy()
+        pose[:3, 3] = (pose[:3, :3] @ self.centre + pose[:3, 3]) * self.scale
+        pose[:3, :3] = pose[:3, :3] @ self.rotation.T
+        return replace(camera, cam_from_world=pose)
+
+
+UNMOVED = SceneTransform()
+
+
 class FileEntry(TypedDict):
     """One file that scene.json lists."""
 
@@ -94,34 +122,6 @@ class SparsePoints:
         """Points [K, 3] seen by at least three photos, for surfaces; all points if these are too few."""
         sure = np.diff(self.track_offsets) >= 3
         return self.xyz[sure] if sure.sum() >= _FEW_POINTS else self.xyz
-
-
-@dataclass(frozen=True)
-class SceneTransform:
-    """The change of coordinates from a scene's files to training: ``x -> R (x - centre) * scale``."""
-
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: float = 1.0  # a power of two, so that positions lose no bit
-    turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # R as w, x, y, z; of exports alone
-
-    @property
-    def rotation(self) -> np.ndarray:
-        """R, [3, 3]."""
-        w, x, y, z = np.array(self.turn) / np.linalg.norm(self.turn)
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return np.eye(3) + 2.0 * (w * cross + cross @ cross)
-
-    def inside(self, camera: Camera) -> Camera:
-        """Return a camera of the files' coordinates in those of training."""
-        if self == UNMOVED:
-            return camera
-        pose = camera.cam_from_world.copy()
-        pose[:3, 3] = (pose[:3, :3] @ self.centre + pose[:3, 3]) * self.scale
-        pose[:3, :3] = pose[:3, :3] @ self.rotation.T
-        return replace(camera, cam_from_world=pose)
-
-
-UNMOVED = SceneTransform()
 
 
 @dataclass(frozen=True)

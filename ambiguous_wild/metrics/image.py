@@ -38,6 +38,18 @@ _YCC_FROM_XYZ = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, 
 _YCC_OFFSET = np.array([-16.0, 0.0, 0.0])
 
 
+def _xyz_from_rgb() -> np.ndarray:
+    """Matrix [3, 3] from linear RGB to XYZ, from the primaries and the white point."""
+    columns = np.array([(x / y, 1.0, (1.0 - x - y) / y) for x, y in _PRIMARIES]).T
+    x, y = _WHITE
+    return columns * np.linalg.solve(columns, [x / y, 1.0, (1.0 - x - y) / y])
+
+
+_XYZ_FROM_RGB = _xyz_from_rgb()
+_XYZ_WHITE = _XYZ_FROM_RGB.sum(axis=1)
+_YCC_FROM_RGB = _YCC_FROM_XYZ @ (_XYZ_FROM_RGB / _XYZ_WHITE[:, None])
+
+
 def checked_pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return both images as [H, W, 3] float64 in [0, 1].
 
@@ -212,18 +224,6 @@ def flip_map(
     colour = _colour_error(_perceived(first), _perceived(second))
     feature = _feature_error(_luminance(first), _luminance(second))
     return colour ** (1.0 - feature)  # equation 7
-
-
-def _xyz_from_rgb() -> np.ndarray:
-    """Matrix [3, 3] from linear RGB to XYZ, from the primaries and the white point."""
-    columns = np.array([(x / y, 1.0, (1.0 - x - y) / y) for x, y in _PRIMARIES]).T
-    x, y = _WHITE
-    return columns * np.linalg.solve(columns, [x / y, 1.0, (1.0 - x - y) / y])
-
-
-_XYZ_FROM_RGB = _xyz_from_rgb()
-_XYZ_WHITE = _XYZ_FROM_RGB.sum(axis=1)
-_YCC_FROM_RGB = _YCC_FROM_XYZ @ (_XYZ_FROM_RGB / _XYZ_WHITE[:, None])
 
 
 def _opponent(linear: np.ndarray) -> np.ndarray:

@@ -37,6 +37,46 @@ SURFACE_NAMES = ("ground", "wall_back", "wall_left", "wall_right", "wall_front")
 
 
 @dataclass(frozen=True)
+class GroundPlan:
+    """A rectangle with walls."""
+
+    ground_m: tuple[float, float]  # of the ground's texture, centred on the origin
+    x_m: tuple[float, float]  # range of the inside
+    y_m: tuple[float, float]  # range of the inside
+    wall_m: float  # height
+    walls: tuple[str, ...] = SURFACE_NAMES[1:]
+    ceiling: bool = False
+
+    @property
+    def surfaces(self) -> Mapping[str, tuple[float, float]]:
+        """Width and height of the ground and of each wall; a texture covers each once."""
+        across, along = self.x_m[1] - self.x_m[0], self.y_m[1] - self.y_m[0]
+        width = {"wall_back": across, "wall_front": across, "wall_left": along, "wall_right": along}
+        return {"ground": self.ground_m} | {name: (width[name], self.wall_m) for name in self.walls}
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Centre of the inside, m."""
+        return (self.x_m[0] + self.x_m[1]) / 2, (self.y_m[0] + self.y_m[1]) / 2
+
+    @property
+    def highest_m(self) -> float:
+        """Greatest height of a camera, m."""
+        return self.wall_m - 0.3 if self.ceiling else 3.3
+
+    def gap(self, x: float, y: float) -> float:
+        """Return the distance to the nearest wall, m, negative outside; an open side counts as wall."""
+        return min(x - self.x_m[0], self.x_m[1] - x, y - self.y_m[0], self.y_m[1] - y)
+
+
+PLANS: Mapping[str, GroundPlan] = {
+    "courtyard": GroundPlan((16.0, 14.0), (-5.6, 5.6), (-6.0, 4.2), 3.4, SURFACE_NAMES[1:4]),  # open in front
+    "room": GroundPlan((7.2, 6.0), (-3.6, 3.6), (-3.0, 3.0), 2.7, ceiling=True),
+    "yard": GroundPlan((18.0, 16.0), (-9.0, 9.0), (-8.0, 8.0), 5.0),
+}
+
+
+@dataclass(frozen=True)
 class Designed:
     """Label of a capture: the result that measuring it should give."""
 
@@ -234,43 +274,3 @@ class CaptureSpec:
     effects: Effects = field(default_factory=Effects)
     fixed: FixedThing | None = None  # fixed to the camera, in every train photo, on top of `occlusion`
     designed: Designed = field(default_factory=Designed)
-
-
-@dataclass(frozen=True)
-class GroundPlan:
-    """A rectangle with walls."""
-
-    ground_m: tuple[float, float]  # of the ground's texture, centred on the origin
-    x_m: tuple[float, float]  # range of the inside
-    y_m: tuple[float, float]  # range of the inside
-    wall_m: float  # height
-    walls: tuple[str, ...] = SURFACE_NAMES[1:]
-    ceiling: bool = False
-
-    @property
-    def surfaces(self) -> Mapping[str, tuple[float, float]]:
-        """Width and height of the ground and of each wall; a texture covers each once."""
-        across, along = self.x_m[1] - self.x_m[0], self.y_m[1] - self.y_m[0]
-        width = {"wall_back": across, "wall_front": across, "wall_left": along, "wall_right": along}
-        return {"ground": self.ground_m} | {name: (width[name], self.wall_m) for name in self.walls}
-
-    @property
-    def middle(self) -> tuple[float, float]:
-        """Centre of the inside, m."""
-        return (self.x_m[0] + self.x_m[1]) / 2, (self.y_m[0] + self.y_m[1]) / 2
-
-    @property
-    def highest_m(self) -> float:
-        """Greatest height of a camera, m."""
-        return self.wall_m - 0.3 if self.ceiling else 3.3
-
-    def gap(self, x: float, y: float) -> float:
-        """Return the distance to the nearest wall, m, negative outside; an open side counts as wall."""
-        return min(x - self.x_m[0], self.x_m[1] - x, y - self.y_m[0], self.y_m[1] - y)
-
-
-PLANS: Mapping[str, GroundPlan] = {
-    "courtyard": GroundPlan((16.0, 14.0), (-5.6, 5.6), (-6.0, 4.2), 3.4, SURFACE_NAMES[1:4]),  # open in front
-    "room": GroundPlan((7.2, 6.0), (-3.6, 3.6), (-3.0, 3.0), 2.7, ceiling=True),
-    "yard": GroundPlan((18.0, 16.0), (-9.0, 9.0), (-8.0, 8.0), 5.0),
-}

@@ -30,6 +30,14 @@ _C1, _C2 = 0.01**2, 0.03**2
 _SMALLEST = 1e-30  # keeps the square root differentiable
 
 
+def _window() -> tuple[float, ...]:
+    taps = [math.exp(-((i - _REACH) ** 2) / (2 * 1.5**2)) for i in range(2 * _REACH + 1)]
+    return tuple(tap / sum(taps) for tap in taps)
+
+
+_TAPS = _window()
+
+
 @torch.no_grad()
 def nearest(points: Tensor, count: int) -> Tensor:
     """Return the rows of the points nearest to every point, the nearest first, itself among them.
@@ -136,14 +144,6 @@ def compiled(function: Callable[..., Any], what: str) -> Callable[..., Any]:
 def compiles(device: torch.device) -> bool:
     """Whether functions are compiled for tensors on this device."""
     return device.type == "cuda"
-
-
-def _window() -> tuple[float, ...]:
-    taps = [math.exp(-((i - _REACH) ** 2) / (2 * 1.5**2)) for i in range(2 * _REACH + 1)]
-    return tuple(tap / sum(taps) for tap in taps)
-
-
-_TAPS = _window()
 
 
 def _blurred(maps: Tensor) -> Tensor:

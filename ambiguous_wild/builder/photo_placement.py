@@ -47,7 +47,7 @@ SPLITS = 5  # times at most that photos without a link to the others are taken o
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
-UNSURE_DEG = 0.33  # standard deviation of a rotation above which the photo is provisional: 1 degree is three
+UNSURE_DEG = 0.33  # standard deviation of a rotation by COLMAP above which photos were off by 1 degree and more
 ADJUSTMENTS = 3  # joint adjustments at most
 STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
 
@@ -203,12 +203,13 @@ class Placement:
         """Make photos provisional whose rotation the matches leave open; all, if that holds for most."""
         if self._covariance is None:
             return
-        found = {k: self._covariance.get_cam_cov_from_world(self.matched.ids[k]) for k in self.poses}
-        deviations_deg = {
-            k: float(np.degrees(np.sqrt(np.linalg.eigvalsh(np.asarray(both)[:3, :3]).max())))
-            for k, both in found.items()
-            if both is not None  # the first photo is held
-        }
+        deviations_deg = {}
+        for photo in self.poses:
+            found = self._covariance.get_cam_cov_from_world(self.matched.ids[photo])  # None: it is held
+            rotation = np.full((3, 3), np.nan) if found is None else np.asarray(found)[:3, :3]
+            if np.isfinite(rotation).all():  # a lens that nothing determines makes all of them NaN
+                variance = max(float(np.linalg.eigvalsh(rotation).max()), 0.0)
+                deviations_deg[photo] = float(np.degrees(np.sqrt(variance)))
         unsure = {k for k, deviation in deviations_deg.items() if deviation > UNSURE_DEG}
         self.provisional |= self.poses.keys() if 2 * len(unsure) > len(deviations_deg) else unsure
 

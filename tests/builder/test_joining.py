@@ -229,6 +229,7 @@ def test_photos_are_provisional_whose_rotation_the_matches_leave_open():
     for deviations_deg, named in (
         ([None, 0.1, 0.5], {2}),  # the first photo is held
         ([None, 0.1, 0.1], set()),
+        ([None, np.nan, np.nan], set()),  # unknown, because the focal length of a photo is not determined
         ([None, 0.5, 0.5], {0, 1, 2}),  # most: the others are no better known
     ):
         part, _ = parts({})

@@ -47,7 +47,7 @@ SPLITS = 5  # times at most that photos without a link to the others are taken o
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
-UNSURE_DEG = 0.33  # standard deviation of a rotation by COLMAP above which photos were off by 1 degree and more
+UNSURE_DEG = 0.33  # standard deviation of a rotation, by COLMAP, above which photos were off by a degree
 ADJUSTMENTS = 3  # joint adjustments at most
 STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
 

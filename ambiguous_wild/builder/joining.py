@@ -3,7 +3,7 @@
 The relative pose of two parts needs several photos at once: a single pair may show a distractor, and gives no
 scale. A photo that has a pose in both parts is a hypothesis for the similarity between them, and so are the
 pairs across the parts that agree on one rotation. The pairs that fit a hypothesis are the evidence, as for a
-photo in `placing`.
+photo in `photo_placement`.
 """
 
 from __future__ import annotations
@@ -192,8 +192,11 @@ def _fitting(first: Placement, moved: Mapping[int, np.ndarray]) -> set[Pair]:
             continue
         near = matched.misfit((a, b), poses[a], poses[b], rays) <= ROUGHLY
         for motion in motions:
+            if near[motion.matches].mean() < FITS:
+                continue
             rows = matched.matches[a, b][motion.matches].T
             places = (first.place(k, None, {((a, b), 0): row}) for k, row in zip((a, b), rows))
-            if near[motion.matches].mean() >= FITS and not any(place.crowded for place in places):
+            if not any(place.crowded for place in places):
                 fitting.add((a, b))
+                break
     return fitting

@@ -113,10 +113,10 @@ def _lay_out_part(part: Sequence[int], links: Sequence[Link]) -> np.ndarray:
     inverse = np.linalg.pinv(laplacian)
     for _ in range(STRESS_ROUNDS):
         drawn = np.linalg.norm(xy[:, None] - xy[None], axis=2)
-        vjp = -weights * apart / np.maximum(drawn, 1e-9)
-        np.fill_diagonal(vjp, 0.0)
-        np.fill_diagonal(vjp, -vjp.sum(axis=1))
-        xy = inverse @ (vjp @ xy)
+        force = -weights * apart / np.maximum(drawn, 1e-9)
+        np.fill_diagonal(force, 0.0)
+        np.fill_diagonal(force, -force.sum(axis=1))
+        xy = inverse @ (force @ xy)
     return _oriented(xy - xy.mean(axis=0))
 
 

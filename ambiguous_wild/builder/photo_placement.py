@@ -47,7 +47,7 @@ SPLITS = 5  # times at most that photos without a link to the others are taken o
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
-UNSURE_DEG = 0.33  # standard deviation of a rotation, by COLMAP, above which photos were off by a degree
+UNSURE_DEG = 0.66  # standard deviation of a rotation above which photos were off by 1 degree and more
 ADJUSTMENTS = 3  # joint adjustments at most
 STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
 
@@ -168,6 +168,7 @@ class Placement:
             if not graph.degree(k):
                 continue
             photo, linked = photos[k], set(graph[k])
+            linked = {j for j in linked if not self._joins(photo, photos[j])}
             evidence = self._judge(photo, self.poses[photo], rays).evidence
             sides = []
             for side in nx.connected_components(nx.restricted_view(graph, [k], [])):
@@ -184,10 +185,10 @@ class Placement:
         numbers: dict[int, list[int]] = {}
         for photo in self.poses:
             numbers.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
-        covariance = self._covariance
+        covariance, adjusted = self._covariance or (None, self.model)
         facts: list[CameraFact] = []
         for number, photos in numbers.items():
-            params = self.model.cameras[number].params
+            params = adjusted.cameras[number].params
             spread = covariance.get_other_params_cov(params) if covariance else None
             deviation = np.inf if spread is None else float(np.sqrt(spread[0][0]))
             facts.append(
@@ -201,33 +202,62 @@ class Placement:
 
     def name_unsure(self) -> None:
         """Make photos provisional whose rotation the matches leave open; all, if that holds for most."""
+        self.provisional |= {k for k in self.poses if self._observations(k) < LEAST_POINTS}
+        deviations = self._deviations_deg(None)
+        unsure = {k for k, deviation in deviations.items() if deviation > UNSURE_DEG}
+        if 2 * len(unsure) > len(deviations):  # the photo that was held may be the uncertain one
+            reference = max(deviations, key=self._observations)
+            among = self._deviations_deg(reference)
+            unsure = {k for k, deviation in among.items() if deviation > UNSURE_DEG}
+            unsure |= self.poses.keys() - (deviations if 2 * len(unsure) <= len(among) else set())
+        self.provisional |= unsure
+
+    def _observations(self, photo: int) -> int:
+        return int(self.model.images[self.matched.ids[photo]].num_points3D)
+
+    def _deviations_deg(self, reference: int | None) -> dict[int, float]:
+        """Return the standard deviation of each photo's rotation, where it is known.
+
+        Args:
+            reference: the photo relative to which; None: the one that the adjustment held.
+        """
         if self._covariance is None:
-            return
-        deviations_deg = {}
-        for photo in self.poses:
-            found = self._covariance.get_cam_cov_from_world(self.matched.ids[photo])  # None: it is held
+            return {}
+        covariance, model = self._covariance
+        images = {k: model.images[self.matched.ids[k]] for k in self.poses}
+        deviations = {}
+        for photo, image in images.items():
+            if reference is None:
+                found = covariance.get_cam_cov_from_world(image.image_id)
+            else:
+                two = (images[reference], image)
+                ends = [part for one in two for part in (one.image_id, one.cam_from_world())]
+                found = None if photo == reference else covariance.get_cam2_cov_from_cam1(*ends)
             rotation = np.full((3, 3), np.nan) if found is None else np.asarray(found)[:3, :3]
             if np.isfinite(rotation).all():  # a lens that nothing determines makes all of them NaN
                 variance = max(float(np.linalg.eigvalsh(rotation).max()), 0.0)
-                deviations_deg[photo] = float(np.degrees(np.sqrt(variance)))
-        unsure = {k for k, deviation in deviations_deg.items() if deviation > UNSURE_DEG}
-        self.provisional |= self.poses.keys() if 2 * len(unsure) > len(deviations_deg) else unsure
+                # Ceres' tangent of a quaternion is half of the angle.
+                deviations[photo] = 2.0 * float(np.degrees(np.sqrt(variance)))
+        return deviations
 
     @cached_property
-    def _covariance(self) -> Any:
-        """The covariance of a joint adjustment of the whole model; None if it is not determined."""
+    def _covariance(self) -> tuple[Any, Any] | None:
+        """Covariance of a joint adjustment, and the adjusted copy of the model; None if not determined."""
         if not LEAST_PHOTOS <= len(self.poses) <= COVARIANCE_LIMIT:
             return None
+        model = pycolmap.Reconstruction(self.model)  # a diagnosis changes no pose
         config = pycolmap.BundleAdjustmentConfig()
-        for number in self.model.reg_image_ids():
-            config.add_image(number)
+        for photo in self.poses:
+            if self._observations(photo) >= LEAST_POINTS:  # one with fewer leaves all of them open
+                config.add_image(self.matched.ids[photo])
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(
-            adjustment_options(self.matched.distorted, len(self.poses), final=True), config, self.model
+            adjustment_options(self.matched.distorted, len(self.poses), final=True), config, model
         )
         adjuster.solve()
         options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
-        return pycolmap.estimate_ba_covariance(options, self.model, adjuster)
+        covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
+        return None if covariance is None else (covariance, model)
 
     def _place_all(self, times_out: list[int], only_out: bool) -> bool:
         """Place all photos; tell whether more than a few changed, or an added one may help others in."""
@@ -444,6 +474,7 @@ class Placement:
     def _use_model(self, model: Any) -> None:
         """Use the cameras and poses of a model."""
         self.model = model
+        self.__dict__.pop("_covariance", None)
         self.matched.take_cameras(model)
         self.poses = self.matched.poses(model)
         centres = np.array([centre_of(pose) for pose in self.poses.values()]).reshape(-1, 3)

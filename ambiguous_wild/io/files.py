@@ -70,7 +70,9 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
             busy.holder = holder
             raise busy from None
         except OSError as error:
-            raise AwError(f"cannot write beside {folder}: {error.strerror}; choose another -o") from error
+            raise AwError(
+                f"cannot write beside {folder}: {error.strerror}; make it writable, or choose another folder"
+            ) from error
         yield
 
 

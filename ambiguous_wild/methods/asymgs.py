@@ -221,11 +221,11 @@ class SecondModel(Fields):
         """Return gradients of the models' difference and of the second one's loss in its own view."""
         apart = frames[STATIC].image - frames[TWIN].image
         weight = self.config.consistency if context.nominal > self.config.warm_up else 0.0
-        vjp = apart.sign() * (weight / apart.numel())
-        second = -vjp
+        cotangent = apart.sign() * (weight / apart.numel())
+        second = -cotangent
         if self._second is not None and context.camera is self._second[1]:
             second = second + self._photometric(self._second[0], frames[TWIN].image, context.divisor)
-        return {STATIC: Cotangents(image=vjp), TWIN: Cotangents(image=second)}
+        return {STATIC: Cotangents(image=cotangent), TWIN: Cotangents(image=second)}
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
         """Return gradients of both models in the second view, which is drawn with replacement."""

@@ -121,12 +121,12 @@ class PlaneMask(EffectMask, CountingMask):
         with torch.enable_grad():
             planar = self.effect._leaf(step)["planar"].requires_grad_()
             front, mask = self.effect.layer(planar, step)
-            outputs, vjps = [mask], [torch.full_like(mask, self.config.area / mask.numel())]
+            outputs, cotangents = [mask], [torch.full_like(mask, self.config.area / mask.numel())]
             if step.nominal < self.config.joint:
                 picture = composed(front, mask, step.rendered.image.detach())
                 outputs.append(picture)
-                vjps.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
-            (d_planar,) = torch.autograd.grad(outputs, planar, vjps)
+                cotangents.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
+            (d_planar,) = torch.autograd.grad(outputs, planar, cotangents)
         return Cotangents(effect_grads={self.effect.name: {"planar": d_planar}})
 
     @staticmethod

@@ -250,5 +250,5 @@ class SmallVolumes(DensityControl):
 
     def before_step(self, step: Step, gradients: Gradients) -> Gradients:
         g = step.gaussians
-        vjp = self.weight * self.weights(g) * g.log_scales.sum(dim=1).exp()
-        return replace(gradients, log_scales=gradients.log_scales + vjp[:, None])
+        gradient = self.weight * self.weights(g) * g.log_scales.sum(dim=1).exp()
+        return replace(gradients, log_scales=gradients.log_scales + gradient[:, None])

@@ -172,10 +172,10 @@ def mask_loss(
 
     The authors' last term, 0.5 max|W1| max|W2|, is made from detached weights, hence constant and left out.
     """
-    vjp = config.lambda_pull * math.exp(-nominal / config.beta)
+    pull = config.lambda_pull * math.exp(-nominal / config.beta)
     bounds = (F.relu(mask - upper) + F.relu(lower - mask)).mean()
     agreement = config.lambda_cosine * (mask - target).abs().mean()
-    return agreement + config.lambda_residual * bounds + vjp * (1.0 - mask).mean()
+    return agreement + config.lambda_residual * bounds + pull * (1.0 - mask).mean()
 
 
 class RobustSplatMask(PausingMask):

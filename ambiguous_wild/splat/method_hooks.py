@@ -67,13 +67,15 @@ class RenderLeaves:
         Raises:
             AwError: it is not one number, or does not depend on them.
         """
-        if not isinstance(loss, Tensor) or loss.numel() != 1 or not loss.requires_grad:
+        leaves, found = list(self._leaves.values()), tuple[Tensor | None, ...]()
+        if isinstance(loss, Tensor) and loss.numel() == 1 and loss.requires_grad and leaves:
+            found = torch.autograd.grad(loss.reshape(()), leaves, allow_unused=True)
+        if all(gradient is None for gradient in found):
             what = f"a tensor {list(loss.shape)}" if isinstance(loss, Tensor) else f"a {type(loss).__name__}"
             raise AwError(
                 f"loss(render, step, keep) of {owner} gave {what}; it must give one number (a mean) computed "
                 "from render.image, render.alpha or render.depth, not from step.rendered (docs/extend.md)"
             )
-        found = torch.autograd.grad(loss.reshape(()), list(self._leaves.values()), allow_unused=True)
         by_name = dict(zip(self._leaves, found))
         return Cotangents(by_name.get("image"), None, by_name.get("alpha"), by_name.get("depth"))
 
@@ -110,7 +112,8 @@ class MaskPolicy:
     def loss(self, render: RenderLeaves, step: Step, keep: Tensor | None) -> Tensor | None:
         """Return a loss of the method's own, one number, that is added to the photo's loss.
 
-        torch differentiates it with respect to `render.image`, `.alpha` and `.depth`.
+        torch differentiates it with respect to `render.image`, `.alpha` and `.depth`, and nothing else: nets
+        of the policy's own learn in `keep`. A policy that overrides `cotangent` has no `loss`.
         """
         return None
 

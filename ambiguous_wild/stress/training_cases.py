@@ -116,7 +116,7 @@ def _one_round(g: Gaussians, screen: torch.Tensor, ceiling: int, **config: Any) 
 
 @case(9, "density control that would remove all, clones all, meets the cap, meets NaN")
 def density_rows(device: str) -> CaseResult:
-    vjp, still = torch.full((8, 2), 1.0), torch.zeros(8, 2)
+    growing, still = torch.full((8, 2), 1.0), torch.zeros(8, 2)
     invisible = cloud(8)
     invisible.opacity_logits[:] = -9.0
     broken = cloud(8)
@@ -127,8 +127,8 @@ def density_rows(device: str) -> CaseResult:
     checks = {}
     for name, g, screen, ceiling, expected in (
         ("would remove all: keeps all", invisible, still, 100, 8),
-        ("clones all", sound.clone(), vjp, 100, 16),
-        ("stops at the cap", sound.clone(), vjp, 11, 11),
+        ("clones all", sound.clone(), growing, 100, 16),
+        ("stops at the cap", sound.clone(), growing, 11, 11),
         ("drops the row of NaN", broken, still, 100, 7),
     ):
         after, same_rows = _one_round(g, screen, ceiling)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder import photo_placement
 from ambiguous_wild.builder.joining import Similarity, join
 from ambiguous_wild.builder.matched import Matched, largest_group
 from ambiguous_wild.builder.motions import Motion
@@ -221,22 +222,53 @@ def test_pairs_whose_matches_are_crowded_join_no_parts():
     assert not join(first, second)
 
 
-def test_photos_are_provisional_whose_rotation_the_matches_leave_open():
-    def covariance(deviations_deg: list[float | None]) -> SimpleNamespace:
-        found = [None if d is None else np.diag([np.radians(d) ** 2] * 3 + [1.0] * 3) for d in deviations_deg]
-        return SimpleNamespace(get_cam_cov_from_world=lambda number: found[number - 1])
+def placed_with_noise(weak: int | None) -> Placement:
+    """Six photos of one scene, 0.3 px off; of the weak one a few points are left."""
+    part, _ = parts({})
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(part.matched.cameras[0])
+    part.poses = {k: pose(k) for k in range(6)}
+    rng = np.random.default_rng(3)
+    for k, p in part.poses.items():
+        xy = part.matched.features[k] + rng.normal(0.0, 0.3, (len(POINTS), 2))
+        image = pycolmap.Image(name=f"{k}.jpg", keypoints=xy, camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(p))
+    for number, xyz in enumerate(POINTS):
+        seen = [k for k in part.poses if shown_in(k)[number] and (k != weak or number % 40 == 0)]
+        if len(seen) > 1:
+            track = pycolmap.Track([pycolmap.TrackElement(k + 1, number) for k in seen])
+            model.add_point3D(xyz, track)
+    part.model, part.provisional = model, set()
+    return part
 
-    for deviations_deg, named in (
-        ([None, 0.1, 0.5], {2}),  # the first photo is held
-        ([None, 0.1, 0.1], set()),
-        ([None, np.nan, np.nan], set()),  # unknown, because the focal length of a photo is not determined
-        ([None, 0.5, 0.5], {0, 1, 2}),  # most: the others are no better known
-    ):
-        part, _ = parts({})
-        part.provisional = set()
-        part._covariance = covariance(deviations_deg)
-        part.name_unsure()
-        assert part.provisional == named
+
+def shown_in(photo: int) -> np.ndarray:
+    local = POINTS @ pose(photo)[:, :3].T + pose(photo)[:, 3]
+    xy = local[:, :2] / local[:, 2:] * FOCAL + [WIDTH / 2, HEIGHT / 2]
+    return (local[:, 2] > 0) & ((xy >= 0) & (xy < [WIDTH, HEIGHT])).all(axis=1)
+
+
+@pytest.mark.parametrize("weak", [None, 0, 4])
+def test_the_photo_is_provisional_whose_rotation_the_matches_leave_open(weak, monkeypatch):
+    """Also photo 0, which the adjustment holds: relative to it all others are open."""
+    monkeypatch.setattr(photo_placement, "UNSURE_DEG", 0.35)
+    part = placed_with_noise(weak)
+    part.name_unsure()
+    assert part.provisional == (set() if weak is None else {weak})
+    poses = {k: part.model.images[k + 1].cam_from_world().matrix() for k in range(6)}
+    assert all(np.allclose(x, pose(k), atol=1e-12) for k, x in poses.items())  # the model stays as it is
+
+
+def test_an_open_model_and_photos_of_few_points_are_provisional(monkeypatch):
+    monkeypatch.setattr(photo_placement, "UNSURE_DEG", 0.01)
+    part = placed_with_noise(None)
+    part.name_unsure()
+    assert part.provisional == set(range(6))
+    monkeypatch.setattr(photo_placement, "LEAST_POINTS", 10)
+    monkeypatch.setattr(photo_placement, "UNSURE_DEG", 0.35)
+    part = placed_with_noise(4)
+    part.name_unsure()
+    assert part.provisional == {4}
 
 
 def test_little_evidence_is_enough_only_where_nothing_speaks_against_it():

@@ -100,8 +100,10 @@ def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
     monkeypatch.setattr(policy.effect, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
     monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
     weight, gradients = policy._weight(step, learn=True)
-    vjp = gradients.attributes["nexus_doubt"][:, 0]
-    assert weight.max() > 3.0 and vjp.min() < 0.0 and vjp.max() <= 1e-9  # a step against it raises sigma
+    gradient = gradients.attributes["nexus_doubt"][:, 0]
+    assert (
+        weight.max() > 3.0 and gradient.min() < 0.0 and gradient.max() <= 1e-9
+    )  # a step against it raises sigma
 
 
 def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch):

@@ -200,7 +200,7 @@ class Learnt(Effect):
         return replace(frame, image=toned.detach().contiguous()), vjp
 
     def step(
-        self, effect_grads: Mapping[str, Tensor], context: ViewContext, skipped: Tensor | None = None
+        self, effect_grads: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None
     ) -> None:
         for name, gradient in effect_grads.items():
             leaf = self._leaves[name]
@@ -208,7 +208,7 @@ class Learnt(Effect):
             assert row is not None
             rate = decayed(leaf.rate, leaf.rate * leaf.final, context.progress)
             rate = rate if leaf.made_for is None else rate_for_run_length(rate, leaf.made_for, context)
-            self._adam[name].step(row, gradient, rate, skipped)
+            self._adam[name].step(row, gradient, rate, skip_step)
 
     def begin_fit(self) -> None:
         for name, leaf in self._leaves.items():

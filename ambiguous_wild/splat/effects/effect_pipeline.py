@@ -137,12 +137,12 @@ class EffectPipeline:
 
         return shade
 
-    def step(self, gradients: Gradients, context: ViewContext, skipped: Tensor | None = None) -> None:
+    def step(self, gradients: Gradients, context: ViewContext, skip_step: Tensor | None = None) -> None:
         """Let every effect learn from the last backward pass; see `Effect.step`."""
         for effect in self._with("step"):
             effect_grads = gradients.effect_grads.get(effect.name)
             if effect_grads is not None:
-                effect.step(effect_grads, context, skipped)
+                effect.step(effect_grads, context, skip_step)
 
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
         """Call the effects at the end of a step; see `Effect.after_step`."""

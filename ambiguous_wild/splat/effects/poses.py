@@ -73,8 +73,8 @@ class PoseRefinement(Effect):
         row = self.adam.values[context.view]
         share = decayed(1.0, FINAL, context.progress)
         self.adam.step(context.view, effect_grads["motion"], self.rate * share, skip_step)
-        vjp = PULL * share if skip_step is None else PULL * share * share_of(skip_step, row)
-        row *= 1 - vjp  # decoupled from Adam's scaling, as weight decay is in AdamW
+        decay = PULL * share if skip_step is None else PULL * share * share_of(skip_step, row)
+        row *= 1 - decay  # decoupled from Adam's scaling, as weight decay is in AdamW
 
     def facts(self) -> Facts:
         angle = torch.rad2deg(self.adam.values[:, :3].norm(dim=1))

@@ -10,14 +10,14 @@ import numpy as np
 from ambiguous_wild.builder.motions import Pair
 
 AGREE = 2  # smallest number of partners that agree with a photo's place
-AGREE_NEW = 3  # the same for a photo that COLMAP did not place, if less than `AREA_NEW` of it agrees
+AGREE_NEW = 3  # the same for a photo that is not placed yet, if less than `AREA_NEW` of it agrees
 RIVAL = 0.7  # relative weight of a second place from which on a photo has two places
 LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a distractor
 # The same if all placed photos that share a motion with it agree, and the matches are spread over the photo
 # at least so much of what as many features drawn at random would be: those of a distractor are crowded.
 LITTLE_AREA, LITTLE_SPREAD = 0.05, 0.2
 CROWDED = 0.28  # spread of matches below which `AREA_NEW` of a photo must agree
-AREA_NEW = 0.3  # share of a photo that COLMAP did not place, from which on two partners are enough
+AREA_NEW = 0.3  # share of a photo that is not placed yet, from which on two partners are enough
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ def reason_against(best: PoseHypothesis, rival: PoseHypothesis, needed: int) -> 
     if len(best.partners) < needed:
         return f"only {len(best.partners)} placed photos agree with it on a place"
     if best.area < LEAST_AREA or (best.area < AREA_NEW and best.spread < CROWDED):
-        return f"only a small part of it agrees with {len(best.partners)} placed photos"
+        part = f"{best.area:.0%}, spread {best.spread:.2f}"
+        return f"only a small part of it agrees with {len(best.partners)} placed photos ({part})"
     if len(rival.partners) >= AGREE and rival.weight > RIVAL * best.weight:
         return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
     return None

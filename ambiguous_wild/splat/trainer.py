@@ -166,9 +166,9 @@ class Trainer(Run):
         context = replace(context, camera=self.effects.camera(context))
         with self.clock.part("render"):
             rendered = self.drawing(self.gaussians, context)
-        of_shot = {f.name: getattr(context, f.name) for f in fields(ViewContext)}
+        of_context = {f.name: getattr(context, f.name) for f in fields(ViewContext)}
         return Step(
-            **of_shot,
+            **of_context,
             ceiling=self.pace.ceiling(divisor, progress),
             rendered=rendered,
             gaussians=self.gaussians,

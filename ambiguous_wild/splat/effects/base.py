@@ -78,8 +78,8 @@ class Effect:
     def image(self, frame: Frame, context: ViewContext) -> tuple[Frame, FrameVjp]:
         """Return the pictures as they are compared with the photo, as new tensors.
 
-        The effect learns from `Cotangents.image` alone: a method's own loss on the render (`extra`) tells
-        nothing about a photo's exposure.
+        The effect learns from `Cotangents.image` alone: what a method gives as `extra` tells nothing about a
+        photo's exposure.
         """
         return frame, unchanged
 

@@ -240,13 +240,13 @@ class EffectRender:
             image, alpha: pictures after the image effects.
             drawn: Gaussians that the back end drew.
             context: view context of the picture.
-            model_pulls, frame_pulls: vjps in the order in which the effects acted.
+            model_vjps, frame_vjps: vjps in the order in which the effects acted.
             posing: effects that learn from the camera's gradient.
         """
         self.image, self.alpha = image, alpha
         self.visible = rendered.visible
         self.frames, self.renders = frames_of(rendered), renders_of(rendered)
-        self._inner, self._drawn, self._shot = rendered, drawn, context
+        self._inner, self._drawn, self._context = rendered, drawn, context
         self._model_vjps, self._frame_vjps, self._posing = model_vjps, frame_vjps, posing
 
     @property
@@ -266,7 +266,7 @@ class EffectRender:
         gradients = self._inner.backward(passed, needs)
         for effect in self._posing:
             gradients = gradients.with_effect_grads(
-                effect.name, effect.pose(self._drawn, gradients, self._shot)
+                effect.name, effect.pose(self._drawn, gradients, self._context)
             )
         for vjp in reversed(self._model_vjps):
             gradients = vjp(gradients)

@@ -73,7 +73,7 @@ def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     head = (tmp_path / "cost/cost.csv").read_text().splitlines()[0].split(",")
     assert {"grey_error", "contrast"} <= set(head)
     added = aw("leaderboard", "add", tmp_path / "runs", "--board", tmp_path / "board", "--dataset", "d",
-               "--scenes", tmp_path)  # fmt: skip
+               "--scene", tmp_path)  # fmt: skip
     assert added.returncode == 0, added.stderr
     assert ",grey_error," in (tmp_path / "board/measured/d.csv").read_text().splitlines()[0]
 

@@ -25,7 +25,6 @@ from ambiguous_wild.builder.motions import (
     focal_votes,
     motions_of_pairs,
 )
-from ambiguous_wild.builder.overlap_graph import graph_of, groups
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 # A match fits within this distance of its epipolar line: a share of the longer side, between bounds in px.
@@ -237,8 +236,12 @@ class Matched:
 
 def largest_group(pairs: Collection[Pair]) -> int:
     """Return the largest number of photos that pairs connect."""
-    count = max((max(pair) for pair in pairs), default=-1) + 1
-    return max(map(len, groups(graph_of(count, pairs))), default=0)
+    if not pairs:
+        return 0
+    ends = np.array(list(pairs)).T
+    size = int(ends.max()) + 1
+    label = connected_components(coo_array((np.ones(ends.shape[1]), tuple(ends)), (size, size)), False)[1]
+    return int(np.bincount(label).max())
 
 
 def connected_photos(database: Path) -> int:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Sequence
+from typing import TYPE_CHECKING
 
-import networkx as nx
 import numpy as np
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 Link = tuple[int, int, int]  # two photos, the lower number first, and their matches
 FEW_PARTNERS = 3  # a photo with fewer is held weakly
@@ -21,6 +24,8 @@ def graph_of(
     links: Iterable[Sequence[int]],
 ) -> nx.Graph:
     """Return the graph of photos and links."""
+    import networkx as nx  # takes a third of a second, which commands that draw no graph do not wait
+
     graph = nx.Graph()
     graph.add_nodes_from(range(count))
     graph.add_edges_from(link[:2] for link in links)
@@ -29,6 +34,8 @@ def graph_of(
 
 def bridges(graph: nx.Graph) -> set[tuple[int, int]]:
     """Return the links without which a part falls into two."""
+    import networkx as nx
+
     return {(min(pair), max(pair)) for pair in nx.bridges(graph)}
 
 
@@ -64,6 +71,8 @@ def best_join(inside: Collection[int], outside: Collection[int], links: Iterable
 
 def groups(graph: nx.Graph) -> list[list[int]]:
     """Return the connected parts, the largest first."""
+    import networkx as nx
+
     return sorted(map(sorted, nx.connected_components(graph)), key=lambda part: (-len(part), part))
 
 

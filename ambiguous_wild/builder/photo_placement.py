@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import networkx as nx
 import numpy as np
 
 from ambiguous_wild.builder.adjustment import adjustment_options, pipeline_options, plausible
@@ -21,6 +20,7 @@ from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.overlap_graph import bridges, graph_of, groups
 from ambiguous_wild.builder.point_lookup import PointLookup
+from ambiguous_wild.builder.pose_covariance import deviations_deg, joint_covariance
 from ambiguous_wild.builder.pose_hypothesis import (
     AGREE,
     AGREE_NEW,
@@ -31,6 +31,9 @@ from ambiguous_wild.builder.pose_hypothesis import (
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.io.safe_pycolmap import pycolmap
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 FITS = 0.5  # share of a motion's matches that must fit for a partner to agree
 LEAST_PHOTOS = 3  # smallest number of photos of a model
@@ -163,6 +166,8 @@ class Placement:
 
     def _cut_crowded(self, graph: nx.Graph, photos: Sequence[int]) -> None:
         """Remove the links of a photo with a group that it alone connects, if they may show a distractor."""
+        import networkx as nx
+
         rays = self.matched.rays()
         for k in sorted(nx.articulation_points(graph)):
             if not graph.degree(k):
@@ -216,48 +221,18 @@ class Placement:
         return int(self.model.images[self.matched.ids[photo]].num_points3D)
 
     def _deviations_deg(self, reference: int | None) -> dict[int, float]:
-        """Return the standard deviation of each photo's rotation, where it is known.
-
-        Args:
-            reference: the photo relative to which; None: the one that the adjustment held.
-        """
-        if self._covariance is None:
-            return {}
-        covariance, model = self._covariance
-        images = {k: model.images[self.matched.ids[k]] for k in self.poses}
-        deviations = {}
-        for photo, image in images.items():
-            if reference is None:
-                found = covariance.get_cam_cov_from_world(image.image_id)
-            else:
-                two = (images[reference], image)
-                ends = [part for one in two for part in (one.image_id, one.cam_from_world())]
-                found = None if photo == reference else covariance.get_cam2_cov_from_cam1(*ends)
-            rotation = np.full((3, 3), np.nan) if found is None else np.asarray(found)[:3, :3]
-            if np.isfinite(rotation).all():  # a lens that nothing determines makes all of them NaN
-                variance = max(float(np.linalg.eigvalsh(rotation).max()), 0.0)
-                # Ceres' tangent of a quaternion is half of the angle.
-                deviations[photo] = 2.0 * float(np.degrees(np.sqrt(variance)))
-        return deviations
+        """Return the standard deviation of each photo's rotation; see `pose_covariance.deviations_deg`."""
+        return deviations_deg(self._covariance, {k: self.matched.ids[k] for k in self.poses}, reference)
 
     @cached_property
     def _covariance(self) -> tuple[Any, Any] | None:
         """Covariance of a joint adjustment, and the adjusted copy of the model; None if not determined."""
         if not LEAST_PHOTOS <= len(self.poses) <= COVARIANCE_LIMIT:
             return None
-        model = pycolmap.Reconstruction(self.model)  # a diagnosis changes no pose
-        config = pycolmap.BundleAdjustmentConfig()
-        for photo in self.poses:
-            if self._observations(photo) >= LEAST_POINTS:  # one with fewer leaves all of them open
-                config.add_image(self.matched.ids[photo])
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        adjuster = pycolmap.create_default_ceres_bundle_adjuster(
-            adjustment_options(self.matched.distorted, len(self.poses), final=True), config, model
-        )
-        adjuster.solve()
-        options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
-        covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
-        return None if covariance is None else (covariance, model)
+        # A photo with fewer points leaves all of them open.
+        photos = [self.matched.ids[k] for k in self.poses if self._observations(k) >= LEAST_POINTS]
+        options = adjustment_options(self.matched.distorted, len(self.poses), final=True)
+        return joint_covariance(self.model, photos, options)
 
     def _place_all(self, times_out: list[int], only_out: bool) -> bool:
         """Place all photos; tell whether more than a few changed, or an added one may help others in."""

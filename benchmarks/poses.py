@@ -371,6 +371,7 @@ def main(words: Sequence[str] | None = None) -> None:
             if not kept.is_file() and not args.report_only:
                 made = capture_of(name, seed, kind, every, args)
                 if made is None:
+                    print(f"{capture}: too few photos to paste on, left out")
                     break
                 raw, judge = made
                 row = build(raw, way, seed, args)

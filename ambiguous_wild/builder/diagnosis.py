@@ -19,7 +19,6 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 MIN_SHARE = 0.3  # share of the readable photos that must be placed, or most of the scene is missing
 MIN_POINTS = 10  # per placed photo; fewer determine neither poses nor surfaces
 _STRONG_PAIRS = 60  # pairs with the most inliers, used for the diagnosis
-_MAX_PAIR_ID = 2147483647  # COLMAP: pair id = id1 * this + id2
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def _motion(database: Path, pair_ids: list[int]) -> tuple[list[float], list[floa
     db = pycolmap.Database.open(str(database))
     try:
         for pair_id in pair_ids:
-            first, second = (db.read_image(i) for i in divmod(pair_id, _MAX_PAIR_ID))
+            first, second = (db.read_image(i) for i in pycolmap.pair_id_to_image_pair(pair_id))
             geometry = db.read_two_view_geometry(first.image_id, second.image_id)
             points = [db.read_keypoints(i.image_id)[:, :2].astype(np.float64) for i in (first, second)]
             cameras = [db.read_camera(i.camera_id) for i in (first, second)]

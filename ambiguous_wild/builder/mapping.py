@@ -57,7 +57,7 @@ def run_mapping(job: MappingJob) -> None:
             other.load_motions(Path(job["motions"]))
             parts = max(parts, _placed(job, database, other, rivals), key=lambda p: _explained(p[0]))
     chosen = parts[job["part"] - 1] if len(parts) >= job["part"] else None
-    for part in {id(part): part for part in (*parts[:1], *parts[job["part"] - 1 : job["part"]])}.values():
+    for part in {*parts[:1], *([chosen] if chosen else [])}:
         part.name_unsure()
     firm = len(parts[0].poses.keys() - parts[0].provisional) if parts else 0
     if chosen is None or len(chosen.poses) < LEAST_PHOTOS:

@@ -170,10 +170,8 @@ class Placement:
 
         rays = self.matched.rays()
         for k in sorted(nx.articulation_points(graph)):
-            if not graph.degree(k):
-                continue
-            photo, linked = photos[k], set(graph[k])
-            linked = {j for j in linked if not self._joins(photo, photos[j])}
+            photo = photos[k]
+            linked = {j for j in graph[k] if not self._joins(photo, photos[j])}
             evidence = self._judge(photo, self.poses[photo], rays).evidence
             sides = []
             for side in nx.connected_components(nx.restricted_view(graph, [k], [])):
@@ -214,7 +212,8 @@ class Placement:
             reference = max(deviations, key=self._observations)
             among = self._deviations_deg(reference)
             unsure = {k for k, deviation in among.items() if deviation > UNSURE_DEG}
-            unsure |= self.poses.keys() - (deviations if 2 * len(unsure) <= len(among) else set())
+            most = not among or 2 * len(unsure) > len(among)
+            unsure = set(self.poses) if most else unsure | (self.poses.keys() - deviations.keys())
         self.provisional |= unsure
 
     def _observations(self, photo: int) -> int:

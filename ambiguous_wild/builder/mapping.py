@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ def run_mapping(job: MappingJob) -> None:
     and the model with more observations is kept.
     """
     output, database = Path(job["output"]), Path(job["database"])
+    ThreadPoolExecutor(1).submit(importlib.import_module, "networkx")  # while COLMAP maps
     matched = Matched.read(database)
     models = _models(job, output, matched)
     if models and not plausible(models[0]):

@@ -20,7 +20,7 @@ from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.motions import Pair, trace_of
 from ambiguous_wild.builder.overlap_graph import bridges, graph_of, groups
 from ambiguous_wild.builder.point_lookup import PointLookup
-from ambiguous_wild.builder.pose_covariance import deviations_deg, joint_covariance
+from ambiguous_wild.builder.pose_covariance import UNSURE, JointCovariance, joint_covariance
 from ambiguous_wild.builder.pose_hypothesis import (
     AGREE,
     AGREE_NEW,
@@ -50,7 +50,6 @@ SPLITS = 5  # times at most that photos without a link to the others are taken o
 TAKEN_OUT = 2  # times a photo is taken out before it stays out
 LOOSE_PX, TIGHT_PX = 4.0, 2.0  # observations with a larger error are removed, first and last
 COVARIANCE_LIMIT = 400  # photos: the poses' covariance is a dense matrix
-UNSURE_DEG = 0.66  # standard deviation of a rotation above which photos were off by 1 degree and more
 ADJUSTMENTS = 3  # joint adjustments at most
 STILL = 2e-3  # share of changed observations that ends them, and share of moved photos that ends placing
 
@@ -188,11 +187,12 @@ class Placement:
         numbers: dict[int, list[int]] = {}
         for photo in self.poses:
             numbers.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
-        covariance, adjusted = self._covariance or (None, self.model)
+        found = self._covariance
         facts: list[CameraFact] = []
         for number, photos in numbers.items():
-            params = adjusted.cameras[number].params
-            spread = covariance.get_other_params_cov(params) if covariance else None
+            spread = None
+            if found is not None:
+                spread = found.covariance.get_other_params_cov(found.model.cameras[number].params)
             deviation = np.inf if spread is None else float(np.sqrt(spread[0][0]))
             facts.append(
                 {
@@ -204,34 +204,26 @@ class Placement:
         return facts
 
     def name_unsure(self) -> None:
-        """Make photos provisional whose rotation the matches leave open; all, if that holds for most."""
+        """Make photos provisional whose poses the matches leave open; all, if that holds for most."""
         self.provisional |= {k for k in self.poses if self._observations(k) < LEAST_POINTS}
-        deviations = self._deviations_deg(None)
-        unsure = {k for k, deviation in deviations.items() if deviation > UNSURE_DEG}
-        if 2 * len(unsure) > len(deviations):  # the photo that was held may be the uncertain one
-            reference = max(deviations, key=self._observations)
-            among = self._deviations_deg(reference)
-            unsure = {k for k, deviation in among.items() if deviation > UNSURE_DEG}
-            most = not among or 2 * len(unsure) > len(among)
-            unsure = set(self.poses) if most else unsure | (self.poses.keys() - deviations.keys())
-        self.provisional |= unsure
+        deviations = self._covariance.deviations if self._covariance else {}
+        if deviations:
+            sure = {k for k in self.poses if (deviations.get(self.matched.ids[k], np.inf) <= UNSURE).all()}
+            most = 2 * len(sure) >= len(deviations)
+            self.provisional |= self.poses.keys() - (sure if most else set())
 
     def _observations(self, photo: int) -> int:
         return int(self.model.images[self.matched.ids[photo]].num_points3D)
 
-    def _deviations_deg(self, reference: int | None) -> dict[int, float]:
-        """Return the standard deviation of each photo's rotation; see `pose_covariance.deviations_deg`."""
-        return deviations_deg(self._covariance, {k: self.matched.ids[k] for k in self.poses}, reference)
-
     @cached_property
-    def _covariance(self) -> tuple[Any, Any] | None:
-        """Covariance of a joint adjustment, and the adjusted copy of the model; None if not determined."""
+    def _covariance(self) -> JointCovariance | None:
         if not LEAST_PHOTOS <= len(self.poses) <= COVARIANCE_LIMIT:
             return None
         # A photo with fewer points leaves all of them open.
-        photos = [self.matched.ids[k] for k in self.poses if self._observations(k) >= LEAST_POINTS]
+        photos = [k for k in self.poses if self._observations(k) >= LEAST_POINTS]
+        ids = [self.matched.ids[k] for k in sorted(photos, key=self._observations, reverse=True)]
         options = adjustment_options(self.matched.distorted, len(self.poses), final=True)
-        return joint_covariance(self.model, photos, options)
+        return joint_covariance(self.model, ids, options)
 
     def _place_all(self, times_out: list[int], only_out: bool) -> bool:
         """Place all photos; tell whether more than a few changed, or an added one may help others in."""

@@ -5,6 +5,7 @@ A job for that process is written as JSON, which `sfm_worker` reads.
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -12,6 +13,7 @@ import shutil
 import sqlite3
 import subprocess
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NotRequired, TypedDict, cast
@@ -331,7 +333,10 @@ def map_scene(
         "seed": settings.seed,
         "jobs": jobs,
     }
-    run_job(job, folder, lambda: bar.at(_number(progress)))
+    with ThreadPoolExecutor(1) as ahead:
+        # The map is drawn next; these imports take a second, in which this process has nothing to do.
+        ahead.map(importlib.import_module, ("networkx", "matplotlib.figure"))
+        run_job(job, folder, lambda: bar.at(_number(progress)))
     bar.finish()
     database.unlink()
     progress.unlink(missing_ok=True)

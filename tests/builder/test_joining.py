@@ -251,7 +251,7 @@ def shown_in(photo: int) -> np.ndarray:
 @pytest.mark.parametrize("weak", [None, 0, 4])
 def test_the_photo_is_provisional_whose_rotation_the_matches_leave_open(weak, monkeypatch):
     """Also photo 0, which the adjustment holds: relative to it all others are open."""
-    monkeypatch.setattr(photo_placement, "UNSURE_DEG", 0.35)
+    monkeypatch.setattr(photo_placement, "UNSURE", np.array([np.radians(0.25), np.inf]))
     part = placed_with_noise(weak)
     part.name_unsure()
     assert part.provisional == (set() if weak is None else {weak})
@@ -260,12 +260,12 @@ def test_the_photo_is_provisional_whose_rotation_the_matches_leave_open(weak, mo
 
 
 def test_an_open_model_and_photos_of_few_points_are_provisional(monkeypatch):
-    monkeypatch.setattr(photo_placement, "UNSURE_DEG", 0.01)
+    monkeypatch.setattr(photo_placement, "UNSURE", np.array([np.radians(0.01), np.inf]))
     part = placed_with_noise(None)
     part.name_unsure()
     assert part.provisional == set(range(6))
     monkeypatch.setattr(photo_placement, "LEAST_POINTS", 10)
-    monkeypatch.setattr(photo_placement, "UNSURE_DEG", 0.35)
+    monkeypatch.setattr(photo_placement, "UNSURE", np.array([np.radians(0.25), np.inf]))
     part = placed_with_noise(4)
     part.name_unsure()
     assert part.provisional == {4}

@@ -41,7 +41,7 @@ from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import BY_MACHINE, DINO, check_features, first_here, make_features, parse
 from ambiguous_wild.vision.precompute import photo_features
-from ambiguous_wild.vision.protocols import Features, SceneFeatures
+from ambiguous_wild.vision.protocols import Features
 
 _SIZES = dict.fromkeys((*DINO, "vgg16"), 252)  # px, input of nets without "@"; others take the photo's size
 PUBLISHED = "dinov2-small-registers@504,normalise=raw"
@@ -389,10 +389,12 @@ class RobustSplatMask(PausingMask):
 
 def _fit(features: Features, photos: list[Tensor], data: TrainData) -> None:
     """Fit features to photos, which may be smaller than the scene's; tracks are in px of the scene's."""
-    if not isinstance(features, SceneFeatures):
+    from ambiguous_wild.methods.refinesplat.inputs import train_tracks  # wants SciPy
+    from ambiguous_wild.vision.sceneconv import SceneConv
+
+    if not isinstance(features, SceneConv):
         features.fit(photos)
         return
-    from ambiguous_wild.methods.refinesplat.inputs import train_tracks  # wants SciPy
 
     point, photo, xy = train_tracks(data.scene)
     scale = photos[0].shape[1] / data.photos[0].shape[1]

@@ -235,11 +235,11 @@ def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
 
     from ambiguous_wild.methods.refinesplat.inputs import train_tracks
     from ambiguous_wild.vision.backends import make_features
-    from ambiguous_wild.vision.protocols import SceneFeatures
+    from ambiguous_wild.vision.sceneconv import SceneConv
 
     backend = make_features(spec)
     views = list(scene.train)
-    if isinstance(backend, SceneFeatures):
+    if isinstance(backend, SceneConv):
         photos = [torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in views]
         backend.fit_scene(photos, train_tracks(scene), cache)
         return backend

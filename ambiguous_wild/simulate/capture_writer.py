@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from importlib.metadata import version
@@ -32,6 +32,7 @@ from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.files import atomic_dir, refuse_foreign_files, sha256_file, write_json
+from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.simulate.courtyard import courtyard
 from ambiguous_wild.simulate.distractors import lay_out
 from ambiguous_wild.simulate.image_effects import PhotoRandom
@@ -155,9 +156,6 @@ def _zoomed(cameras: list[Camera], spec: CaptureSpec, shift: float) -> list[Came
     return zoomed
 
 
-PhotoProgress = Callable[[list[PlannedPhoto]], Iterable[PlannedPhoto]]
-
-
 def build_world(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
     """Build the place of the spec; positions and textures vary with the generator.
 
@@ -192,7 +190,7 @@ def simulate(
     seed: int = 0,
     depth: bool = False,
     overwrite: bool = False,
-    progress: PhotoProgress = iter,
+    progress: Progress = iter,
 ) -> SimulatedCapture:
     """Make the capture, or reuse an identical one, and return truth/capture.json.
 
@@ -233,7 +231,7 @@ def _render(
     seed: int,
     folder: Path,
     depth: bool,
-    progress: PhotoProgress,
+    progress: Progress,
 ) -> dict[str, PhotoTruth]:
     photos: dict[str, PhotoTruth] = {}
     randoms = [PhotoRandom(seed, k, k / max(spec.train_views - 1, 1)) for k in range(len(planned))]

@@ -9,7 +9,6 @@ RAW/truth/composite.json            config, cut-outs with sha256; per photo sour
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -25,6 +24,7 @@ from ambiguous_wild.core.srgb import srgb_to_linear
 from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES, Exif, UnreadablePhoto, read_photo
+from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.simulate.composite_scene import check_request
 from ambiguous_wild.simulate.cutouts import (
     SMALLEST_PX,
@@ -110,7 +110,7 @@ def composite_photos(
     output: Path | str,
     config: CompositeConfig,
     cutouts: Path | str | None = None,
-    progress: Callable[[Sequence[Path]], Iterable[Path]] = iter,
+    progress: Progress = iter,
 ) -> PastedRecord:
     """Make the capture, and return truth/composite.json.
 

@@ -9,7 +9,6 @@ SCENE2/truth/composite.json           config, cut-outs with sha256; per photo pl
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,9 +20,10 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.core.scene import Scene, SceneInfo, View
+from ambiguous_wild.core.scene import Scene, SceneInfo
 from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
 from ambiguous_wild.io.images import image_size, read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, load_scene, read_scene_json
 from ambiguous_wild.simulate.cutouts import (
     Cutout,
@@ -94,9 +94,6 @@ class CompositeRecord(TypedDict):
     photos: dict[str, CompositePhoto]
 
 
-ViewProgress = Callable[[Sequence[View]], Iterable[View]]
-
-
 @dataclass(frozen=True)
 class _PastePlan:
     cutouts: list[Cutout]
@@ -109,7 +106,7 @@ def composite(
     output: Path | str,
     config: CompositeConfig,
     cutouts: Path | str | None = None,
-    progress: ViewProgress = iter,
+    progress: Progress = iter,
 ) -> CompositeRecord:
     """Make the scene, and return truth/composite.json.
 
@@ -202,7 +199,7 @@ def _folders(root: Path) -> list[str]:
 
 
 def _write_photos(
-    scene: Scene, plan: _PastePlan, config: CompositeConfig, folder: Path, progress: ViewProgress
+    scene: Scene, plan: _PastePlan, config: CompositeConfig, folder: Path, progress: Progress
 ) -> dict[str, CompositePhoto]:
     """Write the photos of all sizes, and the truth at the size of training."""
     kinds = [(f, _pictures(scene, f)) for f in _folders(scene.root)]

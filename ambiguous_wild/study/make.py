@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePosixPath
@@ -19,6 +19,7 @@ from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
+from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.study.answers import KEY_FORMAT, KEY_VERSION, KIND_PAIR, KIND_PHOTO, study_id
 
@@ -198,9 +199,6 @@ def same_size(paths: tuple[Path, ...]) -> list[np.ndarray]:
     return images
 
 
-Bar = Callable[[list[Question]], Iterable[Question]]
-
-
 @dataclass(frozen=True)
 class StudySettings:
     """Settings of a study."""
@@ -226,7 +224,7 @@ class StudyFiles:
 
 
 def make_study(
-    questions: Sequence[Question], page: Path, key: Path, settings: StudySettings, progress: Bar = iter
+    questions: Sequence[Question], page: Path, key: Path, settings: StudySettings, progress: Progress = iter
 ) -> StudyFiles:
     """Choose questions, encode their images, write the page and the key.
 

@@ -136,7 +136,7 @@ def make_features(spec: str) -> Features:
 
 
 def make_instances(spec: str) -> Instances:
-    """Make the back end of instances that a spec names; it may be `NamedInstances` or `SceneInstances`, too.
+    """Make the back end of instances that a spec names; it may be `SceneInstances`, too.
 
     ``graph``; one of `CONV`: graph segments grouped by its features; one of `SAM` (``@n`` = points along a
     side) or `SAM_VIDEO`; ``grounded:PROMPT`` and, tracked over a sequence, ``grounded-video:PROMPT``;

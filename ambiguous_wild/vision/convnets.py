@@ -20,7 +20,7 @@ from ambiguous_wild.core.weight_files import expanded, read_tensors
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.vision import weight_registry
 from ambiguous_wild.vision.dino import normalised
-from ambiguous_wild.vision.protocols import FittedByDistance, cell_grid, check_image, check_sizes, whole_cells
+from ambiguous_wild.vision.protocols import Features, cell_grid, check_image, check_sizes, whole_cells
 from ambiguous_wild.vision.weight_conversion import check_published, used_tensors
 
 _EPS = 1e-3  # of the batch norms
@@ -164,7 +164,7 @@ NETWORKS = {
 }
 
 
-class ConvFeatures(FittedByDistance):
+class ConvFeatures(Features):
     """Features that are the output of one layer, [h, w, C]; the cells divide the image evenly."""
 
     def __init__(self, name: str, config: ConvConfig | None = None, folder: str | Path | None = None) -> None:
@@ -228,7 +228,7 @@ class ConvFeatures(FittedByDistance):
         return cell_grid(height, width, self.size, self.stride)
 
     def precision(self, device: torch.device) -> str:
-        """See `precompute.PreciseFeatures`: torch's default for convolutions on a GPU is TF32."""
+        """See `Features.precision`: torch's default for convolutions on a GPU is TF32."""
         return "tf32" if device.type == "cuda" and torch.backends.cudnn.allow_tf32 else ""
 
     def __call__(self, image: Tensor) -> Tensor:

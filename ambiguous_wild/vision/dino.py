@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.vision.pretrained import Pretrained, load, locate
-from ambiguous_wild.vision.protocols import FittedByDistance, cell_grid, check_image, check_sizes, whole_cells
+from ambiguous_wild.vision.protocols import Features, cell_grid, check_image, check_sizes, whole_cells
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class DinoConfig:
     fit_photos: int = 8  # photos that `fit` uses
 
 
-class DinoFeatures(FittedByDistance):
+class DinoFeatures(Features):
     """Patch tokens after the final norm, [h, w, C]; the class token and registers are dropped."""
 
     def __init__(
@@ -106,7 +106,6 @@ class DinoFeatures(FittedByDistance):
         return cell_grid(height, width, self.config.size, self.patch)
 
     def precision(self, device: torch.device) -> str:
-        """See `precompute.PreciseFeatures`."""
         return str(MIXED).removeprefix("torch.") if mixed(device) else ""
 
     def __call__(self, image: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.weight_files import expanded
 from ambiguous_wild.io.images import decode
-from ambiguous_wild.vision.protocols import Bar, no_bar
+from ambiguous_wild.io.progress_bar import Progress
 
 SUFFIXES = (".png", ".npy")
 _ASPECT = 0.02  # a map is rejected if its aspect ratio differs from the photo's by more
@@ -103,7 +103,11 @@ class SceneLabelMaps(LabelMaps):
         self.name = f"labels-scene-1-{self.folder.name}"
 
     def identities(
-        self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
+        self,
+        photos: Sequence[Tensor],
+        names: Sequence[str],
+        folder: Path | None = None,
+        progress: Progress = iter,
     ) -> list[np.ndarray]:
         """Labels [H, W] int32 of every photo, with ids 1..P without gaps over the whole scene; 0 = none."""
         maps = self._raw(photos, names)

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import State
-from ambiguous_wild.vision.protocols import blurred_noisy_copy, check_image, spaced
+from ambiguous_wild.vision.protocols import Features, blurred_noisy_copy, check_image, spaced
 
 STRIDE = 4  # px of the image per cell of the grid
 BINS = 9  # orientations over 180 degrees
@@ -32,7 +32,7 @@ _XYZ = (
 )
 
 
-class LabHog:
+class LabHog(Features):
     """Lab means (4, 12, 20 px) and HOG (9 bins, full and half size) on a grid of 4 px.
 
     Each block has length sqrt(weight), with weight = 1 / mean cosine distance between the scene's photos and
@@ -41,6 +41,7 @@ class LabHog:
 
     name = "labhog-1"
     channels = LAB_CHANNELS + HOG_CHANNELS
+    fit_photos = 24
 
     def __init__(self) -> None:
         self.hog_mean = torch.zeros(HOG_CHANNELS)
@@ -49,17 +50,16 @@ class LabHog:
         self.unit = float(2.0 / self.weights.sum())
 
     @torch.no_grad()
-    def fit(self, photos: Sequence[Tensor], most: int = 24) -> None:
+    def fit(self, photos: Sequence[Tensor]) -> None:
         """Measure channel statistics and block weights of the scene.
 
         Args:
-            photos: training photos, [H, W, 3] in [0, 1].
-            most: photos to use, evenly spaced.
+            photos: training photos, [H, W, 3] in [0, 1]; `fit_photos` of them are used, evenly spaced.
 
         Raises:
             AwError: there is no photo.
         """
-        chosen = [photos[k] for k in spaced(len(photos), most)]
+        chosen = [photos[k] for k in spaced(len(photos), self.fit_photos)]
         pairs = [_blocks(photo) for photo in chosen]
         hogs = torch.cat([hog.reshape(-1, HOG_CHANNELS) for _, hog in pairs]).double()
         device = photos[0].device

@@ -17,7 +17,8 @@ from torch import Tensor
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import KEPT, MASKED, faded
 from ambiguous_wild.vision.precompute import cache_key, cached
-from ambiguous_wild.vision.protocols import Instances, PromptedInstances
+from ambiguous_wild.vision.protocols import Instances
+from ambiguous_wild.vision.sam import SamInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
 MOVES = 0.6  # a pixel moves if `moving_map` is above this
@@ -65,7 +66,7 @@ def moving_labels(
 ) -> np.ndarray:
     """Segments for `moving_map`, [H, W] int32.
 
-    A back end that takes points (SAM) is prompted with features that move together, and with static features
+    SAM is prompted with features that move together, and with static features
     as negatives; each mask it returns becomes a segment of its own. Other back ends keep their segments.
 
     Args:
@@ -76,7 +77,7 @@ def moving_labels(
         folder: the cache.
     """
     motions = np.flatnonzero(np.bincount(points.motion)[1:] >= LEAST_PROMPT) + 1
-    if not isinstance(instances, PromptedInstances) or not len(motions):
+    if not isinstance(instances, SamInstances) or not len(motions):
         return labels
     xy = points.xy * labels.shape[::-1]
     groups = [xy[points.motion == k] for k in motions]

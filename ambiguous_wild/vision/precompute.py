@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,13 +21,9 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.io.files import atomic_path, sha256_array
-from ambiguous_wild.vision.protocols import (
-    Features,
-    Instances,
-    NamedInstances,
-    SceneInstances,
-    terminal_bar,
-)
+from ambiguous_wild.io.progress_bar import terminal_bar
+from ambiguous_wild.vision.label_maps import LabelMaps
+from ambiguous_wild.vision.protocols import Features, Instances, SceneInstances
 
 Arrays = dict[str, np.ndarray]
 STALE_S = 24 * 3600.0  # older temporary files are leftovers of a killed process
@@ -103,15 +99,6 @@ class SceneLabels:
     scene_wide: bool  # all photos share the ids
 
 
-@runtime_checkable
-class PreciseFeatures(Protocol):
-    """Features whose precision depends on the device; optional, in addition to `Features`."""
-
-    def precision(self, device: torch.device) -> str:
-        """Precision on the device, e.g. ``"bfloat16"``, part of cache keys; "" = float32."""
-        ...
-
-
 def photo_features(features: Features, photos: Sequence[Tensor], folder: Path) -> list[Tensor]:
     """Features [h, w, C] of every photo [H, W, 3]; call `features.fit` first.
 
@@ -121,7 +108,7 @@ def photo_features(features: Features, photos: Sequence[Tensor], folder: Path) -
     state = {k: _digest(v) if isinstance(v, Tensor) else v for k, v in features.state_dict().items()}
     result = []
     for photo in terminal_bar("features")(photos):
-        precision = features.precision(photo.device) if isinstance(features, PreciseFeatures) else ""
+        precision = features.precision(photo.device)
         name = f"{features.name}-{precision}" if precision else features.name
         key = cache_key("features", name, state, photo.detach().cpu().numpy())
 
@@ -149,7 +136,7 @@ def instance_labels(
     """Label maps of every photo, with the scene's identities if the back end provides them.
 
     Args:
-        instances: back end; `SceneInstances` and `NamedInstances` are used if implemented.
+        instances: back end; of `SceneInstances` the ids are the scene's.
         photos: [H, W, 3] in [0, 1].
         names: names of the photos.
         folder: the cache; photos and chunks in it are not computed again.
@@ -157,7 +144,7 @@ def instance_labels(
     shown = terminal_bar(f"instances ({instances.name.partition('-')[0]})")
     if isinstance(instances, SceneInstances):
         return SceneLabels(instances.identities(photos, names, folder, shown), True)
-    if isinstance(instances, NamedInstances):
+    if isinstance(instances, LabelMaps):
         return SceneLabels(instances.labels_of(photos, names), False)
     return SceneLabels([photo_labels(instances, photo, folder) for photo in shown(photos)], False)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -15,63 +15,43 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import State
+from ambiguous_wild.io.progress_bar import Progress
 
-Bar: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]
 _LEAST_PX = 8
 _BLUR_PX, _NOISE = 1.5, 0.02  # blur and noise of the copies that set units and weights of features
 
 
-def no_bar(items: Sequence[Any]) -> Iterable[Any]:
-    """Return the items unchanged: no progress bar is shown."""
-    return items
-
-
-def terminal_bar(what: str) -> Bar:
-    """Return a function that wraps a list of photos, so that a terminal shows a bar during iteration.
-
-    `what` is the name of the stage, e.g. ``"instance masks"``.
-    """
-
-    def wrap(items: Sequence[Any]) -> Iterable[Any]:
-        from tqdm import tqdm
-
-        return tqdm(items, desc=what, unit="photo", disable=None, leave=False)  # None: only on a terminal
-
-    return wrap
-
-
-class Features(Protocol):
+class Features(ABC):
     """Dense features of an image, frozen after `fit`, differentiable in the image."""
 
     name: str  # part of every cache key
     channels: int  # C
-    unit: float  # mean cosine distance that blur and noise alone cause; set by `fit`
+    unit = 0.1  # mean cosine distance that blur and noise alone cause; set by `fit`
+    fit_photos = 8  # photos that `fit` uses
 
-    def fit(self, photos: Sequence[Tensor]) -> None:
-        """Measure statistics of the scene on the training photos [H, W, 3], without ground truth."""
-        ...
-
+    @abstractmethod
     def __call__(self, image: Tensor) -> Tensor:
         """Features [h, w, C] float32 of an sRGB image [H, W, 3] float32 in [0, 1]."""
-        ...
 
-    def state_dict(self) -> State: ...
+    def fit(self, photos: Sequence[Tensor]) -> None:
+        """Measure statistics of the scene on the training photos [H, W, 3], without ground truth.
 
-    def load_state_dict(self, state: State) -> None: ...
+        By default that is `unit` alone, see `degraded_distance`.
 
+        Raises:
+            AwError: there is no photo.
+        """
+        self.unit = degraded_distance(self, photos, self.fit_photos)
 
-@runtime_checkable
-class SceneFeatures(Protocol):
-    """Features that are trained on the scene: call `fit_scene` in place of `fit` the first time."""
+    def precision(self, device: torch.device) -> str:
+        """Precision on the device, e.g. ``"bfloat16"``, part of cache keys; "" = float32."""
+        return ""
 
-    def fit_scene(
-        self,
-        photos: Sequence[Tensor],
-        tracks: tuple[np.ndarray, np.ndarray, np.ndarray],
-        folder: Path | None = None,
-    ) -> None:
-        """Train on photos [H, W, 3] and SfM observations: point [L], photo [L], xy px [L, 2]."""
-        ...
+    def state_dict(self) -> State:
+        return {"unit": self.unit}
+
+    def load_state_dict(self, state: State) -> None:
+        self.unit = float(state["unit"])
 
 
 class Instances(Protocol):
@@ -85,28 +65,6 @@ class Instances(Protocol):
 
 
 @runtime_checkable
-class NamedInstances(Protocol):
-    """Instances that are found by the photo's name; optional, in addition to `Instances`."""
-
-    name: str
-
-    def labels_of(self, photos: Sequence[Tensor], names: Sequence[str]) -> list[np.ndarray]:
-        """Labels [H, W] int32 of every photo, with ids per photo; 0 = none."""
-        ...
-
-
-@runtime_checkable
-class PromptedInstances(Protocol):
-    """Instances at given points; optional, in addition to `Instances`."""
-
-    name: str
-
-    def at_points(self, photo: Tensor, groups: Sequence[np.ndarray], outside: np.ndarray) -> np.ndarray:
-        """Mask [n, H, W] bool of the instance under each group of points [k, 2] px, not under `outside`."""
-        ...
-
-
-@runtime_checkable
 class SceneInstances(Protocol):
     """Instances with one id per object over all photos; optional, in addition to `Instances`.
 
@@ -116,7 +74,11 @@ class SceneInstances(Protocol):
     name: str
 
     def identities(
-        self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
+        self,
+        photos: Sequence[Tensor],
+        names: Sequence[str],
+        folder: Path | None = None,
+        progress: Progress = iter,
     ) -> list[np.ndarray]:
         """Labels [H, W] int32 of every photo, one id per object of the scene; 0 = none, gaps allowed.
 
@@ -124,7 +86,7 @@ class SceneInstances(Protocol):
             photos: [H, W, 3] float32 in [0, 1].
             names: names of the photos, with a suffix; their natural order is the order of a sequence.
             folder: the cache (`vision.precompute`), from which a stopped stage resumes.
-            bar: wraps the list of items, for a progress bar.
+            progress: wraps the list of items, for a progress bar.
         """
         ...
 
@@ -142,16 +104,20 @@ def spaced(count: int, most: int) -> list[int]:
 
 def blurred_noisy_copy(photo: Tensor, seed: int) -> Tensor:
     """Blur the photo and add noise, so that it resembles a good render of it."""
-    radius = math.ceil(3 * _BLUR_PX)
-    taps = torch.arange(-radius, radius + 1, dtype=photo.dtype, device=photo.device)
-    kernel = torch.exp(-0.5 * (taps / _BLUR_PX) ** 2)
-    kernel = kernel / kernel.sum()
-    maps = photo.permute(2, 0, 1)[:, None]
-    maps = F.pad(maps, (radius, radius, radius, radius), mode="replicate")
-    maps = F.conv2d(F.conv2d(maps, kernel.reshape(1, 1, 1, -1)), kernel.reshape(1, 1, -1, 1))
+    blurred = gaussian_blur(photo.permute(2, 0, 1), _BLUR_PX).permute(1, 2, 0)
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(photo.shape, generator=generator).to(photo.device) * _NOISE
-    return (maps[:, 0].permute(1, 2, 0) + noise).clamp(0.0, 1.0)
+    return (blurred + noise).clamp(0.0, 1.0)
+
+
+def gaussian_blur(maps: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur of [C, H, W], `sigma` in px; border pixels are repeated."""
+    radius = max(math.ceil(3.0 * sigma), 1)
+    taps = torch.arange(-radius, radius + 1, dtype=maps.dtype, device=maps.device)
+    kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    padded = F.pad(maps[:, None], (radius, radius, radius, radius), mode="replicate")
+    return F.conv2d(F.conv2d(padded, kernel.reshape(1, 1, 1, -1)), kernel.reshape(1, 1, -1, 1))[:, 0]
 
 
 @torch.no_grad()
@@ -172,30 +138,6 @@ def degraded_distance(features: Callable[[Tensor], Tensor], photos: Sequence[Ten
         means.append((1.0 - F.cosine_similarity(one, two, dim=2)).double().mean().item())
     # rounded, because it is part of cache keys and its last bits depend on the number of threads
     return float(f"{max(sum(means) / len(means), 1e-6):.4g}")
-
-
-class FittedByDistance(ABC):
-    """Features whose only statistic of a scene is `unit`."""
-
-    unit = 0.1  # until `fit` measures it
-    fit_photos: int  # photos that `fit` uses
-
-    @abstractmethod
-    def __call__(self, image: Tensor) -> Tensor: ...
-
-    def fit(self, photos: Sequence[Tensor]) -> None:
-        """Set `unit`, see `degraded_distance`.
-
-        Raises:
-            AwError: there is no photo.
-        """
-        self.unit = degraded_distance(self, photos, self.fit_photos)
-
-    def state_dict(self) -> State:
-        return {"unit": self.unit}
-
-    def load_state_dict(self, state: State) -> None:
-        self.unit = float(state["unit"])
 
 
 def check_sizes(name: str, size: int, cell: int, fit_photos: int) -> None:

@@ -21,10 +21,11 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.precompute import cache_key, cached, photo_labels
 from ambiguous_wild.vision.pretrained import load, locate
-from ambiguous_wild.vision.protocols import Bar, Instances, no_bar
+from ambiguous_wild.vision.protocols import Instances
 from ambiguous_wild.vision.sam import SamConfig, SamInstances, fit_to
 
 
@@ -79,7 +80,11 @@ class SamVideoInstances:
         return self.single.labels(photo)
 
     def identities(
-        self, photos: Sequence[Tensor], names: Sequence[str], folder: Path | None = None, bar: Bar = no_bar
+        self,
+        photos: Sequence[Tensor],
+        names: Sequence[str],
+        folder: Path | None = None,
+        progress: Progress = iter,
     ) -> list[np.ndarray]:
         """Labels [H, W] int32 of every photo, one id per object over the whole sequence; 0 = none.
 
@@ -87,13 +92,13 @@ class SamVideoInstances:
             photos: [H, W, 3] in [0, 1].
             names: names of the photos; their natural order (a2 before a10) is the order of the sequence.
             folder: the cache; each photo's instances and each chunk are one entry.
-            bar: wraps the chunks, for a progress bar.
+            progress: wraps the chunks, for a progress bar.
         """
         order = sorted(range(len(photos)), key=lambda i: (natural(names[i]), i))
         result: list[np.ndarray] = [np.zeros(tuple(p.shape[:2]), dtype=np.int32) for p in photos]
         carried: np.ndarray | None = None  # ids in the next chunk's first photo
         next_id = 1
-        for start in bar(list(range(0, len(order), self.config.every))):
+        for start in progress(list(range(0, len(order), self.config.every))):
             chunk = order[start : start + self.config.every + 1]
             frames = [photos[i] for i in chunk]
             detected = photo_labels(self.single, frames[0], folder)

@@ -29,7 +29,13 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import State
 from ambiguous_wild.vision.labhog import STRIDE, lab_image
 from ambiguous_wild.vision.precompute import cache_key, cached
-from ambiguous_wild.vision.protocols import blurred_noisy_copy, check_image, spaced
+from ambiguous_wild.vision.protocols import (
+    Features,
+    blurred_noisy_copy,
+    check_image,
+    gaussian_blur,
+    spaced,
+)
 
 Tracks = tuple[np.ndarray, np.ndarray, np.ndarray]  # point [L], photo [L], xy px [L, 2]
 Net = TypeVar("Net", bound=nn.Module)
@@ -182,7 +188,7 @@ def imitated_render(image: Tensor, rng: np.random.Generator) -> Tensor:
     height, width = image.shape[1:]
     sharp, soft = np.sort(rng.uniform(0.6, 3.5, 2))
     share = (_field(height, width, int(rng.integers(3, 9)), rng) * 3.0 - 1.0).clamp(0.0, 1.0)
-    result = _blur(image, float(sharp)) * (1.0 - share) + _blur(image, float(soft)) * share
+    result = gaussian_blur(image, float(sharp)) * (1.0 - share) + gaussian_blur(image, float(soft)) * share
     shift = [(_field(height, width, 4, rng) - 0.5) * 3.0 for _ in range(2)]
     x = (torch.arange(width) + 0.5 + shift[0]) / width * 2.0 - 1.0
     y = (torch.arange(height)[:, None] + 0.5 + shift[1]) / height * 2.0 - 1.0
@@ -191,7 +197,7 @@ def imitated_render(image: Tensor, rng: np.random.Generator) -> Tensor:
     noise = torch.from_numpy(rng.standard_normal(result.shape).astype(np.float32))
     grain = float(rng.uniform(0.0, 1.5))
     if grain > 0.4:
-        noise = _blur(noise, grain)
+        noise = gaussian_blur(noise, grain)
         noise = noise / noise.std()
     result = result + noise * float(rng.uniform(0.005, 0.03))
     if rng.random() < 0.5:
@@ -205,16 +211,6 @@ def _field(height: int, width: int, knots: int, rng: np.random.Generator) -> Ten
     coarse = torch.from_numpy(rng.random((1, 1, knots, knots)).astype(np.float32))
     fine = F.interpolate(coarse, size=(height, width), mode="bicubic", align_corners=False)
     return fine[0, 0].clamp(0.0, 1.0)
-
-
-def _blur(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of [3, H, W]; border pixels are repeated."""
-    radius = max(math.ceil(3.0 * sigma), 1)
-    taps = torch.arange(-radius, radius + 1, dtype=torch.float32)
-    kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    maps = F.pad(image[:, None], (radius, radius, radius, radius), mode="replicate")
-    return F.conv2d(F.conv2d(maps, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))[:, 0]
 
 
 def _window(image: Tensor, xy: np.ndarray, most: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
@@ -270,12 +266,14 @@ def _lab_scale(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor([[0.5, 0.0, 0.0], [3.0, 6.0, 6.0]], dtype=dtype, device=device)[:, :, None, None]
 
 
-class SceneConv:
+class SceneConv(Features):
     """Features [ceil(H / 4), ceil(W / 4), 32] of unit length, trained by `fit_scene`, then frozen."""
+
+    name = "sceneconv-1"
+    fit_photos = 24
 
     def __init__(self, config: SceneConvConfig | None = None) -> None:
         self.config = config or SceneConvConfig()
-        self.name = "sceneconv-1"
         self.channels = self.config.channels
         self.unit = 1.0
         self.net: ConvNet | None = None
@@ -309,14 +307,14 @@ class SceneConv:
         self.fit(photos)
 
     @torch.no_grad()
-    def fit(self, photos: Sequence[Tensor], most: int = 24) -> None:
+    def fit(self, photos: Sequence[Tensor]) -> None:
         """Measure `unit` as `LabHog` does; the net itself is trained by `fit_scene`.
 
         Raises:
             AwError: there is no photo, or no trained net.
         """
         distances = []
-        for index, k in enumerate(spaced(len(photos), most)):
+        for index, k in enumerate(spaced(len(photos), self.fit_photos)):
             one, two = self(photos[k]), self(blurred_noisy_copy(photos[k], index))
             distances.append(float((1.0 - (one * two).sum(2)).double().mean()))
         # a scene of one colour has distance 0
@@ -337,7 +335,7 @@ class SceneConv:
         return self.net(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
 
     def precision(self, device: torch.device) -> str:
-        """See `precompute.PreciseFeatures`: torch's default for convolutions on a GPU is TF32."""
+        """See `Features.precision`: torch's default for convolutions on a GPU is TF32."""
         return "tf32" if device.type == "cuda" and torch.backends.cudnn.allow_tf32 else ""
 
     def _new_net(self) -> ConvNet:

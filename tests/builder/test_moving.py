@@ -27,6 +27,7 @@ from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.motion_maps import moving_labels, moving_map
+from ambiguous_wild.vision.sam import SamInstances
 from tests.builder import capture_maker
 from tests.builder.capture_maker import HEIGHT, WIDTH, eyes, render
 
@@ -152,8 +153,11 @@ def test_poses_that_do_not_fit_the_photos_tell_nothing(sliding, tmp_path):
 
 
 def test_what_moves_is_a_prompt(tmp_path):
-    class Disc:
+    class Disc(SamInstances):
         name = "disc"
+
+        def __init__(self):
+            """Without weights."""
 
         def labels(self, photo):
             return np.zeros(photo.shape[:2], np.int32)

@@ -230,7 +230,7 @@ def test_instance_means_against_a_loop_with_gaps_and_negative_labels():
         if cells:
             assert means[j - 1] == pytest.approx(np.mean(cells))
         else:
-            assert np.isnan(means[j - 1])
+            assert means[j - 1].isnan()
 
 
 def test_instances_of_one_pixel_and_of_the_whole_photo():

@@ -206,7 +206,7 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
     factor = policy.looks[1].factor((HEIGHT, WIDTH))
     assert factor.max() > 1.3 and factor.min() < 0.7
     _, alone, _ = examined(first_look=dataclasses.replace(look, weight=1.0))
-    assert np.allclose(maps.statistic.numpy(), (alone.statistic * factor).numpy(), rtol=1e-5)
+    assert np.allclose(maps.statistic.numpy(), alone.statistic.numpy() * factor, rtol=1e-5)
     pixels = policy.masks.pixels
     assert pixels.other_views.queries[0].sparse_depth is not None and pixels.seen[0] is not None
     low = dataclasses.replace(FAST.mask, ceiling=1e-6, least=50.0)

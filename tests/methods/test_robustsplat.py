@@ -21,7 +21,7 @@ from ambiguous_wild.methods.robustsplat import (
     mask_loss,
 )
 from ambiguous_wild.vision import backends
-from ambiguous_wild.vision.labhog import LabHog
+from ambiguous_wild.vision.sceneconv import SceneConv
 from tests.methods.baselines import data_of, parts_of, step_of, trained
 from tests.tiny_scene import SQUARE, TRAIN, wall_colour
 
@@ -262,7 +262,7 @@ def test_its_features_are_the_best_whose_weights_are_here(tmp_path, monkeypatch)
 
 
 def test_features_trained_on_the_scene_get_tracks_in_px_of_their_pictures(scene, tmp_path):
-    class Recorded(LabHog):
+    class Recorded(SceneConv):
         def fit_scene(self, photos, tracks, folder=None):
             self.given = tracks
 

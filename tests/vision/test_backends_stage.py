@@ -3,13 +3,14 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.progress_bar import terminal_bar
 from ambiguous_wild.vision.backends import DINO, SAM, SAM_VIDEO, make_features, make_instances
 from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
 from ambiguous_wild.vision.grounded import GroundedInstances
 from ambiguous_wild.vision.label_maps import LabelMaps, SceneLabelMaps
 from ambiguous_wild.vision.labhog import LabHog
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
-from ambiguous_wild.vision.protocols import NamedInstances, SceneInstances, terminal_bar
+from ambiguous_wild.vision.protocols import SceneInstances
 from ambiguous_wild.vision.sam import SamInstances
 from ambiguous_wild.vision.sam_video import SamVideoInstances
 from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
@@ -50,7 +51,7 @@ def test_instances_by_name(checkpoint, tmp_path):
     assert followed.name != SamVideoInstances("sam2.1-hiera-tiny", None, checkpoint("sam2_video")).name
     np.save(tmp_path / "a.npy", np.ones((4, 4), np.int32))
     own = make_instances(f"labels:{tmp_path}")
-    assert isinstance(own, LabelMaps) and isinstance(own, NamedInstances)
+    assert isinstance(own, LabelMaps)
     assert not isinstance(own, SceneInstances)
     assert isinstance(make_instances(f"labels:{tmp_path},scene_wide=true"), SceneLabelMaps)
 

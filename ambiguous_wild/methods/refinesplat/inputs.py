@@ -23,7 +23,8 @@ from ambiguous_wild.methods.refinesplat.masks import instance_means
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.precompute import cache_key, cached, instance_labels, photo_features
-from ambiguous_wild.vision.protocols import Features, Instances, SceneFeatures
+from ambiguous_wild.vision.protocols import Features, Instances
+from ambiguous_wild.vision.sceneconv import SceneConv
 
 SHORTEST = 3  # views of a track at least
 FEWEST = 100  # observations that a photo needs to be judged
@@ -76,7 +77,7 @@ class FrozenInputs:
     @functools.cached_property
     def semantics(self) -> Semantics:
         data, config = self._data, self._config
-        if isinstance(self.features, SceneFeatures):
+        if isinstance(self.features, SceneConv):
             self.features.fit_scene(data.photos, train_tracks(data.scene), data.cache_dir)
         else:
             self.features.fit(data.photos)

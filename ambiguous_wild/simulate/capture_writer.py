@@ -50,7 +50,6 @@ from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, CaptureSpec, Wo
 from ambiguous_wild.simulate.spec_file import plain_spec
 from ambiguous_wild.simulate.tracer import TracedPhoto
 from ambiguous_wild.simulate.truth_records import (
-    CameraRecord,
     CaptureTruth,
     DrawnEffects,
     PhotoTruth,
@@ -387,9 +386,8 @@ def _code_hash() -> str:
     return config_hash([__version__, *(sha256_file(p) for p in sources)])
 
 
-def _camera_json(spec: CaptureSpec, camera: Camera) -> CameraRecord:
-    fields = asdict(camera) | {"cam_from_world": camera.cam_from_world.tolist()}
-    record = cast(CameraRecord, fields)
+def _camera_json(spec: CaptureSpec, camera: Camera) -> dict[str, object]:
+    record = asdict(camera) | {"cam_from_world": camera.cam_from_world.tolist()}
     lens = spec.effects.lens_distortion
     if lens is not None:
         record["distortion"] = {"k1": lens.k1, "k2": lens.k2}

@@ -12,13 +12,13 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.config import Facts, to_plain
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.srgb import srgb_to_linear
 from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
@@ -27,76 +27,33 @@ from ambiguous_wild.io.photos import PHOTO_SUFFIXES, Exif, UnreadablePhoto, read
 from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.simulate.composite_scene import check_request
 from ambiguous_wild.simulate.cutouts import (
-    SMALLEST_PX,
     TRUTH_COVER,
     Cutout,
     CutoutPlacement,
     blobs,
     composed,
-    filled,
+    cut_patch,
     layer,
     read_cutouts,
     truth,
 )
 from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
-from ambiguous_wild.simulate.placement import CompositeConfig, natural_heights
-from ambiguous_wild.simulate.truth_records import Spread, spread
+from ambiguous_wild.simulate.placement import (
+    LONGEST,
+    PREVIEW_PX,
+    CompositeConfig,
+    bisected,
+    covered,
+    longest_side,
+    natural_heights,
+)
+from ambiguous_wild.simulate.truth_records import spread
 
 _TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos
 _MOST_PIECES = 3  # largest number of pieces in a photo
 _SPREAD = (0.5, 1.5)  # range of a photo's coverage, relative to the mean
 _MOST_COVER = 0.6  # largest mean coverage of photos with distractors
 _MIDDLE = (0.15, 0.85)  # range of a piece's middle, relative to the photo's sides
-_LONGEST = 1.2  # largest piece, relative to the photo's longer side
-_WINDOW = 0.6  # largest piece of another photo, relative to that photo's sides
-_PREVIEW_PX = 160
-
-
-class PastedPiece(TypedDict):
-    """One distractor in one plain photo."""
-
-    cutout: str
-    photo: str  # photo that the piece was cut from; empty for cut-outs
-    mirrored: bool
-    x: float  # of its middle, over the photo's width
-    y: float  # of its middle, over the photo's height
-    height: float  # over the photo's height
-
-
-class PastedPhoto(TypedDict):
-    """One training photo of a capture with pasted distractors."""
-
-    source: str  # file name of the clean photo
-    sha256: str  # of the clean photo
-    occlusion: float
-    distractors: list[PastedPiece]
-
-
-class PhotoFolder(TypedDict):
-    """The folder of photos that a capture is made from."""
-
-    name: str
-    photos: int
-
-
-class PastedCutout(TypedDict):
-    """One cut-out of a capture with pasted distractors."""
-
-    name: str
-    sha256: str  # of its file
-
-
-class PastedRecord(TypedDict):
-    """truth/composite.json of a capture with pasted distractors."""
-
-    schema: int
-    version: str
-    source: PhotoFolder
-    config: dict[str, object]  # `CompositeConfig` without pose and shadow
-    mask: str
-    cutouts: list[PastedCutout]
-    occlusion: Spread
-    photos: dict[str, PastedPhoto]
 
 
 def is_photo_folder(path: Path | str) -> bool:
@@ -111,7 +68,7 @@ def composite_photos(
     config: CompositeConfig,
     cutouts: Path | str | None = None,
     progress: Progress = iter,
-) -> PastedRecord:
+) -> Facts:
     """Make the capture, and return truth/composite.json.
 
     Args:
@@ -142,7 +99,8 @@ def composite_photos(
     chosen = {train[i] for i in order[: max(1, round(config.presence * len(train)))]}
     if cutouts is None and not config.patches:
         chosen = set()
-    photos: dict[str, PastedPhoto] = {}
+    photos: dict[str, Facts] = {}
+    shares: list[float] = []
     with atomic_dir(target, replace=False) as folder:
         for part in ("train", "test"):
             (folder / part).mkdir()
@@ -152,7 +110,7 @@ def composite_photos(
             if test and config.fixed is None:
                 _write_jpeg(folder / "test" / name, clean, exif)
                 continue
-            over, pieces = np.zeros((*clean.shape[:2], 4), np.float32), list[PastedPiece]()
+            over, pieces = np.zeros((*clean.shape[:2], 4), np.float32), list[Facts]()
             if path in chosen:
                 rng = np.random.default_rng(seed)
                 cover = float(mean * rng.uniform(*_SPREAD))
@@ -168,11 +126,14 @@ def composite_photos(
             write_png(folder / "truth" / "distractor" / own, mask)
             if test:
                 continue
-            share, sha256 = round(float((mask > 0).mean()), 6), sha256_file(path)
-            source_ = path.relative_to(base).as_posix()
-            photos[name] = PastedPhoto(source=source_, sha256=sha256, occlusion=share, distractors=pieces)
-        shares = [p["occlusion"] for p in photos.values()]
-        facts: PastedRecord = {
+            shares.append(round(float((mask > 0).mean()), 6))
+            photos[name] = {
+                "source": path.relative_to(base).as_posix(),
+                "sha256": sha256_file(path),  # of the source
+                "occlusion": shares[-1],
+                "distractors": pieces,
+            }
+        facts: Facts = {
             "schema": 1,
             "version": __version__,
             "source": {"name": root.resolve().name, "photos": len(paths)},
@@ -278,12 +239,7 @@ def _draw(
         if patches:
             path = others[int(rng.integers(len(others)))]
             photo, origin = _read(path)[0], path.name
-            # The window is as large as the piece will appear, if the other photo allows it.
-            tall = np.sqrt(area / count / (cutout.aspect * cutout.filled))
-            tall = min(tall, _WINDOW * photo.shape[0], _WINDOW * photo.shape[1] / cutout.aspect)
-            height, width = (max(SMALLEST_PX, round(s)) for s in (tall, tall * cutout.aspect))
-            corner = [int(rng.integers(0, n - s + 1)) for n, s in zip(photo.shape, (height, width))]
-            cutout = filled(cutout, photo, corner, (height, width))
+            cutout, _ = cut_patch(cutout, photo, area / count, rng)  # as large as it will appear
         mirrored = bool(rng.random() < 0.5)
         light = np.ascontiguousarray(cutout.light[:, ::-1]) if mirrored else cutout.light
         drawn.append((replace(cutout, light=light), origin, mirrored))
@@ -292,25 +248,28 @@ def _draw(
 
 def _layer(
     drawn: list[tuple[Cutout, str, bool]], size: tuple[int, ...], cover: float, rng: np.random.Generator
-) -> tuple[np.ndarray, list[PastedPiece]]:
+) -> tuple[np.ndarray, list[Facts]]:
     """Draw the pieces at random places as a layer, at the size at which they cover `cover`."""
     cutouts, (height, width) = [cutout for cutout, _, _ in drawn], size[:2]
     middles = rng.uniform(*_MIDDLE, (len(drawn), 2))  # x and y over width and height
     places = enumerate(middles * [width / height, 1.0])
     placements = [CutoutPlacement(k, (float(x), float(y), 1.0), 0.0, False) for k, (x, y) in places]
-    natural, small = natural_heights(cutouts, rng), [c.reduced(_PREVIEW_PX) for c in cutouts]
-    preview = _camera(width, height, _PREVIEW_PX / max(width, height))
-    longest = max(h * max(1.0, c.aspect) for h, c in zip(natural, cutouts, strict=True))
-    low, high = 0.0, _LONGEST * max(1.0, width / height) / longest
-    for _ in range(14):
-        scale = (low + high) / 2
-        share = (layer(small, list(natural * scale), placements, preview)[..., 3] >= TRUTH_COVER).mean()
-        low, high = (scale, high) if share < cover else (low, scale)
-    heights = natural * (low + high) / 2
+    natural, small = natural_heights(cutouts, rng), [c.reduced(PREVIEW_PX) for c in cutouts]
+    preview = _camera(width, height, PREVIEW_PX / max(width, height))
+    high = LONGEST * max(1.0, width / height) / longest_side(natural, cutouts)
+    scale = bisected(lambda scale: covered(small, natural * scale, placements, preview), high, cover)
+    heights = natural * scale
     over = layer(cutouts, list(heights), placements, _camera(width, height, 1.0))
     over[over[..., 3] < TRUTH_COVER] = 0  # pixels that the mask leaves out keep their bytes
-    pieces = [
-        PastedPiece(cutout=c.name, photo=p, mirrored=m, x=float(x), y=float(y), height=float(tall))
+    pieces: list[Facts] = [
+        {
+            "cutout": c.name,
+            "photo": p,  # that the piece was cut from; empty for cut-outs
+            "mirrored": m,
+            "x": float(x),  # of its middle, over the photo's width
+            "y": float(y),  # of its middle, over the photo's height
+            "height": float(tall),  # over the photo's height
+        }
         for (c, p, m), (x, y), tall in zip(drawn, middles, heights, strict=True)
     ]
     return over, pieces

@@ -12,12 +12,12 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypedDict, cast
+from typing import cast
 
 import numpy as np
 
 from ambiguous_wild import __version__
-from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.config import Facts, to_plain
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import Scene, SceneInfo
@@ -45,53 +45,7 @@ from ambiguous_wild.simulate.placement import (
     solve_heights,
     visible_points,
 )
-from ambiguous_wild.simulate.truth_records import Spread, spread
-
-
-class PlacedCutout(TypedDict):
-    """One cut-out in one photo: `cutouts.CutoutPlacement` with its name."""
-
-    cutout: str
-    which: int
-    position: tuple[float, float, float]
-    turn_deg: float
-    standing: bool
-
-
-class CompositePhoto(TypedDict):
-    """One training photo of a composite."""
-
-    occlusion: float
-    distractors: list[PlacedCutout]
-
-
-class CutoutRecord(TypedDict):
-    """One cut-out of a composite."""
-
-    name: str
-    sha256: str  # of its file; empty without a file
-    height: float  # scene units
-
-
-class CompositeSource(TypedDict):
-    """The scene that a composite is made from."""
-
-    name: str
-    scene_json: str | None  # sha256
-
-
-class CompositeRecord(TypedDict):
-    """truth/composite.json."""
-
-    schema: int
-    version: str
-    source: CompositeSource
-    config: dict[str, object]  # `CompositeConfig`
-    mask: str
-    poses: str
-    cutouts: list[CutoutRecord]
-    occlusion: Spread
-    photos: dict[str, CompositePhoto]
+from ambiguous_wild.simulate.truth_records import spread
 
 
 @dataclass(frozen=True)
@@ -107,7 +61,7 @@ def composite(
     config: CompositeConfig,
     cutouts: Path | str | None = None,
     progress: Progress = iter,
-) -> CompositeRecord:
+) -> Facts:
     """Make the scene, and return truth/composite.json.
 
     Poses and points come from the clean photos, so they are better than from photos with distractors.
@@ -142,7 +96,7 @@ def composite(
         _copy_rest(scene, folder)
         facts = _facts(scene, plan, config, photos)
         write_json(folder / "truth" / "composite.json", facts)
-        _write_scene_json(scene, folder, name, facts)
+        _write_scene_json(scene, folder, name, facts, config.patches)
     return facts
 
 
@@ -200,11 +154,11 @@ def _folders(root: Path) -> list[str]:
 
 def _write_photos(
     scene: Scene, plan: _PastePlan, config: CompositeConfig, folder: Path, progress: Progress
-) -> dict[str, CompositePhoto]:
+) -> dict[str, Facts]:
     """Write the photos of all sizes, and the truth at the size of training."""
     kinds = [(f, _pictures(scene, f)) for f in _folders(scene.root)]
     placements = dict(zip((v.name for v in scene.train), plan.placements, strict=True))
-    photos: dict[str, CompositePhoto] = {}
+    photos: dict[str, Facts] = {}
     for _, pictures in kinds:
         for view in scene.test:
             _copy(pictures[view.name], scene.root, folder)
@@ -226,7 +180,11 @@ def _write_photos(
                     own = Path(view.name).with_suffix(".png")
                     for part, pixels in (("clean", photo), ("distractor", mask)):
                         jobs.append(writers.submit(write_png, folder / "truth" / part / own, pixels))
-                    photos[view.name] = _photo_facts(plan, placements[view.name], mask)
+                    placed = [
+                        {"cutout": plan.cutouts[p.which].name, **asdict(p)} for p in placements[view.name]
+                    ]
+                    occlusion = round(float((mask > 0).mean()), 6)
+                    photos[view.name] = {"occlusion": occlusion, "distractors": placed}
             for job in jobs:
                 job.result()
     return photos
@@ -235,13 +193,6 @@ def _write_photos(
 def _pictures(scene: Scene, folder: str) -> dict[str, Path]:
     factor = 1 if folder == "images" else int(folder.removeprefix("images_"))
     return {v.name: v.image_path for v in load_scene(scene.root, factor=factor, verify=False).views}
-
-
-def _photo_facts(
-    plan: _PastePlan, placements: tuple[CutoutPlacement, ...], mask: np.ndarray
-) -> CompositePhoto:
-    placed = [cast(PlacedCutout, {"cutout": plan.cutouts[p.which].name, **asdict(p)}) for p in placements]
-    return {"occlusion": round(float((mask > 0).mean()), 6), "distractors": placed}
 
 
 def _copy(path: Path, root: Path, folder: Path) -> None:
@@ -262,10 +213,8 @@ def _copy_rest(scene: Scene, folder: Path) -> None:
         (folder / f"{side}_list.txt").write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
-def _facts(
-    scene: Scene, plan: _PastePlan, config: CompositeConfig, photos: dict[str, CompositePhoto]
-) -> CompositeRecord:
-    shares = [p["occlusion"] for p in photos.values()]
+def _facts(scene: Scene, plan: _PastePlan, config: CompositeConfig, photos: dict[str, Facts]) -> Facts:
+    shares = [cast(float, photo["occlusion"]) for photo in photos.values()]
     record = scene.root / "scene.json"
     return {
         "schema": 1,
@@ -283,7 +232,7 @@ def _facts(
     }
 
 
-def _write_scene_json(scene: Scene, folder: Path, name: str, facts: CompositeRecord) -> None:
+def _write_scene_json(scene: Scene, folder: Path, name: str, facts: Facts, patches: bool) -> None:
     """Write the source's scene.json without the keys by which 'aw build-scene' recognises its own scenes."""
     before: SceneInfo = read_scene_json(scene.root) or {"license": "not stated"}
     license_ = before.get("license", "not stated")
@@ -296,15 +245,9 @@ def _write_scene_json(scene: Scene, folder: Path, name: str, facts: CompositeRec
         "name": name,
         "factor": factor,
         "images": "images" if factor == 1 else f"images_{factor}",
-        "license": license_ if facts["config"]["patches"] else f"{license_}; cut-outs: not stated",
+        "license": license_ if patches else f"{license_}; cut-outs: not stated",
         "truth": {"distractor": len(scene.train), "clean": len(scene.train)},
-        "composite": {
-            "source": facts["source"],
-            "config": facts["config"],
-            "cutouts": facts["cutouts"],
-            "occlusion": facts["occlusion"],
-            "poses": facts["poses"],
-        },
+        "composite": {k: facts[k] for k in ("source", "config", "cutouts", "occlusion", "poses")},
     }
     paths = sorted(p for p in folder.rglob("*") if p.is_file())
     content["files"] = {

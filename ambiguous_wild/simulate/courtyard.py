@@ -13,11 +13,8 @@ from ambiguous_wild.simulate.world import (
     World,
     baked_sheets,
     box,
-    circle_of,
-    ground_and_sky,
     parts_of,
     poster,
-    shade_feet,
     sunlight,
     surface,
     world_of,
@@ -96,10 +93,8 @@ def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int, wh
         furniture, circles = [], []
     if what.statue:
         circles.append((statue[0], statue[1], 0.65))
-    circles += [circle_of(thing) for thing in what.things]
     yaw = float(rng.uniform(-20, 20))
     ground = tx.gravel_ground(rng, *PLAN.ground_m, d)
-    shade_feet(ground, circles, d, PLAN)
     sheets = baked_sheets(rng, d)
     textures = {
         "ground": ground,
@@ -109,8 +104,8 @@ def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int, wh
         "sky": tx.sky(rng),
         **sheets(),
     }
-    shapes = [*ground_and_sky(PLAN), *_walls(rng), *furniture]
+    shapes = [*_walls(rng), *furniture]
     if what.statue:
         shapes += placed(parts_of("courtyard plinth"), (statue[0], statue[1], 0), yaw)
         shapes += placed(figure("stone", "stone", 0.07, 0.8), statue, yaw)
-    return world_of(PLAN, what, shapes, circles, textures, sunlight(rng, samples), statue)
+    return world_of(PLAN, what, shapes, circles, textures, d, sunlight(rng, samples), statue)

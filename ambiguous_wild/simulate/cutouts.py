@@ -22,6 +22,7 @@ SMALLEST_PX = 8  # shorter side
 LARGEST_PX = 1200  # longer side; larger files are reduced
 _BLOB_PX = 200
 _BLOBS = 3
+_WINDOW = 0.6  # largest window of a patch, relative to the photo's sides
 TRUTH_COVER = 0.25  # share of a pixel that must be covered to mark it as distractor in the truth
 _SHADOW_BLUR = 0.03  # of the cut-out's height
 _LYING_SHADOW = (0.07, 0.05)  # of the cut-out's height, to the right and down
@@ -138,20 +139,25 @@ def blobs(rng: np.random.Generator) -> list[Cutout]:
     return cutouts
 
 
-def filled(
+def cut_patch(
     shape: Cutout,
     photo: np.ndarray,  # [H, W, 3] uint8, sRGB
-    corner: Sequence[int],  # row and column of the window in the photo
-    size: tuple[int, int],  # height and width of the window, px
-) -> Cutout:
-    """Fill the shape with a window of a photo."""
-    (top, left), (height, width) = corner, size
-    window = photo[top : top + height, left : left + width].astype(np.float32) / 255
+    area: float,  # px of the photo that the patch covers, if the photo is large enough
+    rng: np.random.Generator,
+) -> tuple[Cutout, tuple[slice, slice]]:
+    """Fill the shape with a random window of a photo; returns rows and columns of the window, too."""
+    tall = np.sqrt(area / (shape.aspect * shape.filled))
+    tall = min(tall, _WINDOW * photo.shape[0], _WINDOW * photo.shape[1] / shape.aspect)
+    sides = (max(SMALLEST_PX, round(side)) for side in (tall, tall * shape.aspect))
+    height, width = (min(side, limit) for side, limit in zip(sides, photo.shape))
+    top, left = (int(rng.integers(0, n - s + 1)) for n, s in zip(photo.shape, (height, width)))
+    rows, columns = slice(top, top + height), slice(left, left + width)
     # Area averaging keeps the mean of alpha when reducing; linear interpolation keeps edges smooth.
     how = cv2.INTER_AREA if height < shape.light.shape[0] else cv2.INTER_LINEAR
     alpha = cv2.resize(np.ascontiguousarray(shape.light[..., 3]), (width, height), interpolation=how)
-    name = f"patch {shape.name}"
-    return Cutout(name, premultiplied(np.concatenate([window, alpha[..., None]], 2)), shape.source)
+    window = photo[rows, columns].astype(np.float32) / 255
+    rgba = np.concatenate([window, alpha[..., None]], 2)
+    return Cutout(f"patch {shape.name}", premultiplied(rgba), shape.source), (rows, columns)
 
 
 @dataclass(frozen=True)

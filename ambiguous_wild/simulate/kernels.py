@@ -45,20 +45,27 @@ def distance(volume, x, y, z):
     return (1 - c) * low + c * high
 
 
-@kernel(inline="never")
-def sphere_trace(volume, o, d, size, far):
-    """Return the distance along the local ray o + t d, |d| = 1, to the volume's surface, or `far`."""
-    start, end = 1e-6, far
+@kernel(inline="always")
+def _slabs(o, d, h):
+    """Return t where the ray o + t d enters and leaves the box of half sizes `h`; FAR, -FAR if it misses."""
+    near, away = -FAR, FAR
     for axis in range(3):
         oa = o[0] if axis == 0 else (o[1] if axis == 1 else o[2])
         da = d[0] if axis == 0 else (d[1] if axis == 1 else d[2])
-        if abs(da) < 1e-12:
-            if abs(oa) > size:
-                return far
-            continue
-        t0, t1 = (-size - oa) / da, (size - oa) / da
-        start, end = max(start, min(t0, t1)), min(end, max(t0, t1))
-    t = start
+        ha = h[0] if axis == 0 else (h[1] if axis == 1 else h[2])
+        if abs(da) >= 1e-12:
+            t0, t1 = (-ha - oa) / da, (ha - oa) / da
+            near, away = max(near, min(t0, t1)), min(away, max(t0, t1))
+        elif abs(oa) > ha:
+            near, away = FAR, -FAR
+    return near, away
+
+
+@kernel(inline="never")
+def sphere_trace(volume, o, d, size, far):
+    """Return the distance along the local ray o + t d, |d| = 1, to the volume's surface, or `far`."""
+    near, away = _slabs(o, d, (size, size, size))
+    t, end = max(1e-6, near), min(far, away)
     for _ in range(_STEPS):
         if t >= end:
             return far
@@ -98,19 +105,7 @@ def _intersect(kind, o, d, h, far):
             return t
         return far
     if kind == BOX:
-        near, away = -FAR, FAR
-        for a in range(3):
-            oa = ox if a == 0 else (oy if a == 1 else oz)
-            da = dx if a == 0 else (dy if a == 1 else dz)
-            ha = hx if a == 0 else (hy if a == 1 else hz)
-            if abs(da) < 1e-12:
-                if abs(oa) > ha:
-                    return far
-                continue
-            t0, t1 = (-ha - oa) / da, (ha - oa) / da
-            if t0 > t1:
-                t0, t1 = t1, t0
-            near, away = max(near, t0), min(away, t1)
+        near, away = _slabs(o, d, h)
         if near <= away and near > 1e-6 and near < far:
             return near
         return far
@@ -165,11 +160,22 @@ def _local(table, s, px, py, pz, shift):
     )
 
 
+@kernel(inline="always")
+def _hit(table, s, o, d, far):
+    """Return the distance along the ray o + t d to shape s, or `far`."""
+    kind, half = table[0][s], table[3]
+    h = (half[s, 0], half[s, 1], half[s, 2])
+    lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
+    if kind == VOLUME:
+        return sphere_trace(table[13][table[12][s]], lo, ld, h[0], far)
+    return _intersect(kind, lo, ld, h, far)
+
+
 @kernel(inline="never")
 def nearest(table, which, count, o, d, far):
     """Return the nearest hit among the listed shapes: (distance, shape or -1)."""
     best, hit = far, -1
-    center, radius, half, kind = table[2], table[4], table[3], table[0]
+    center, radius = table[2], table[4]
     for k in range(count):
         s = which[k]
         qx, qy, qz = center[s, 0] - o[0], center[s, 1] - o[1], center[s, 2] - o[2]
@@ -178,12 +184,7 @@ def nearest(table, which, count, o, d, far):
             continue
         if along - radius[s] > best:
             continue
-        h = (half[s, 0], half[s, 1], half[s, 2])
-        lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
-        if kind[s] == VOLUME:
-            t = sphere_trace(table[13][table[12][s]], lo, ld, h[0], best)
-        else:
-            t = _intersect(kind[s], lo, ld, h, best)
+        t = _hit(table, s, o, d, best)
         if t < best:
             best, hit = t, s
     return best, hit
@@ -191,20 +192,15 @@ def nearest(table, which, count, o, d, far):
 
 @kernel(inline="never")
 def _shadowed(table, o, d):
-    center, radius, half, kind, casts = table[2], table[4], table[3], table[0], table[9]
-    for s in range(len(kind)):
+    center, radius, casts = table[2], table[4], table[9]
+    for s in range(len(casts)):
         if not casts[s]:
             continue
         qx, qy, qz = center[s, 0] - o[0], center[s, 1] - o[1], center[s, 2] - o[2]
         along = qx * d[0] + qy * d[1] + qz * d[2]
         if along < -radius[s] or qx * qx + qy * qy + qz * qz - along * along > radius[s] * radius[s]:
             continue
-        h = (half[s, 0], half[s, 1], half[s, 2])
-        lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
-        if kind[s] == VOLUME:
-            if sphere_trace(table[13][table[12][s]], lo, ld, h[0], FAR) < FAR:
-                return True
-        elif _intersect(kind[s], lo, ld, h, FAR) < FAR:
+        if _hit(table, s, o, d, FAR) < FAR:
             return True
     return False
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,11 +15,10 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Scene, SparsePoints, View
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.simulate.cutouts import (
-    SMALLEST_PX,
     TRUTH_COVER,
     Cutout,
     CutoutPlacement,
-    filled,
+    cut_patch,
     layer,
     project,
 )
@@ -30,9 +29,8 @@ _NEARER = (0.90, 0.98)  # depth of the cut-out relative to that of the point beh
 _SAME_PLACE = 0.08  # distance relative to the scene's spread below which positions are the same place
 _SAME_PLACE_SHARE = 0.15  # of the photos; a cut-out that stays longer would be part of the scene
 _APART = 0.3  # distance of two cut-outs, if possible, relative to the photo's shorter side
-_PREVIEW_PX = 160
-_LARGEST = 0.6  # largest window of a patch, relative to the photo's sides
-_LONGEST = 1.2  # largest cut-out, relative to the photo's longer side
+PREVIEW_PX = 160
+LONGEST = 1.2  # largest cut-out, relative to the photo's longer side
 
 
 @dataclass(frozen=True)
@@ -191,41 +189,51 @@ def solve_heights(
     Raises:
         AwError: even the largest size covers less.
     """
-    small = [c.reduced(_PREVIEW_PX) for c in cutouts]
+    small = [c.reduced(PREVIEW_PX) for c in cutouts]
     cameras = [_preview(s.view) for s in sites]
     natural = natural / natural.max()
 
-    def covered(scale: float) -> float:
-        return float(
-            np.mean([_share(small, natural * scale, s, c) for s, c in zip(placements, cameras, strict=True)])
-        )
+    def share(scale: float) -> float:
+        shares = [covered(small, natural * scale, s, c) for s, c in zip(placements, cameras, strict=True)]
+        return float(np.mean(shares))
 
     depths = [project(c, s.position)[2] for group, c in zip(placements, cameras, strict=True) for s in group]
     if not depths:
         raise AwError("no photo shows a cut-out; raise --presence")
     focal = float(np.median([c.fy for c in cameras]))
-    longest = max(h * max(1.0, c.aspect) for h, c in zip(natural, cutouts, strict=True))
-    low, high = 0.0, _LONGEST * _PREVIEW_PX * float(np.median(depths)) / focal / longest
-    if covered(high) < config.coverage:
+    high = LONGEST * PREVIEW_PX * float(np.median(depths)) / focal / longest_side(natural, cutouts)
+    if share(high) < config.coverage:
         raise AwError(
             f"--coverage {config.coverage:g} is more than {len(cutouts)} cut-outs can cover "
-            f"({covered(high):.2f} at their largest); lower it, raise --presence or add cut-outs"
+            f"({share(high):.2f} at their largest); lower it, raise --presence or add cut-outs"
         )
+    return natural * bisected(share, high, config.coverage)
+
+
+def longest_side(heights: np.ndarray, cutouts: Sequence[Cutout]) -> float:
+    """Return the longest side of the cut-outs at these heights [K]."""
+    return float(max(h * max(1.0, c.aspect) for h, c in zip(heights, cutouts, strict=True)))
+
+
+def bisected(share: Callable[[float], float], high: float, wanted: float) -> float:
+    """Return the scale up to `high` at which `share`, which grows with it, is the wanted one."""
+    low = 0.0
     for _ in range(14):
         middle = (low + high) / 2
-        low, high = (middle, high) if covered(middle) < config.coverage else (low, middle)
-    return natural * (low + high) / 2
+        low, high = (middle, high) if share(middle) < wanted else (low, middle)
+    return (low + high) / 2
 
 
 def _preview(view: View) -> Camera:
     camera = view.camera
-    scale = _PREVIEW_PX / max(camera.width, camera.height)
+    scale = PREVIEW_PX / max(camera.width, camera.height)
     return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
-def _share(
-    cutouts: Sequence[Cutout], heights: np.ndarray, placements: tuple[CutoutPlacement, ...], camera: Camera
+def covered(
+    cutouts: Sequence[Cutout], heights: np.ndarray, placements: Sequence[CutoutPlacement], camera: Camera
 ) -> float:
+    """Return the share of a photo's pixels that cut-outs of these heights mark as distractor."""
     over = layer(cutouts, list(heights), placements, camera)
     return float((over[..., 3] >= TRUTH_COVER).mean())
 
@@ -265,24 +273,14 @@ def cut_patches(
     for k, shape in enumerate(shapes):
         site = sites[int(rng.integers(len(sites)))]
         photo = read_png_rgb(pictures[site.view.name])
-        height, width = _window(shape, photo.shape, config, len(shapes))
-        top = int(rng.integers(0, photo.shape[0] - height + 1))
-        left = int(rng.integers(0, photo.shape[1] - width + 1))
-        patches.append(filled(shape, photo, (top, left), (height, width)))
-        window = photo[top : top + height, left : left + width].astype(np.float32) / 255
-        colours[k] = cv2.cvtColor(window, cv2.COLOR_RGB2LAB).reshape(-1, 3).mean(0)
+        rows, columns = photo.shape[:2]
+        area = config.coverage * rows * columns / (len(shapes) * config.presence)
+        patch, window = cut_patch(shape, photo, area, rng)
+        patches.append(patch)
+        cut = photo[window].astype(np.float32) / 255
+        colours[k] = cv2.cvtColor(cut, cv2.COLOR_RGB2LAB).reshape(-1, 3).mean(0)
         camera = site.view.camera
-        scale = np.array([camera.width / photo.shape[1], camera.height / photo.shape[0]])
-        middle = np.array([left + width / 2, top + height / 2]) * scale
+        scale = np.array([camera.width / columns, camera.height / rows])
+        middle = np.array([w.start + (w.stop - w.start) / 2 for w in window[::-1]]) * scale
         origins[k] = site.xyz[np.linalg.norm(site.uv - middle, axis=1).argmin()]
     return patches, colours, origins
-
-
-def _window(shape: Cutout, photo: tuple[int, ...], config: CompositeConfig, count: int) -> tuple[int, int]:
-    """Return height and width of a window, px, with the area that one of `count` patches will cover."""
-    area = config.coverage * photo[0] * photo[1] / (count * config.presence)
-    height = np.sqrt(area / (shape.aspect * shape.filled))
-    shrink = min(1.0, _LARGEST * photo[0] / height, _LARGEST * photo[1] / (height * shape.aspect))
-    height = height * shrink
-    sides = max(SMALLEST_PX, round(height)), max(SMALLEST_PX, round(height * shape.aspect))
-    return min(sides[0], photo[0]), min(sides[1], photo[1])

@@ -16,12 +16,9 @@ from ambiguous_wild.simulate.world import (
     World,
     baked_sheets,
     box,
-    circle_of,
-    ground_and_sky,
     on_wall,
     parts_of,
     poster,
-    shade_feet,
     statue,
     sunlight,
     wall,
@@ -46,10 +43,8 @@ def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
         shapes, circles = [], []
     if what.statue:
         circles.append((hub[0], hub[1], 0.4))
-    circles += [circle_of(thing) for thing in what.things]
     streams = rng.spawn(7)
     ground = built.parquet(streams[0], *PLAN.ground_m, d)
-    shade_feet(ground, circles, d, PLAN)
     sheets = baked_sheets(rng, d)
     colours = {"wall_back": built.PAINT, "wall_left": (0.50, 0.46, 0.39), "wall_right": (0.36, 0.42, 0.40)}
     colours["wall_front"] = built.PAINT
@@ -64,13 +59,13 @@ def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
         },
         **sheets(),
     }
-    shapes = [*ground_and_sky(PLAN), *_hull(), *_pictures(streams[4]), *shapes]
+    shapes = [*_hull(), *_pictures(streams[4]), *shapes]
     if what.statue:
         pedestal = [*parts_of("room pedestal"), *placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0)]
         shapes += placed(pedestal, hub, float(rng.uniform(-20, 20)))
     # The sun comes in through the windows; light reflected by walls is part of the sky light.
     light = sunlight(rng, samples, (-178.0, -165.0), (26.0, 34.0), sky=1.4)
-    return world_of(PLAN, what, shapes, circles, textures, light, hub)
+    return world_of(PLAN, what, shapes, circles, textures, d, light, hub)
 
 
 def _hull() -> list[Shape]:

@@ -6,12 +6,7 @@ from typing import NotRequired, TypedDict
 
 import numpy as np
 
-
-class DrawnShutter(TypedDict):
-    """Rolling shutter of a photo."""
-
-    deg_s: list[float]  # angular velocity in camera axes
-    readout_s: float
+Spread = dict[str, float]  # mean, min and max of a figure over the training photos
 
 
 class DrawnEffects(TypedDict, total=False):
@@ -21,7 +16,7 @@ class DrawnEffects(TypedDict, total=False):
     specular: dict[str, float]  # empty: the same in all photos
     moving_shadow: dict[str, list[list[float]]]  # lobes, each x, y, radius, m
     lens_distortion: dict[str, float]  # k1, k2, as in COLMAP's RADIAL camera
-    rolling_shutter: DrawnShutter
+    rolling_shutter: dict[str, list[float] | float]  # deg_s in camera axes, readout_s
     motion_blur: dict[str, float]  # exposure_s, length_px
     defocus: dict[str, float]  # radius_px; 0 = sharp
     vignetting: dict[str, float]  # falloff
@@ -50,27 +45,6 @@ class PhotoTruth(TypedDict):
     distractors: list[PlacedDistractor]
     shadow: NotRequired[float]  # share of the pixels that a moving shadow darkens
     effects: NotRequired[DrawnEffects]
-
-
-class Spread(TypedDict):
-    """Mean and range of a figure over the training photos."""
-
-    mean: float
-    min: float
-    max: float
-
-
-class CameraRecord(TypedDict):
-    """One camera of truth/cameras.json."""
-
-    width: int  # px
-    height: int  # px
-    fx: float  # px
-    fy: float
-    cx: float
-    cy: float
-    cam_from_world: list[list[float]]  # [4, 4], OpenCV axes, m
-    distortion: NotRequired[dict[str, float]]  # k1, k2, as in COLMAP's RADIAL camera
 
 
 def spread(shares: list[float]) -> Spread:

@@ -176,16 +176,20 @@ class World:
 def world_of(
     plan: GroundPlan,
     what: WorldSpec,
-    shapes: Sequence[Shape],  # of the place itself
+    shapes: Sequence[Shape],  # of the place itself, without ground and sky
     circles: Sequence[tuple[float, float, float]],  # x, y, radius in m in which no distractor may stand
-    textures: Mapping[str, np.ndarray],
+    textures: Mapping[str, np.ndarray],  # that of the ground is darkened at the foot of walls and objects
+    detail_px_per_m: float,
     light: Light,
     hub: tuple[float, float, float],
 ) -> World:
     """Make the world of a place and of the things that the spec adds to it."""
     things = [s for thing in what.things for s in shapes_of_thing(thing, plan)]
+    circles = [*circles, *map(circle_of, what.things)]
+    _shade_feet(textures["ground"], circles, detail_px_per_m, plan)
     keep_out = np.array(circles, float).reshape(-1, 3)
-    return World((*shapes, *things), build_atlas(textures), light, keep_out, hub, plan)
+    shapes = (*_ground_and_sky(plan), *shapes, *things)
+    return World(shapes, build_atlas(textures), light, keep_out, hub, plan)
 
 
 def baked_sheets(rng: np.random.Generator, detail_px_per_m: float) -> Callable[[], dict[str, np.ndarray]]:
@@ -214,7 +218,7 @@ def surface(
     return Shape(QUAD, center, (*half, 0.0), texture, axes, PLANAR, scale, (0.5, 0.5), casts=casts)
 
 
-def ground_and_sky(plan: GroundPlan) -> list[Shape]:
+def _ground_and_sky(plan: GroundPlan) -> list[Shape]:
     """Make the ground and a dome around it."""
     return [
         surface((0, 0, 0), (plan.ground_m[0] / 2, plan.ground_m[1] / 2), "ground", Shape.axes, False),
@@ -277,7 +281,7 @@ def poster(name: str, at: tuple[float, float, float], axes: Axes, half_m: float 
     return surface(at, (half_m, half_m * h / w), f"poster_{name}", axes, False)
 
 
-def shade_feet(
+def _shade_feet(
     ground: np.ndarray, circles: Iterable[Sequence[float]], px_per_m: float, plan: GroundPlan
 ) -> None:
     """Darken the ground at the foot of walls and objects, in place and without tracing rays."""

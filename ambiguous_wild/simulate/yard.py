@@ -18,12 +18,9 @@ from ambiguous_wild.simulate.world import (
     baked_sheets,
     box,
     car,
-    circle_of,
-    ground_and_sky,
     on_wall,
     parts_of,
     poster,
-    shade_feet,
     sunlight,
     wall,
     world_of,
@@ -60,10 +57,8 @@ def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     foot = (float(rng.uniform(4.0, 4.5)), float(rng.uniform(-0.8, -0.3)), 0.0)
     if what.statue:
         circles.append((foot[0], foot[1], 0.65))
-    circles += [circle_of(thing) for thing in what.things]
     streams = rng.spawn(7)
     ground = built.yard_ground(streams[0], *PLAN.ground_m, d)
-    shade_feet(ground, circles, d, PLAN)
     sheets = baked_sheets(rng, d)
     textures = {
         "ground": ground,
@@ -74,12 +69,12 @@ def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
         },
         **sheets(),
     }
-    shapes = [*ground_and_sky(PLAN), *_fronts(streams[2]), *shapes]
+    shapes = [*_fronts(streams[2]), *shapes]
     if what.statue:
         plinth = [*parts_of("yard plinth"), *placed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0)]
         shapes += placed(plinth, foot, float(rng.uniform(-110, -70)))
     light = sunlight(rng, samples, (-150.0, -120.0), (48.0, 58.0))
-    return world_of(PLAN, what, shapes, circles, textures, light, hub)
+    return world_of(PLAN, what, shapes, circles, textures, d, light, hub)
 
 
 def _fronts(rng: np.random.Generator) -> list[Shape]:

@@ -19,9 +19,17 @@ from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CAPSULE, CYLINDER, ELL
 from ambiguous_wild.simulate.tracer import Atlas, ShapeTable
 
 SIZE = 64  # samples a side
-Point = tuple[float, float, float]
+Vector = tuple[float, float, float]
+Axes = tuple[Vector, ...]
 UNSEEN = -1  # owner of an invisible shadow caster
 SHEET_M = 2.0  # side of the square that an object's texture covers before it repeats mirrored
+STATUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {}  # signed distance of points [..., 3], by name
+
+
+def _statue(distance: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+    """Decorate the signed distance of a statue: registers it by the function's name."""
+    STATUES[distance.__name__.removeprefix("_")] = distance
+    return distance
 
 
 @cache
@@ -40,7 +48,7 @@ def grids(names: Iterable[str]) -> np.ndarray:
     return np.stack(listed) if listed else np.zeros((0, 1, 1, 1), np.float32)
 
 
-def _ball(p: np.ndarray, at: Point, half: Point | float) -> np.ndarray:
+def _ball(p: np.ndarray, at: Vector, half: Vector | float) -> np.ndarray:
     """Distance to an ellipsoid, or to a ball of one radius."""
     h = np.broadcast_to(np.asarray(half, float), 3)
     q = p - at
@@ -49,14 +57,14 @@ def _ball(p: np.ndarray, at: Point, half: Point | float) -> np.ndarray:
     return np.where(outer > 1e-9, inner * (inner - 1) / np.maximum(outer, 1e-9), -h.min())
 
 
-def _rod(p: np.ndarray, start: Point, end: Point, radius: float) -> np.ndarray:
+def _rod(p: np.ndarray, start: Vector, end: Vector, radius: float) -> np.ndarray:
     """Distance to a capsule."""
     a, b = np.asarray(start), np.asarray(end)
     along = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
     return np.linalg.norm(p - a - along[..., None] * (b - a), axis=-1) - radius
 
 
-def _block(p: np.ndarray, at: Point, half: Point, round_off: float = 0.03) -> np.ndarray:
+def _block(p: np.ndarray, at: Vector, half: Vector, round_off: float = 0.03) -> np.ndarray:
     """Distance to a box with rounded edges."""
     q = np.abs(p - at) - (np.asarray(half) - round_off)
     return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - round_off
@@ -72,6 +80,7 @@ def _joined(parts: Iterable[np.ndarray], soft: float = 0.08) -> np.ndarray:
     return total
 
 
+@_statue
 def _bust(p: np.ndarray) -> np.ndarray:
     """Distance to head and shoulders on a foot."""
     return _joined(
@@ -90,6 +99,7 @@ def _bust(p: np.ndarray) -> np.ndarray:
     )
 
 
+@_statue
 def _knot(p: np.ndarray) -> np.ndarray:
     """Distance to a trefoil knot on a slab."""
     t = np.linspace(0, 2 * np.pi, 61)
@@ -100,6 +110,7 @@ def _knot(p: np.ndarray) -> np.ndarray:
     return _joined([rods.min(0), _block(p, (0, 0, -0.73), (0.4, 0.4, 0.17))])
 
 
+@_statue
 def _hound(p: np.ndarray) -> np.ndarray:
     """Distance to a sitting dog that looks ahead (-y)."""
     legs = [_rod(p, (x, -0.28, -0.1), (x, -0.3, -0.75), 0.075) for x in (-0.15, 0.15)]
@@ -120,6 +131,7 @@ def _hound(p: np.ndarray) -> np.ndarray:
     )
 
 
+@_statue
 def _spire(p: np.ndarray) -> np.ndarray:
     """Distance to a square column that twists and narrows upwards."""
     z = p[..., 2]
@@ -128,18 +140,6 @@ def _spire(p: np.ndarray) -> np.ndarray:
     x, y = c * p[..., 0] - s * p[..., 1], s * p[..., 0] + c * p[..., 1]
     column = 0.7 * _block(np.stack([x / width, y / width, z / 0.9], -1), (0, 0, 0), (0.8, 0.8, 0.95), 0.1)
     return np.minimum(column * np.minimum(width, 0.9), _block(p, (0, 0, -0.84), (0.36, 0.36, 0.06)))
-
-
-STATUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "bust": _bust,
-    "knot": _knot,
-    "hound": _hound,
-    "spire": _spire,
-}
-
-
-Vector = tuple[float, float, float]
-Axes = tuple[Vector, ...]
 
 
 @dataclass(frozen=True)

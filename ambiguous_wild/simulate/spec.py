@@ -5,7 +5,6 @@ World axes: x right, y away from the walk, z up; metres; the ground is z = 0.
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -242,12 +241,6 @@ class Effects:
     white_balance: WhiteBalance | None = None
     iso_noise: IsoNoise | None = None
     jpeg: Jpeg | None = None
-
-
-KINDS: dict[str, type] = {
-    name: next(kind for kind in typing.get_args(hint) if kind is not type(None))
-    for name, hint in typing.get_type_hints(Effects).items()
-}  # settings by name of the effect
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import typing
 from collections.abc import Collection, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -16,7 +17,6 @@ from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
-    KINDS,
     PLANS,
     CaptureSpec,
     Distractor,
@@ -29,6 +29,10 @@ from ambiguous_wild.simulate.world import POSTERS, SHEETS
 
 PICTURES = tuple(f"poster_{name}" for name in POSTERS)
 MOST = 255  # largest number of distractors, as the ray caster stores a pixel's distractor in a byte
+KINDS: dict[str, type] = {
+    name: next(kind for kind in typing.get_args(hint) if kind is not type(None))
+    for name, hint in typing.get_type_hints(Effects).items()
+}  # settings by name of the effect
 _SPEC: Limits = {
     "train_views": (3, 2000),
     "test_views": (1, 2000),

@@ -16,8 +16,8 @@ from __future__ import annotations
 import math
 import re
 import traceback
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -49,9 +49,12 @@ class CaseResult:
     condition: float | None = None  # condition number: relative change of the result over that of the input
 
 
+_NOTHING = CaseResult(math.nan, 0.0, "", "")  # of a case that raised an error
+
+
 @dataclass(frozen=True)
 class Case:
-    """One row of the table."""
+    """One case of the table."""
 
     row: int  # number of a group of cases and tests
     name: str
@@ -63,24 +66,24 @@ class Case:
         return f"{self.row:02d}-{re.sub(r'[^a-z0-9.]+', '-', self.name.lower()).strip('-')}"
 
 
-@dataclass(frozen=True)
-class StressLine:
+@dataclass(frozen=True, kw_only=True)
+class StressLine(CaseResult):
     """One line of `aw stress`."""
 
     key: str
     device: str
-    error: float
-    tolerance: float
-    why: str
-    expected: str
-    condition: float | None
-    passed: bool
     failure: str = ""  # the error, if the case raised one
+
+    @property
+    def passed(self) -> bool:
+        return not self.failure and self.error <= self.tolerance  # false for NaN
 
     def plain(self) -> Facts:
         """Return plain data for JSON, with None for NaN and infinity."""
-        missing = {k: None for k, v in asdict(self).items() if isinstance(v, float) and not math.isfinite(v)}
-        return asdict(self) | missing
+        measured = {field.name: getattr(self, field.name) for field in fields(CaseResult)}
+        facts = {"key": self.key, "device": self.device, **measured}
+        facts |= {"passed": self.passed, "failure": self.failure}
+        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in facts.items()}
 
 
 def case(
@@ -98,15 +101,13 @@ def case(
 def run(chosen: Case, device: str) -> StressLine:
     """Measure a case; an exception counts as its failure."""
     try:
-        m = chosen.measure(device)
+        return StressLine(**vars(chosen.measure(device)), key=chosen.key, device=device)
     except Exception as error:
         text = str(error) if isinstance(error, AwError) else traceback.format_exc(limit=-2)
-        return StressLine(chosen.key, device, float("nan"), 0.0, "", "", None, False, text)
-    passed = m.error <= m.tolerance  # false for NaN
-    return StressLine(chosen.key, device, m.error, m.tolerance, m.why, m.expected, m.condition, bool(passed))
+        return StressLine(**vars(_NOTHING), key=chosen.key, device=device, failure=text)
 
 
-def failed_checks(checks: dict[str, bool], expected: str) -> CaseResult:
+def failed_checks(checks: Mapping[str, object], expected: str) -> CaseResult:
     """A case of exact checks: the error is the number of checks that fail; the tolerance is 0."""
     bad = [name for name, holds in checks.items() if not holds]
     why = "exact" + (f"; wrong: {', '.join(bad)}" if bad else f", {len(checks)} checks")

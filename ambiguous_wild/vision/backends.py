@@ -149,7 +149,14 @@ def make_instances(spec: str) -> Instances:
     parsed = check_instances(spec)
     if parsed.argument and parsed.name not in ("grounded", "grounded-video", "labels"):
         raise AwError(f"instances {spec!r}: {parsed.name} takes nothing after a colon; remove it")
-    return _BUILDERS.get(parsed.name, _sam)(parsed, spec)
+    builders: dict[str, Callable[[Spec, str], Instances]] = {
+        "graph": _graph,
+        **dict.fromkeys(CONV, _grouped),
+        "labels": _labels,
+        "grounded": _grounded,
+        "grounded-video": _grounded,
+    }
+    return builders.get(parsed.name, _sam)(parsed, spec)
 
 
 def _graph(parsed: Spec, spec: str) -> Instances:
@@ -214,15 +221,6 @@ def _sam(parsed: Spec, spec: str) -> Instances:
 
     video = _sized(SamVideoConfig(), parsed, options, "sam.grid")
     return SamVideoInstances(SAM_VIDEO[parsed.name], video, folder)
-
-
-_BUILDERS: dict[str, Callable[[Spec, str], Instances]] = {
-    "graph": _graph,
-    **dict.fromkeys(CONV, _grouped),
-    "labels": _labels,
-    "grounded": _grounded,
-    "grounded-video": _grounded,
-}
 
 
 def _sized(config: Config, parsed: Spec, options: dict[str, str], size: str = "size") -> Config:

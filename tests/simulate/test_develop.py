@@ -19,7 +19,8 @@ from ambiguous_wild.simulate.photo_render import (
     trace_photo,
 )
 from ambiguous_wild.simulate.presets import PRESETS, preset, resized
-from ambiguous_wild.simulate.spec import KINDS, CaptureSpec, Defocus, Effects
+from ambiguous_wild.simulate.spec import CaptureSpec, Defocus, Effects
+from ambiguous_wild.simulate.spec_file import KINDS
 from ambiguous_wild.simulate.world import World
 
 EXACT = ("specular", "lens_distortion")  # of the place and the lens: test photos have them, too

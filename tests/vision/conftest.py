@@ -11,9 +11,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from ambiguous_wild.vision import weight_download
-from tests.vision.stub_sources import Hub
+from ambiguous_wild.vision.convnets import NETWORKS, ConvConfig, ConvFeatures
+from ambiguous_wild.vision.dino import DinoConfig, DinoFeatures
+from ambiguous_wild.vision.labhog import LabHog
+from ambiguous_wild.vision.protocols import Features
+from ambiguous_wild.vision.sceneconv import ConvNet, SceneConv
+from tests.vision.stub_sources import Hub, efficientnet_tensors, vgg_tensors
 
 VIT = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 2, "initializer_range": 0.2}
 WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "person", "car", "a", "dog", "red", "blue"]
@@ -148,6 +154,35 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
             assert json.loads((folder / "config.json").read_text())["model_type"]
             made[name] = folder
         return made[name]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def nets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with random tensors in the layouts of VGG-16 and EfficientNet-Lite0."""
+    place = tmp_path_factory.mktemp("nets")
+    save_file(vgg_tensors(), place / "vgg16.safetensors")
+    save_file(efficientnet_tensors(), place / "efficientnet-lite0.safetensors")
+    return place
+
+
+@pytest.fixture
+def backend(checkpoint: Callable[[str], Path], nets: Path) -> Callable[[str], Features]:
+    """Features by kind: `labhog`, `sceneconv`, a network of `nets`, or a checkpoint's name."""
+
+    def make(kind: str) -> Features:
+        if kind == "labhog":
+            return LabHog()
+        if kind == "sceneconv":  # untrained
+            features = SceneConv()
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(0)
+                features.load_state_dict({**ConvNet((16, 32, 48), 32).state_dict(), "unit": 1.0})
+            return features
+        if kind in NETWORKS:
+            return ConvFeatures(kind, ConvConfig(size=64), nets)
+        return DinoFeatures(kind, DinoConfig(size=56), checkpoint(kind))
 
     return make
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
+import math
 import pickle
 import shutil
 import zipfile
@@ -13,10 +14,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import torch
 
+from ambiguous_wild.vision import convnets
 from ambiguous_wild.vision.weight_registry import Package, Weight
 
 HEADS = (3, 5, 2, 4, 4)  # channels
+VGG = [(0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256), (14, 256, 256)]
 
 
 class Harmful:
@@ -36,6 +40,40 @@ def flax_heads() -> dict[str, Any]:
         f"NetLinLayer_{i}": {"Conv_0": {"kernel": rng.random((1, 1, c, 1)).astype(np.float32)}}
         for i, c in enumerate(HEADS)
     }
+
+
+def vgg_tensors() -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(1)
+    made = {}
+    for index, into, out in VGG:
+        made[f"features.{index}.weight"] = torch.randn(out, into, 3, 3, generator=g) * math.sqrt(
+            2 / (9 * into)
+        )
+        made[f"features.{index}.bias"] = 0.1 * torch.randn(out, generator=g)
+    return made
+
+
+def efficientnet_tensors() -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(2)
+    made: dict[str, torch.Tensor] = {}
+
+    def conv(name: str, norm: str, out: int, into: int, kernel: int) -> None:
+        made[f"{name}.weight"] = (
+            torch.randn(out, into, kernel, kernel, generator=g) / math.sqrt(into) / kernel
+        )
+        made[f"{norm}.weight"] = 0.5 + torch.rand(out, generator=g)
+        made[f"{norm}.bias"] = torch.randn(out, generator=g)
+        made[f"{norm}.running_mean"] = torch.randn(out, generator=g)
+        made[f"{norm}.running_var"] = 0.2 + torch.rand(out, generator=g)
+
+    conv("_conv_stem", "_bn0", 32, 3, 3)
+    for i, (kernel, _, expansion, into, out) in enumerate(convnets.BLOCKS[:5]):
+        wide = into * expansion
+        if expansion > 1:
+            conv(f"_blocks.{i}._expand_conv", f"_blocks.{i}._bn0", wide, into, 1)
+        conv(f"_blocks.{i}._depthwise_conv", f"_blocks.{i}._bn1", wide, 1, kernel)
+        conv(f"_blocks.{i}._project_conv", f"_blocks.{i}._bn2", out, wide, 1)
+    return made
 
 
 def wheel(folder: Path, members: dict[str, bytes], name: str = "tiny_nets") -> Package:

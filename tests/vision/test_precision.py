@@ -78,25 +78,10 @@ def test_photos_are_cached_by_precision(checkpoint, photo, monkeypatch, tmp_path
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def hand_made():
-    features = LabHog()
-    features.fit([torch.rand(40, 60, 3, generator=torch.Generator().manual_seed(0))])
-    return features
-
-
-def trained():
-    features = SceneConv()
-    features._take(features._new_net().state_dict())
-    return features
-
-
 @pytest.mark.parametrize("kind", ["labhog", "sceneconv", *KINDS])
-def test_features_of_a_render_leave_the_host_alone(checkpoint, photo, kind):
-    if kind in KINDS:
-        features = DinoFeatures(kind, DinoConfig(size=70), checkpoint(kind))
-        assert features.model is features.model  # loaded
-    else:
-        features = hand_made() if kind == "labhog" else trained()
+def test_features_of_a_render_leave_the_host_alone(backend, photo, kind):
+    features = backend(kind)
+    features.fit([photo(1, 60, 80)])
     shape = features(photo(0, 60, 80)).shape
     features, image = moved([features, photo(0, 60, 80)])
     features(image)  # constants are copied at their first use

@@ -13,10 +13,10 @@ import numpy as np
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate.image_effects import specular
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
-from ambiguous_wild.simulate.shapes import Shape, banner, barrier, figure, placed, pole, shape_table
+from ambiguous_wild.simulate.shapes import Shape, barrier, figure, placed, shape_table
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor, GroundPlan
 from ambiguous_wild.simulate.tracer import ShapeTable, trace
-from ambiguous_wild.simulate.world import World, car, placard, statue
+from ambiguous_wild.simulate.world import World, car, parts_of, placard, statue
 
 _TRIES = 80  # layouts drawn for a photo, of which the best is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place
@@ -52,18 +52,18 @@ def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]
         case "visitor":
             return figure(texture, distractor.head or texture, 0.06 + 0.26 * pose, pose)
         case "twin":
-            base = Shape(BOX, (0, 0, 0.06), (0.33, 0.33, 0.06), texture, offset=(0.4, 0.2))
-            return [base, *placed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0)]
+            return [
+                *parts_of("base of a twin", texture),
+                *placed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0),
+            ]
         case "parcel":
             top = Shape(BOX, (0, 0, 0.2), (0.24, 0.22, 0.2), texture, offset=(0.35, 0.6))
             below = Shape(BOX, (0, 0, 0.35), (0.36, 0.28, 0.35), texture)
             return [below, *placed([top], (0.05, 0, 0.7), 30.0)]
-        case "pole":
-            return pole(texture)
+        case "pole" | "banner":
+            return parts_of(distractor.kind, texture)
         case "barrier":
             return barrier(texture)
-        case "banner":
-            return banner(texture)
         case "placard":
             return placard(texture, plan)
         case "car":

@@ -274,12 +274,6 @@ def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: f
     ]
 
 
-def pole(texture: str) -> list[Shape]:
-    """Make a pole of 2 m, 5 cm thick, on a small foot."""
-    foot = Shape(BOX, (0, 0, 0.02), (0.14, 0.14, 0.02), texture)
-    return [between((0, 0, 0.03), (0, 0, 2.0), 0.025, texture), foot]
-
-
 def barrier(texture: str) -> list[Shape]:
     """Make two posts of 1 m, 1.5 m apart, and a rope of 3 cm that sags between them."""
     posts = [between((x, 0, 0.02), (x, 0, 1.0), 0.022, texture) for x in (-0.75, 0.75)]
@@ -288,9 +282,3 @@ def barrier(texture: str) -> list[Shape]:
     knots = np.stack([x, np.zeros(9), 0.65 + 0.3 * (x / 0.75) ** 2], axis=1)
     rope = [between(a, b, 0.015, texture) for a, b in pairwise(knots)]
     return [*posts, *feet, *rope]
-
-
-def banner(texture: str) -> list[Shape]:
-    """Make a strip of cloth, 1.3 x 0.26 m, held up by two sticks of 2 cm."""
-    sticks = [between((x, 0, 0.02), (x, 0, 1.75), 0.012, texture) for x in (-0.62, 0.62)]
-    return [Shape(BOX, (0, 0, 1.6), (0.65, 0.008, 0.13), texture), *sticks]

@@ -56,14 +56,14 @@ _NOTHING = CaseResult(math.nan, 0.0, "", "")  # of a case that raised an error
 class Case:
     """One case of the table."""
 
-    row: int  # number of a group of cases and tests
+    group: int  # number of the cases of one topic
     name: str
     measure: Callable[[str], CaseResult]  # argument: the device
     devices: tuple[str, ...]  # devices that the case applies to
 
     @property
     def key(self) -> str:
-        return f"{self.row:02d}-{re.sub(r'[^a-z0-9.]+', '-', self.name.lower()).strip('-')}"
+        return f"{self.group:02d}-{re.sub(r'[^a-z0-9.]+', '-', self.name.lower()).strip('-')}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +87,12 @@ class StressLine(CaseResult):
 
 
 def case(
-    row: int, name: str, *, devices: tuple[str, ...] = ("cpu",)
+    group: int, name: str, *, devices: tuple[str, ...] = ("cpu",)
 ) -> Callable[[Callable[[str], CaseResult]], Case]:
     """Decorate a measuring function: makes a case of it and registers it."""
 
     def register(measure: Callable[[str], CaseResult]) -> Case:
-        REGISTERED.append(Case(row, name, measure, devices))
+        REGISTERED.append(Case(group, name, measure, devices))
         return REGISTERED[-1]
 
     return register

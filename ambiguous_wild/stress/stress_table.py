@@ -10,14 +10,14 @@ from ambiguous_wild.stress import mask_cases, render_cases, training_cases
 from ambiguous_wild.stress.case import REGISTERED, Case, StressLine, run
 
 FILES = (render_cases, training_cases, mask_cases)  # each registers its cases when it is imported
-CASES: tuple[Case, ...] = tuple(sorted(REGISTERED, key=lambda c: c.row))
+CASES: tuple[Case, ...] = tuple(sorted(REGISTERED, key=lambda c: c.group))
 HEAD = ("case", "device", "correct result", "worst error", "tolerance", "reason", "condition", "verdict")
 WORDS = ("device", "correct result", "reason", "verdict")  # columns that hold text
 HEADER = f"{'verdict':7} {'on':4}  {'error':>9} {'allowed':>9} {'condition':>9}  case"
 
 
 def chosen(only: Sequence[str]) -> list[Case]:
-    """Return the cases that match an entry: a row ("4"), a part of a key, or a pattern with * and ?.
+    """Return the cases that match an entry: a group ("4"), a part of a key, or a pattern with * and ?.
 
     Raises:
         AwError: an entry matches no case.
@@ -27,7 +27,7 @@ def chosen(only: Sequence[str]) -> list[Case]:
     matching: dict[str, Case] = {}
     for wanted in only:
         if wanted.isdigit():
-            hits = [c for c in CASES if c.row == int(wanted)]
+            hits = [c for c in CASES if c.group == int(wanted)]
         else:
             hits = [c for c in CASES if fnmatch.fnmatch(c.key, wanted) or wanted in c.key]
         if not hits:

@@ -72,7 +72,8 @@ def _download_hub(weight: Weight, folder: Path) -> None:
     if missing:
         raise AwError(f"{weight.hub_id} on the hub has no {shortlist(missing)}")
     if PICKLE in wanted:
-        _convert(folder)
+        save(read_as_arrays(folder / PICKLE), folder / TENSORS)
+        (folder / PICKLE).unlink()
     shutil.rmtree(folder / ".cache", ignore_errors=True)  # the library's records of the download
     hashes = {name: sha256_file(folder / name) for name in weight.files}
     write_json(folder / RECEIPT, {"hub": weight.hub_id, "commit": info.sha, "sha256": hashes})
@@ -86,12 +87,6 @@ def _one_file(hub_id: str, name: str, commit: str, folder: Path, stated: Any) ->
     expected = getattr(getattr(stated, "lfs", None), "sha256", None)
     if expected and sha256_file(folder / name) != expected:
         raise AwError(f"{name} of {hub_id} has another sha256 than the hub states; nothing was installed")
-
-
-def _convert(folder: Path) -> None:
-    """Replace pytorch_model.bin by model.safetensors."""
-    save(read_as_arrays(folder / PICKLE), folder / TENSORS)
-    (folder / PICKLE).unlink()
 
 
 def _first_line(error: Exception) -> str:

@@ -31,7 +31,7 @@ def test_json_holds_what_the_table_shows():
     done = aw("--only", "24", "--json", "--device", "cpu")
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)
-    assert [row["key"] for row in rows] == [c.key for c in stress_table.CASES if c.row == 24]
+    assert [row["key"] for row in rows] == [c.key for c in stress_table.CASES if c.group == 24]
     assert all(row["passed"] and row["error"] <= row["tolerance"] for row in rows)
 
 

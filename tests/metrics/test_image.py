@@ -1,4 +1,7 @@
-"""What holds for the metrics of any picture; test_oracles.py has the values of other people's code."""
+"""What holds for the metrics of any picture.
+
+test_oracles.py has the values of other people's code, stress/mask_cases.py identical and constant pictures.
+"""
 
 from __future__ import annotations
 
@@ -28,31 +31,12 @@ def test_zero_padding_raises_ssim_of_a_noisy_picture() -> None:
     assert 0.0005 < ssim_inria(a, b) - ssim(a, b) < 0.1
 
 
-def test_psnr_of_a_known_error() -> None:
-    a = np.zeros((4, 4, 3))
-    assert psnr(a, a + 0.1) == pytest.approx(20.0, abs=1e-9)
-    assert psnr(a, a + 1.0) == 0.0
-
-
 def test_uint8_and_float_of_the_same_picture_agree() -> None:
     rng = np.random.default_rng(3)
     a, b = (rng.integers(0, 256, (16, 16, 3), dtype=np.uint8) for _ in range(2))
     for metric in (psnr, ssim, ssim_inria):
         assert metric(a, b) == pytest.approx(metric(a / 255.0, b / 255.0), abs=1e-12)
         assert metric(a, b / 255.0) == metric(a / 255.0, b)
-
-
-@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
-def test_identical_and_constant_pictures(level: float) -> None:
-    flat = np.full((20, 20, 3), level)
-    assert psnr(flat, flat) == math.inf
-    assert ssim(flat, flat) == 1.0 and ssim_inria(flat, flat) == 1.0
-
-
-def test_ssim_of_two_constant_pictures_is_the_luminance_term() -> None:
-    a, b = np.full((15, 15, 3), 0.25), np.full((15, 15, 3), 0.75)
-    expected = (2 * 0.25 * 0.75 + 1e-4) / (0.25**2 + 0.75**2 + 1e-4)
-    assert ssim(a, b) == pytest.approx(expected, abs=1e-9)
 
 
 @given(seed=st.integers(0, 2**32 - 1), noise=st.floats(0.0, 1.0))
@@ -83,7 +67,7 @@ def test_ssim_of_a_picture_below_the_window_is_a_named_error() -> None:
     ],
 )
 def test_unusable_pictures_are_named(bad: np.ndarray, words: str) -> None:
-    for metric in (psnr, ssim, ssim_inria):
+    for metric in (psnr, ssim, ssim_inria, flip, psnr_affine):
         with pytest.raises(AwError, match=words):
             metric(np.zeros((4, 4, 3)), bad)
 
@@ -111,11 +95,6 @@ def test_the_error_lies_where_the_pictures_differ_and_grows_with_the_difference(
         assert error[28:32, 28:32].min() > 5 * max(error[:8].max(), 1e-9)
         errors.append(error.mean())
     assert errors == sorted(errors)
-
-
-def test_pictures_of_two_sizes_have_no_flip() -> None:
-    with pytest.raises(AwError, match="different size"):
-        flip(codes(), codes(size=(20, 25)))
 
 
 def recoloured(seed=0, size=(23, 31), noise=0.05):
@@ -162,8 +141,3 @@ def test_it_is_never_below_psnr():
     for seed in range(20):
         render, photo = recoloured(seed, (5, 6), noise=0.4)
         assert psnr_affine(render, photo) >= psnr(render, photo)
-
-
-def test_other_sizes_are_refused():
-    with pytest.raises(AwError, match="different size"):
-        psnr_affine(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))

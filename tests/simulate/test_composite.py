@@ -139,14 +139,8 @@ def test_scene_json_says_how_it_was_made_and_is_not_a_builds(
     base: Path, cutouts: Path, tmp_path: Path
 ) -> None:
     write_scene(tmp_path / "base", NAMES, points=120)
-    source = {
-        "schema_version": 1,
-        "factor": 2,
-        "name": "b",
-        "files": {},
-        "build_key": "k",
-        "license": "CC0-1.0",
-    }
+    source: dict[str, object] = {"schema_version": 1, "factor": 2, "name": "b", "files": {}}
+    source |= {"build_key": "k", "license": "CC0-1.0"}
     (tmp_path / "base/scene.json").write_text(json.dumps(source))
     composite(tmp_path / "base", tmp_path / "out", CONFIG, cutouts)
     info = read_scene_json(tmp_path / "out")
@@ -311,19 +305,18 @@ def test_a_config_that_cannot_be_is_refused(
 def test_a_taken_output_and_a_scene_that_will_not_do_are_refused(
     base: Path, cutouts: Path, made: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(AwError, match="exists"):
-        composite(base, made, CONFIG, cutouts)
-    with pytest.raises(AwError, match="inside each other"):
-        composite(base, base / "inside", CONFIG, cutouts)
-    with pytest.raises(AwError, match="has distractors already"):
-        composite(made, tmp_path / "twice", CONFIG, cutouts)
-    with pytest.raises(AwError, match="--cutouts FOLDER"):
-        composite(base, tmp_path / "out", CONFIG)
     write_scene(tmp_path / "bare", NAMES, points=0)
-    with pytest.raises(AwError, match="has no points"):
-        composite(tmp_path / "bare", tmp_path / "out", CONFIG, cutouts)
-    with pytest.raises(AwError, match="there is no scene folder"):
-        composite(tmp_path / "none", tmp_path / "out", CONFIG, cutouts)
+    out = tmp_path / "out"
+    for words, message in (
+        ((base, made, CONFIG, cutouts), "exists"),
+        ((base, base / "inside", CONFIG, cutouts), "inside each other"),
+        ((made, out, CONFIG, cutouts), "has distractors already"),
+        ((base, out, CONFIG), "--cutouts FOLDER"),
+        ((tmp_path / "bare", out, CONFIG, cutouts), "has no points"),
+        ((tmp_path / "none", out, CONFIG, cutouts), "there is no scene folder"),
+    ):
+        with pytest.raises(AwError, match=message):
+            composite(*words)
 
 
 def test_a_run_that_breaks_leaves_nothing(base: Path, cutouts: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from ambiguous_wild.simulate import capture_writer
 from ambiguous_wild.simulate.capture_writer import look_at
 from ambiguous_wild.simulate.distractors import DistractorPose, movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
+from ambiguous_wild.simulate.shapes import shape_table
 from ambiguous_wild.simulate.spec import CaptureSpec, Distractor
 from ambiguous_wild.simulate.tracer import trace
 from ambiguous_wild.simulate.world import World
@@ -74,7 +75,8 @@ def only(distractor: Distractor) -> tuple[np.ndarray, float]:
     eye, f = np.array([0.0, -4.5, 1.2]), 400.0
     camera = Camera(560, 560, f, f, 280.0, 280.0, look_at(eye, np.array([0.0, -2.0, 1.2]), 0.0))
     here = movers(spec, (DistractorPose(0, 0.0, -2.0, 0.0, 0.4),), world)
-    return trace(camera, world.table(), here, world.atlas, world.light).owner > 0, f / 2.5
+    nothing = shape_table((), world.atlas)
+    return trace(camera, nothing, here, world.atlas, world.light).owner > 0, f / 2.5
 
 
 def width_m(distractor: Distractor) -> float:

@@ -187,7 +187,7 @@ def test_shares_that_cannot_be_reached_are_said(occlusion: str, word: str, tmp_p
 
 def test_presence_is_of_photos_where_the_band_starts_at_nothing() -> None:
     spec = parse_spec(
-        "train_views: 30\nwidth: 64\nheight: 36\ndetail_px_per_m: 5\nocclusion: [0, 0.9]\n"
+        "train_views: 30\nwidth: 64\nheight: 36\ndetail_px_per_m: 5\nocclusion: [0, 0.1]\n"
         "distractors: [{kind: ball, name: a, texture: cloth, ambiguity: none, presence: 0.3}]"
     )
     shots = [s for s in plan(spec, 1)[1] if s.split == "train"]

@@ -48,14 +48,7 @@ def panel_key(methods: tuple[str, ...] = METHODS, views: int = 8) -> Key:
 
 
 def write_key(key: Key, path: Path) -> Path:
-    data = {
-        "format": KEY_FORMAT,
-        "version": 1,
-        "study": key.study,
-        "title": key.title,
-        "questions": key.questions,
-    }
-    path.write_text(json.dumps(data))
+    path.write_text(json.dumps({"format": KEY_FORMAT, "version": 1, **vars(key)}))
     return path
 
 

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 
 from ambiguous_wild.cli.study import command
 from ambiguous_wild.core import AwError
+from ambiguous_wild.study.answers import Key
 from ambiguous_wild.study.scores import agreement, bradley_terry
 from tests.study.studies import METHODS, panel, panel_key, write_key, write_panel
 
@@ -242,19 +243,9 @@ def test_the_same_rater_twice_and_the_key_as_answers(study: tuple[Path, Path, An
     assert "cannot read the key" in error(answers, "--key", tmp_path / "absent.json")
     (tmp_path / "empty").mkdir()
     assert "no answer file" in error(tmp_path / "empty", "--key", key)
-    key.write_text(
-        '{"format": "aw-study-key", "version": 1, "study": "s", "title": "t", "questions": {"a": {}}}'
-    )
+    write_key(Key("s", "t", {"a": {}}), key)
     assert "damaged" in error(answers, "--key", key)
-    entry = {"kind": "ambiguity", "scene": "s", "view": "v"}
-    half = {
-        "format": "aw-study-key",
-        "version": 1,
-        "study": "s",
-        "title": "\ud800",
-        "questions": {"a": entry},
-    }
-    key.write_text(json.dumps(half))
+    write_key(Key("s", "\ud800", {"a": {"kind": "ambiguity", "scene": "s", "view": "v"}}), key)
     assert "half a character" in error(answers, "--key", key)
 
 

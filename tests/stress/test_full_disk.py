@@ -1,4 +1,4 @@
-"""Row 27: disk full: run again, and it ends with the same files.
+"""Disk full: run again, and it ends with the same files.
 
 Kills are in tests/builder/test_killed.py (stages of build-scene) and tests/faults/test_killed_at_random.py.
 """

@@ -1,4 +1,4 @@
-"""Row 26: one capture that holds every defect; each file is used or refused by itself, with its reason."""
+"""One capture that holds every defect: each file is used or refused by itself; and one of two photos."""
 
 import struct
 import zlib
@@ -9,10 +9,13 @@ import OpenImageIO as oiio
 import pytest
 
 from ambiguous_wild.builder.collect import collect
+from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.screen import screen
+from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import image_size, load_image_float, read_gray, read_png_rgb
+from tests.builder.capture_maker import write_capture
 
 LONG = "x" * 240 + ".jpg"
 
@@ -43,7 +46,7 @@ def with_size(data, width, height):
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory):
-    raw = tmp_path_factory.mktemp("row26") / "raw"
+    raw = tmp_path_factory.mktemp("hard") / "raw"
     raw.mkdir()
     save(raw / "plain.jpg", picture(0))
     save(raw / "no focal.jpg", picture(1), Make="M", Model="X")
@@ -147,3 +150,14 @@ def test_a_scene_photo_of_200_megapixels_is_refused_before_memory_is_taken(raw, 
 def test_a_damaged_scene_photo_is_refused_not_filled_with_grey(raw, name, read):
     with pytest.raises(AwError, match=name):
         read(raw / name)
+
+
+def test_two_photos_are_refused_with_how_many_are_needed_or_make_a_scene(tmp_path):
+    write_capture(tmp_path / "raw", 2)
+    try:
+        build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500))
+    except AwError as error:
+        assert "2 photos" in str(error) or "of 2" in str(error)
+        assert [p.name for p in tmp_path.iterdir()] == ["raw"]  # nothing half-made beside it
+    else:
+        assert (tmp_path / "scene/scene.json").is_file()

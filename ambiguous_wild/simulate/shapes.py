@@ -1,4 +1,4 @@
-"""Shapes: primitives, objects made of them (figure, pole, barrier, banner), and statues.
+"""Shapes: primitives, objects made of them (figure, barrier), and statues.
 
 Statues are signed distance functions, sampled on grids for sphere tracing. A grid fills the cube [-1, 1]^3
 around a shape's centre, z up, foot at z = -0.9; the shape's half size scales it. Distances of a smooth union

@@ -30,7 +30,7 @@ from ambiguous_wild.io.colmap_records import (
     model_of_id,
     points_without_tracks,
 )
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.files import write_bytes
 
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length
@@ -341,7 +341,7 @@ def _write_cameras(path: Path, cameras: Iterable[ModelCamera]) -> None:
     for c in ordered:
         parts.append(struct.pack("<iiQQ", c.camera_id, MODELS[c.model][0], c.width, c.height))
         parts.append(struct.pack(f"<{len(c.params)}d", *c.params))
-    _write(path, parts)
+    write_bytes(path, parts)
 
 
 def _write_images(path: Path, images: Iterable[ModelImage]) -> None:
@@ -354,7 +354,7 @@ def _write_images(path: Path, images: Iterable[ModelImage]) -> None:
         rows = np.empty(len(image.xys), _OBSERVATION)
         rows["xy"], rows["point"] = image.xys, image.point_ids
         parts += [struct.pack("<Q", len(rows)), rows.tobytes()]
-    _write(path, parts)
+    write_bytes(path, parts)
 
 
 def _write_points(path: Path, points: ModelPoints) -> None:
@@ -365,15 +365,10 @@ def _write_points(path: Path, points: ModelPoints) -> None:
         rows = np.zeros(len(points.ids), _POINT_ROW)
         rows["id"], rows["error"] = points.ids, points.error_px
         rows["xyz"], rows["rgb"] = points.xyz, points.rgb
-        _write(path, [*parts, rows.tobytes()])
+        write_bytes(path, [*parts, rows.tobytes()])
         return
     for i in range(len(points.ids)):
         start, end = points.track_offsets[i], points.track_offsets[i + 1]
         head = (*points.xyz[i], *(int(v) for v in points.rgb[i]), points.error_px[i], end - start)
         parts += [_POINT.pack(points.ids[i], *head), tracks[start:end].tobytes()]
-    _write(path, parts)
-
-
-def _write(path: Path, parts: list[bytes]) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(b"".join(parts))
+    write_bytes(path, parts)

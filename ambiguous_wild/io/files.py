@@ -397,6 +397,12 @@ def is_record(path: Path, key: str) -> bool:
     return key in own_json(path)
 
 
+def write_bytes(path: Path | str, parts: Iterable[bytes]) -> None:
+    """Write the parts of a file atomically."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        f.writelines(parts)
+
+
 def write_text(path: Path | str, text: str) -> None:
     """Write UTF-8 text atomically."""
     with atomic_path(path) as temporary:

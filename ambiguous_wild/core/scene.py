@@ -9,7 +9,7 @@ from typing import Literal, TypedDict
 
 import numpy as np
 
-from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.core.camera import Camera, rotation_from_quat
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 
@@ -34,9 +34,7 @@ class SceneTransform:
     @property
     def rotation(self) -> np.ndarray:
         """R, [3, 3]."""
-        w, x, y, z = np.array(self.turn) / np.linalg.norm(self.turn)
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return np.eye(3) + 2.0 * (w * cross + cross @ cross)
+        return rotation_from_quat(np.array(self.turn))
 
     def inside(self, camera: Camera) -> Camera:
         """Return a camera of the files' coordinates in those of training."""

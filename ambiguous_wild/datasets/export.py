@@ -54,11 +54,7 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     if form not in WRITERS:
         raise unknown("layout", form, WRITERS)
     scene = load_scene(path, raw=True)
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise AwError(f"{output} exists; nothing is overwritten: choose another -o or remove it")
-    if output.resolve().is_relative_to(scene.root.resolve()):
-        raise AwError(f"{output} lies inside the scene {path}; choose a folder outside it for -o")
-    check_output(output)
+    check_output(output, outside={f"the scene {path}": scene.root}, new=True)
     with atomic_dir(output, replace=False) as folder:
         place = _copy if copy else link_file
         left_out = [*WRITERS[form](scene, folder, place)]

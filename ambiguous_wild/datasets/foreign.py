@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from ambiguous_wild.core.camera import pose_at
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
@@ -173,7 +174,4 @@ def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
         raise AwError("a transform_matrix has no rotation in its left 3x3 part (scaled or mirrored)")
     if not (np.abs(c2w[:3, 3]) < LARGEST_COORDINATE).all():
         raise AwError(f"a transform_matrix has the position {c2w[:3, 3].tolist()}, which is too far away")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ c2w[:3, 3]
-    return pose
+    return pose_at(c2w[:3, 3], rotation.T)

@@ -23,7 +23,7 @@ from ambiguous_wild.core.names import check_name, csv_text
 from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
 from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
-from ambiguous_wild.io.files import atomic_dir, check_output, list_names, refuse_foreign_files
+from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
@@ -75,15 +75,9 @@ def package_scenes(
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise AwError(f"two scenes are called {twice[0]}: their archives would be one file; rename one")
-    for root, name, _ in opened:
-        if output.resolve().is_relative_to(root.resolve()):
-            raise AwError(f"{output} lies inside the scene {name} and would change it; choose another -o")
-    check_output(output)
-    if output.is_dir() and any(output.iterdir()):
-        ours = {*FIXED, *(n for n in list_names(output) if n.endswith(".zip"))}
-        if not (output / "croissant.json").is_file():
-            raise AwError(f"{output} exists and is no package; choose another -o")
-        refuse_foreign_files(output, ours)
+    check_output(output, outside={f"the scene {name}": root for root, name, _ in opened})
+    ours = (output / "croissant.json").is_file()
+    check_replaceable(output, "package", {*FIXED, *(p.name for p in output.glob("*.zip"))} if ours else None)
     bar = Bar(progress)
     file_rows: list[list[Any]] = []
     photo_rows: list[list[Any]] = []

@@ -38,8 +38,8 @@ from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.files import (
     check_output,
+    check_replaceable,
     folder_lock,
-    refuse_foreign_files,
     sweep,
     write_json,
     write_text,
@@ -210,20 +210,17 @@ def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings
 
 
 def _existing(target: Path, key: str, overwrite: bool) -> ImportRecord | None:
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return None
-    info = read_scene_json(target) if target.is_dir() else None
-    if info is None:
-        raise AwError(f"{target} exists and is no scene of 'aw import'; choose another -o")
-    if info.get("build_key") == key:
+    info = read_scene_json(target)
+    if info is not None and info.get("build_key") == key:
         verify_files(target, info, quick=True)
         return cast(ImportRecord, info)  # the key shows that this code wrote it
-    if not overwrite:
+    if info is not None and not overwrite:
         raise AwError(
             f"{target} exists, from other files or settings; pass --overwrite to replace it, or "
             "choose another -o"
         )
-    refuse_foreign_files(target, {"scene.json", *info.get("files", {})})
+    ours = None if info is None else {"scene.json", *info.get("files", {})}
+    check_replaceable(target, "scene of 'aw import'", ours)
     return None
 
 

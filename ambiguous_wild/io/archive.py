@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.files import atomic_dir
+from ambiguous_wild.io.files import atomic_dir, is_free
 
 _CHUNK = 1 << 20
 _HEADER = 4 << 20  # bytes that all headers of one tar member may have
@@ -61,7 +61,7 @@ def extract(archive: Path | str, target: Path | str, limits: Limits | None = Non
         AwError: another format, damaged, or refused; the message names the member.
     """
     source, out = Path(archive), Path(target)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if not is_free(out):
         raise AwError(f"{out} exists; nothing is overwritten: choose another folder or remove it")
     with atomic_dir(out) as folder:
         return sorted(unpack(source, folder, limits))

@@ -47,7 +47,7 @@ def space_of(scene: Scene) -> Space:
     size = np.linalg.norm(up)
     up = up / size if size > 1e-6 else -poses[0, 1, :3]
     centers = np.array([v.camera.center for v in views])
-    depths = np.array([_median_depth(pose, scene.points.xyz) for pose in poses])
+    depths = np.array([_median_depth(v.camera, scene.points.xyz) for v in views])
     finite = np.isfinite(depths)
     depths = np.where(finite, depths, np.median(depths[finite]) if finite.any() else scene.extent)
     middle = (centers + poses[:, 2, :3] * depths[:, None]).mean(axis=0)
@@ -55,11 +55,11 @@ def space_of(scene: Scene) -> Space:
     return Space(up=up, middle=middle, distance=max(distance, 1e-6), extent=scene.extent)
 
 
-def _median_depth(pose: np.ndarray, points: np.ndarray) -> float:
+def _median_depth(camera: Camera, points: np.ndarray) -> float:
     """Return the median depth of points within 45 degrees of the view's axis; NaN without points."""
     if not len(points):
         return np.nan
-    seen = points @ pose[:3, :3].T + pose[:3, 3]
+    seen = camera.to_camera(points)
     ahead = (seen[:, 2] > 0) & (np.linalg.norm(seen[:, :2], axis=1) < seen[:, 2])
     return float(np.median(seen[ahead, 2])) if ahead.any() else np.nan
 

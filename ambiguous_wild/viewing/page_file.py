@@ -299,7 +299,7 @@ def importance(gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera]) -
     area = np.pi * scales[:, 1] * scales[:, 2]  # ellipse of the two longest axes, world units squared
     total = np.zeros(len(means))
     for camera in cameras:
-        seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        seen = camera.to_camera(means)
         depth = np.where(seen[:, 2] > _NEAR, seen[:, 2], np.inf)
         u, v = camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy
         inside = (np.abs(u / camera.width - 0.5) < 0.5 + _MARGIN) & (

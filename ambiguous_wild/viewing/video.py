@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
+from ambiguous_wild.core.camera import pose_at, rigid
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.core.scene import NO_PHOTO, centred, together
 from ambiguous_wild.io.files import atomic_path
@@ -137,9 +138,8 @@ def _camera(row: Any, lens: Camera, size: tuple[int, int]) -> Camera:
             focal = size[1] / 2 / math.tan(math.radians(fov) / 2)
             lens = Camera(size[0], size[1], focal, focal, size[0] / 2, size[1] / 2, np.eye(4))
     else:
-        to_world = np.eye(4)
-        to_world[:3, :3] = np.asarray(row["rotation"], np.float64).reshape(3, 3)
-        to_world[:3, 3] = np.asarray(row["position"], np.float64).reshape(3)
+        rotation = np.asarray(row["rotation"], np.float64).reshape(3, 3)
+        to_world = rigid(rotation, np.asarray(row["position"], np.float64).reshape(3))
         width, height = int(row["width"]), int(row["height"])
         fx, fy = float(row["fx"]), float(row["fy"])
         if not (math.isfinite(fx) and math.isfinite(fy)):
@@ -203,12 +203,10 @@ def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[
     lenses = np.array([fitted(key, size, key.cam_from_world) for key in keys], dtype=object)
     values = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses])
     values = PchipInterpolator(at, values)(wanted)
-    cameras = []
-    for center, rotation, (fx, fy, cx, cy) in zip(centers, rotations, values):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ center
-        cameras.append(Camera(size[0], size[1], fx, fy, cx, cy, pose))
-    return cameras
+    return [
+        Camera(*size, *lens, pose_at(center, rotation.T))
+        for center, rotation, lens in zip(centers, rotations, values)
+    ]
 
 
 def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -216,10 +214,7 @@ def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarr
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
-    return pose
+    return pose_at(center, np.stack([right, np.cross(forward, right), forward]))
 
 
 Frame = np.ndarray  # [H, W, 3] uint8

@@ -100,6 +100,19 @@ def test_a_lock_is_freed_after_an_error(tmp_path):
         assert (tmp_path / ".run.lock").exists()
 
 
+@pytest.mark.parametrize(("number", "advice"), [(28, "free space"), (30, "make it writable")])
+def test_a_lock_that_cannot_be_written_says_what_to_do(tmp_path, monkeypatch, number, advice):
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("filelock.FileLock.acquire", refuse)
+    with (
+        pytest.raises(AwError, match=f"{os.strerror(number)}; {advice}, or choose"),
+        folder_lock(tmp_path / "run", "aw bench"),
+    ):
+        pass
+
+
 def test_a_lock_file_unlinked_under_ones_hands_is_not_held(tmp_path, monkeypatch):
     """B opens the file, A unlinks it and leaves, B locks what is no longer there: B must look again."""
     path, real = tmp_path / ".run.lock", fcntl.flock

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from ambiguous_wild.core.camera import rigid
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, read_text
 from ambiguous_wild.datasets.readers import posed_photos
@@ -91,10 +92,8 @@ def _move(transform: Element | None) -> np.ndarray | None:
     """Return the transform [4, 4] of a component or chunk; None without one."""
     if transform is None or transform.find("rotation") is None:
         return None
-    move = np.eye(4)
-    move[:3, :3] = _numbers(transform.find("rotation"), 3, 3) * _numbers(transform.find("scale"), 1)
-    move[:3, 3] = _numbers(transform.find("translation"), 3)
-    return move
+    scaled = _numbers(transform.find("rotation"), 3, 3) * _numbers(transform.find("scale"), 1)
+    return rigid(scaled, _numbers(transform.find("translation"), 3))
 
 
 def _camera(sensor: Element, where: str) -> ModelCamera:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -14,15 +13,14 @@ import numpy as np
 
 from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.datasets.foreign import without_suffix
 from ambiguous_wild.datasets.imported_photos import link_file
 from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
-from ambiguous_wild.io.files import atomic_dir, check_output
+from ambiguous_wild.io.files import atomic_dir, check_output, write_json
 from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.ply import write_point_ply
-from ambiguous_wild.io.scene_folder import load_scene, model_folder
+from ambiguous_wild.io.scene_folder import load_scene, model_folder, without_suffix
 
 Form = Literal["nerfstudio", "nerfbaselines", "colmap", "on-the-go"]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -135,7 +133,7 @@ def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
         "evaluation_protocol": "nerfw" if _half(scene) else "default",
         "downscale_factor": 1,
     }
-    _write_json(folder / "nb-info.json", info)
+    write_json(folder / "nb-info.json", info)
     return []
 
 
@@ -166,7 +164,7 @@ def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
         "val_filenames": [f"images/{_stored(v)}" for v in scene.test],
         "test_filenames": [f"images/{_stored(v)}" for v in scene.test],
     }
-    _write_json(folder / "transforms.json", data)
+    write_json(folder / "transforms.json", data)
     return [*_protocol_lost(scene), "tracks of the points"]
 
 
@@ -200,10 +198,10 @@ def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
         own = {} if len(lenses) == 1 else _intrinsics(view)
         frames.append({"file_path": name, **own, "transform_matrix": _camera_to_world(view)})
     shared = _intrinsics(views[0]) if len(lenses) == 1 else {}
-    _write_json(folder / "transforms.json", {**shared, "frames": frames})
+    write_json(folder / "transforms.json", {**shared, "frames": frames})
     sides = {"clutter": "train", "extra": "test"}
     split = {word: [i for i, v in enumerate(views) if v.split == side] for word, side in sides.items()}
-    _write_json(folder / "split.json", {**split, "clean": []})
+    write_json(folder / "split.json", {**split, "clean": []})
     masks = ["keep masks"] if any(v.keep_path for v in scene.train) else []
     return [*_protocol_lost(scene), "points", *masks]
 
@@ -229,10 +227,6 @@ def _write_mask(view: View, target: Path) -> None:
     else:
         pixels = read_mask(view.keep_path)
     write_png(target, pixels)
-
-
-def _write_json(path: Path, data: Mapping[str, object]) -> None:
-    path.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 WRITERS: dict[str, Callable[[Scene, Path, Place], list[str]]] = {

@@ -13,9 +13,8 @@ from ambiguous_wild.core.camera import pose_at
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
-from ambiguous_wild.io.scene_folder import TEST_EVERY
+from ambiguous_wild.io.scene_folder import SIDES, TEST_EVERY, without_suffix
 
-SIDES: tuple[Split, Split] = ("train", "test")
 LARGEST = 100_000_000  # bytes of a text file
 SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
 
@@ -68,11 +67,6 @@ def read_text(path: Path) -> str:
         raise AwError(f"cannot read {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise AwError(f"{path} is no text in UTF-8; export it again") from error
-
-
-def without_suffix(name: str) -> str:
-    """Return the name without its last extension."""
-    return str(PurePosixPath(name).with_suffix(""))
 
 
 def plain(name: str) -> str:

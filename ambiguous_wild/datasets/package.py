@@ -23,8 +23,8 @@ from ambiguous_wild.core.names import check_name, csv_text
 from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
 from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
-from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable
-from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
+from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable, write_json
+from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files, without_suffix
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
@@ -98,7 +98,7 @@ def package_scenes(
         people = [f"{r[0]}/{r[1]}" for r in photo_rows if r[6]] if look_for_people else None
         facts = [_facts(name, scene_info) for _, name, scene_info in opened]
         data = croissant(info, facts, packed, {"files.csv": FILES, "photos.csv": PHOTOS})
-        (folder / "croissant.json").write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", "utf-8")
+        write_json(folder / "croissant.json", data)
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):
             every = [*packed, *(_described(folder / n, "") for n in ("croissant.json", "README.md"))]
@@ -148,7 +148,7 @@ def _pack(
         if (root / f"{side}_list.txt").is_file()
         for line in (root / f"{side}_list.txt").read_text(encoding="utf-8").splitlines()
     }
-    stems = {str(PurePosixPath(n).with_suffix("")): n for n in split}
+    stems = {without_suffix(n): n for n in split}
     removed: dict[str, set[str]] = {}
     rows = []
     names = sorted(info["files"])
@@ -198,7 +198,7 @@ def _photo_of(path: str, stems: dict[str, str]) -> str | None:
     if len(parts) < 2 or not parts[0].startswith(("images", "masks")):
         return None
     rest = parts[2:] if parts[0] == "masks" else parts[1:]
-    return stems.get(str(PurePosixPath(*rest).with_suffix(""))) if rest else None
+    return stems.get(without_suffix(str(PurePosixPath(*rest)))) if rest else None
 
 
 def _role(path: str) -> str:

@@ -22,7 +22,7 @@ from ambiguous_wild.builder.workspace import content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split
-from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
+from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.imported_photos import (
     PhotoPlan,
     PlacedPhoto,
@@ -45,7 +45,7 @@ from ambiguous_wild.io.files import (
     write_text,
 )
 from ambiguous_wild.io.images import read_gray
-from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
+from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, SIDES, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
 LARGER = 1.5  # times; cameras that are this much larger than their photos belong to other files

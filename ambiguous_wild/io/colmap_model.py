@@ -32,6 +32,7 @@ from ambiguous_wild.io.colmap_records import (
 )
 from ambiguous_wild.io.files import write_bytes
 
+_AGAIN = "the model is damaged; build it again"
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length
 # An image's line has id, seven numbers, camera id and a name that is no number; observations are numbers.
@@ -62,21 +63,14 @@ def read_model(folder: Path | str) -> ColmapModel:
     names: set[str] = set()
     for image in model.images.values():
         if not PurePosixPath(image.name).name or "\0" in image.name:
-            raise AwError(f"{root}: image {image.image_id} has no name: the model is damaged; build it again")
+            raise AwError(f"{root}: image {image.image_id} has no name: {_AGAIN}")
+        where = f"{root}: image {image.name!r}"
         if image.camera_id not in model.cameras:
-            raise AwError(
-                f"{root}: image {image.name!r} has camera {image.camera_id}, which the model lacks: "
-                "it is damaged; build it again"
-            )
+            raise AwError(f"{where} has camera {image.camera_id}, which the model lacks: {_AGAIN}")
         if not (np.abs(image.tvec) < LARGEST_COORDINATE).all():
-            raise AwError(
-                f"{root}: image {image.name!r} has the translation {image.tvec.tolist()}: the model is "
-                "damaged; build it again"
-            )
+            raise AwError(f"{where} has the translation {image.tvec.tolist()}: {_AGAIN}")
         if image.name in names:
-            raise AwError(
-                f"{root} lists the image {image.name!r} twice: the model is damaged; build it again"
-            )
+            raise AwError(f"{where} is listed twice: {_AGAIN}")
         names.add(image.name)
     ids, counts = np.unique(model.points.ids, return_counts=True)
     if (counts > 1).any():
@@ -85,7 +79,7 @@ def read_model(folder: Path | str) -> ColmapModel:
     if len(odd):
         raise AwError(
             f"{root}: {len(odd)} points have no valid position, the first is {model.points.ids[odd[0]]} at "
-            f"{model.points.xyz[odd[0]].tolist()}: the model is damaged; build it again or remove them"
+            f"{model.points.xyz[odd[0]].tolist()}: {_AGAIN} or remove them"
         )
     return model
 

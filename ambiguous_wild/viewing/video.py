@@ -204,8 +204,8 @@ def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[
     values = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses])
     values = PchipInterpolator(at, values)(wanted)
     return [
-        Camera(*size, *lens, pose_at(center, rotation.T))
-        for center, rotation, lens in zip(centers, rotations, values)
+        Camera(size[0], size[1], fx, fy, cx, cy, pose_at(center, rotation.T))
+        for center, rotation, (fx, fy, cx, cy) in zip(centers, rotations, values)
     ]
 
 

@@ -15,9 +15,9 @@ from ambiguous_wild.datasets.readers.colmap import (
     photo_folder,
     read_lists,
     read_named_model,
-    shipped_factors,
 )
 from ambiguous_wild.datasets.readers.transforms import frame_name, frames_of, read_frames, read_json
+from ambiguous_wild.io.scene_folder import shipped_factors
 
 DATASET = "NeRF On-the-go"
 FACTOR, LOW_FACTOR = 8, 4

@@ -15,7 +15,6 @@ from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
 from ambiguous_wild.io.scene_folder import SIDES, TEST_EVERY, without_suffix
 
-LARGEST = 100_000_000  # bytes of a text file
 SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
 
 
@@ -51,22 +50,6 @@ def inside(name: str, root: Path) -> str:
     if pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or "\0" in name:
         raise AwError(f"{root} names a file outside itself: {name[:80]!r}; do not use this dataset")
     return str(pure)
-
-
-def read_text(path: Path) -> str:
-    """Read a text file in UTF-8, with or without byte order mark.
-
-    Raises:
-        AwError: unreadable, too large, or another encoding.
-    """
-    try:
-        if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB")
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise AwError(f"{path} is no text in UTF-8; export it again") from error
 
 
 def plain(name: str) -> str:

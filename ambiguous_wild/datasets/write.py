@@ -40,6 +40,7 @@ from ambiguous_wild.io.files import (
     check_output,
     check_replaceable,
     folder_lock,
+    replace_folder,
     sweep,
     write_json,
     write_text,
@@ -165,13 +166,7 @@ def import_scene(
             raise
         finally:
             bar.finish()
-        if target.exists():
-            old = target.parent / f".{target.name}.old-{time.time_ns()}"
-            os.replace(target, old)
-            os.replace(work / "scene", target)
-            shutil.rmtree(old)
-        else:
-            os.replace(work / "scene", target)
+        replace_folder(work / "scene", target)
         for left in target.parent.glob(f".{target.name}.import-*"):
             shutil.rmtree(left, ignore_errors=True)
     info = json.loads((target / "scene.json").read_text(encoding="utf-8"))

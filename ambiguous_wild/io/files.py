@@ -205,10 +205,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb") as f:
             os.fsync(f.fileno())
-        # mkstemp makes private files, but the output is to have the permissions of the user's umask.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
+        share(temporary)
         if into:
             _write_into(temporary, target)
             temporary.unlink()
@@ -221,6 +218,13 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' class for OSError
             raise OSError(int(full[1]), os.strerror(int(full[1])), str(target)) from error
         raise
+
+
+def share(path: Path) -> None:
+    """Give a private temporary file or folder the permissions that the user's umask leaves."""
+    umask = os.umask(0)
+    os.umask(umask)
+    os.chmod(path, (0o777 if path.is_dir() else 0o666) & ~umask)
 
 
 def _write_into(source: Path, target: Path) -> None:
@@ -257,9 +261,7 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
     refuse_file(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.tmp-", dir=target.parent))
-    umask = os.umask(0)
-    os.umask(umask)
-    os.chmod(temporary, 0o777 & ~umask)
+    share(temporary)
     try:
         yield temporary
         if not replace:
@@ -271,16 +273,22 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
                 raise AwError(
                     f"another command made {path} meanwhile; nothing of it is replaced: choose another -o"
                 ) from None
-        elif target.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old-", dir=target.parent))
-            os.replace(target, old / target.name)
-            os.replace(temporary, target)
-            shutil.rmtree(old)
         else:
-            os.replace(temporary, target)
+            replace_folder(temporary, target)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def replace_folder(source: Path, target: Path) -> None:
+    """Rename a folder to `target`, over an older folder."""
+    if not target.exists():
+        os.replace(source, target)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old-", dir=target.parent))
+    os.replace(target, old / target.name)
+    os.replace(source, target)
+    shutil.rmtree(old)
 
 
 def refuse_file(path: Path | str) -> None:
@@ -409,6 +417,45 @@ def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> No
         if os.path.lexists(folder / name):
             how = f"; replace it with {flag}, or choose another -o" if flag else "; choose another -o"
             raise AwError(f"{folder / name} exists, and this command would replace it{how}")
+
+
+def read_bytes(path: Path | str, most: int = 1 << 33) -> bytes:
+    """Read a file of another program.
+
+    Raises:
+        AwError: it cannot be read, or has more than `most` bytes.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > most:
+            raise AwError(f"{path} is larger than {most / 1e6:.0f} MB, the limit for such files")
+        return path.read_bytes()
+    except OSError as error:
+        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+
+
+def read_text(path: Path | str, most: int = 100_000_000) -> str:
+    """Read a text of another program in UTF-8, with or without byte order mark.
+
+    Raises:
+        AwError: as `read_bytes`, or another encoding.
+    """
+    try:
+        return read_bytes(path, most).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError:
+        raise AwError(f"cannot read {path}: it is not UTF-8 text; export it again") from None
+
+
+def read_json(path: Path | str) -> Any:
+    """Read a JSON file of another program; no key may stand twice in an object.
+
+    Raises:
+        AwError: as `read_text`, or it does not parse.
+    """
+    try:
+        return json.loads(read_text(path), object_pairs_hook=unique_keys)
+    except (ValueError, RecursionError) as error:
+        raise AwError(f"{path} is no JSON ({error}); copy it again") from None
 
 
 def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

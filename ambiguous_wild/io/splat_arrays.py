@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
+from ambiguous_wild.core import UNMOVED, SceneTransform
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
-_MOST_BYTES = 1 << 33
 _MOST_LOGIT = 15.0  # its sigmoid is 3e-7 below 1; formats that store alpha cannot hold an infinite logit
 
 
@@ -103,21 +101,6 @@ def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     rest = np.sqrt(np.clip(1.0 - (others**2).sum(axis=1), 0.0, None))
     quats[np.arange(len(largest)), largest] = rest
     return quats
-
-
-def read_bytes(path: Path | str) -> bytes:
-    """Read a whole file.
-
-    Raises:
-        AwError: it cannot be read, or has more bytes than a model can have.
-    """
-    path = Path(path)
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise AwError(f"{path} has {path.stat().st_size:,} bytes, more than a model can have")
-        return path.read_bytes()
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
 
 
 def checked_place(

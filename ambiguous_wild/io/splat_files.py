@@ -10,11 +10,11 @@ import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.compressed_ply import decode_compressed_ply, encode_compressed_ply
-from ambiguous_wild.io.files import write_bytes
+from ambiguous_wild.io.files import read_bytes, write_bytes
 from ambiguous_wild.io.gltf import decode_gltf, encode_gltf
 from ambiguous_wild.io.ply import decode_ply, encode_ply, has_chunks
 from ambiguous_wild.io.sog import decode_sog, encode_sog
-from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite, morton_order, read_bytes
+from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite, morton_order
 from ambiguous_wild.io.spz import decode_spz, encode_spz
 
 
@@ -35,42 +35,28 @@ class SplatFormat:
     y_up: bool = False  # y points up in every file, and a node of it states the place
 
 
-FORMATS = {
-    form.name: form
-    for form in (
-        SplatFormat(
-            "compressed-ply", ".compressed.ply", has_chunks, decode_compressed_ply, encode_compressed_ply
-        ),
-        SplatFormat(
-            "spz",
-            ".spz",
-            lambda data: data.startswith((b"NGSP", b"\x1f\x8b")),
-            decode_spz,
-            encode_spz,
-            holds_units=lambda scale: False,  # its scales end at e^6
-        ),
-        SplatFormat(
-            "sog",
-            ".sog",
-            lambda data: data.startswith(b"PK"),
-            decode_sog,
-            encode_sog,
-            holds_units=lambda scale: scale >= 1,  # its positions are logarithms
-        ),
-        SplatFormat(
-            "gltf",
-            ".glb",
-            lambda data: data.startswith(b"glTF"),
-            decode_gltf,
-            encode_gltf,
-            ordered=False,
-            y_up=True,
-        ),
-        SplatFormat(
-            "ply", ".ply", lambda data: data.startswith(b"ply"), decode_ply, encode_ply, ordered=False
-        ),
-    )
-}
+def _magic(*magic: bytes) -> Callable[[bytes], bool]:
+    return lambda data: data.startswith(magic)
+
+
+_ALL = (
+    SplatFormat(
+        "compressed-ply", ".compressed.ply", has_chunks, decode_compressed_ply, encode_compressed_ply
+    ),
+    # SPZ's scales have a fixed range; SOG's positions are logarithms
+    SplatFormat(
+        "spz",
+        ".spz",
+        _magic(b"NGSP", b"\x1f\x8b"),
+        decode_spz,
+        encode_spz,
+        holds_units=lambda scale: False,
+    ),
+    SplatFormat("sog", ".sog", _magic(b"PK"), decode_sog, encode_sog, holds_units=lambda scale: scale >= 1),
+    SplatFormat("gltf", ".glb", _magic(b"glTF"), decode_gltf, encode_gltf, ordered=False, y_up=True),
+    SplatFormat("ply", ".ply", _magic(b"ply"), decode_ply, encode_ply, ordered=False),
+)
+FORMATS = {form.name: form for form in _ALL}
 
 
 def read_splats(path: Path) -> SplatFile:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -15,11 +14,10 @@ from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.camera import pose_at, rigid
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.core.scene import NO_PHOTO, centred, together
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.files import atomic_path, read_json
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
-_MOST_BYTES = 64 * 1024 * 1024
 _TILT_DEG = 15.0  # angle of an orbit's cameras above the middle
 _WIDTH, _HEIGHT, _VIEWS = 960, 540, 8  # px and number of cameras without a scene
 _AWAY = 3.0  # distance of these cameras, relative to the Gaussians' median distance from their middle
@@ -105,14 +103,7 @@ def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> l
     Raises:
         AwError: another format, fewer than two cameras, or an invalid camera.
     """
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise AwError(f"{path} is larger than a camera path can be")
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:
-        raise AwError(f"{path} is no camera path: no JSON ({error})") from None
+    data = read_json(path)
     rows = data.get("camera_path") if isinstance(data, dict) else data
     if not isinstance(rows, list) or len(rows) < 2:
         raise AwError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
+from ambiguous_wild.io.images import decode
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
     SplatFile,
@@ -104,7 +106,15 @@ def decode_sog(data: bytes, path: Path | str) -> SplatFile:
             if meta["version"] != 2:
                 raise AwError(f"{path} is SOG of version {meta['version']!r}; this reads version 2")
             return SplatFile(_decode(archive, meta), place_from(meta.get("asset")))
-    except (zipfile.BadZipFile, KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        LookupError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:
         raise AwError(f"{path} is no SOG of version 2, or damaged: {error}") from None
 
 
@@ -210,7 +220,7 @@ def _webp(image: np.ndarray) -> bytes:
 def _read_webp(data: bytes) -> np.ndarray:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    image = decode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED, "a texture")
     if image is None or image.ndim != 3:
         raise ValueError("a texture is no WebP image in colour")
     if image.shape[2] == 3:

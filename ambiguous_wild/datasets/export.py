@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ambiguous_wild.builder.scene_package import nerfbaselines_info
 from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.datasets.imported_photos import link_file
@@ -126,14 +127,8 @@ def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
             target = folder / "masks" / f"{without_suffix(view.name)}.png"
             if not target.is_file():
                 write_png(target, np.full((view.camera.height, view.camera.width), 255, np.uint8))
-    info = {
-        "loader": "colmap",
-        "loader_kwargs": {"images_path": "images"},
-        "scene": scene.name,
-        "evaluation_protocol": "nerfw" if _half(scene) else "default",
-        "downscale_factor": 1,
-    }
-    write_json(folder / "nb-info.json", info)
+    protocol = {"evaluation_protocol": "nerfw"} if _half(scene) else {}
+    write_json(folder / "nb-info.json", nerfbaselines_info(1, scene.name) | protocol)
     return []
 
 

@@ -266,10 +266,8 @@ def _write_scene(
     for side in SIDES:
         lines = sorted(n for n, s in sides.items() if s == side)
         write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))
-    info = nerfbaselines_info(foreign.factor, name)
-    if foreign.evaluation.get("protocol") == "half":
-        info["evaluation_protocol"] = "nerfw"
-    write_json(folder / "nb-info.json", info)
+    protocol = {"evaluation_protocol": "nerfw"} if foreign.evaluation.get("protocol") == "half" else {}
+    write_json(folder / "nb-info.json", nerfbaselines_info(foreign.factor, name) | protocol)
     record = _record(foreign, settings, name, sides, scene_model, placed, notes, key)
     sweep(folder)  # remove temporary files of killed calls
     record["files"] = list_files(folder, jobs)

@@ -106,8 +106,7 @@ def read_place(path: Path | str) -> SceneTransform:
     Raises:
         AwError: the numbers in its comments are invalid.
     """
-    with open(path, "rb") as f:
-        return header_place(f.read(_MAX_HEADER), path)
+    return header_place(_head(path), path)
 
 
 def header_place(data: bytes, path: Path | str) -> SceneTransform:
@@ -181,11 +180,7 @@ def has_splats(path: Path) -> bool:
     Raises:
         AwError: it cannot be read.
     """
-    try:
-        with open(path, "rb") as f:
-            head = f.read(_MAX_HEADER).partition(b"\nend_header")[0]
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    head = _head(path).partition(b"\nend_header")[0]
     splats = re.search(rb"^(property \w+ opacity|element chunk)\b", head, re.MULTILINE)
     return not head.startswith(b"ply") or splats is not None
 
@@ -237,10 +232,13 @@ def splat_count(path: Path | str) -> int:
     Raises:
         AwError: no such file, or no splat PLY.
     """
-    path = Path(path)
+    return _header(path, _head(path))[0]
+
+
+def _head(path: Path | str) -> bytes:
     try:
         with open(path, "rb") as f:
-            return _header(path, f.read(_MAX_HEADER))[0]
+            return f.read(_MAX_HEADER)
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
 

@@ -12,9 +12,10 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.package import FILES, FIXED
 from ambiguous_wild.datasets.release_facts import NOT_FOR_RELEASE, VERSION
 from ambiguous_wild.io.archive import extract
-from ambiguous_wild.io.files import list_names, read_json, read_text, sha256_file
+from ambiguous_wild.io.files import list_names, sha256_file
 from ambiguous_wild.io.images import image_size
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
+from ambiguous_wild.io.untrusted import read_json, read_text
 
 
 @dataclass

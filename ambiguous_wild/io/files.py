@@ -419,45 +419,6 @@ def refuse_files_there(folder: Path, names: Iterable[str], flag: str = "") -> No
             raise AwError(f"{folder / name} exists, and this command would replace it{how}")
 
 
-def read_bytes(path: Path | str, most: int = 1 << 33) -> bytes:
-    """Read a file of another program.
-
-    Raises:
-        AwError: it cannot be read, or has more than `most` bytes.
-    """
-    path = Path(path)
-    try:
-        if path.stat().st_size > most:
-            raise AwError(f"{path} is larger than {most / 1e6:.0f} MB, the limit for such files")
-        return path.read_bytes()
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
-
-
-def read_text(path: Path | str, most: int = 100_000_000) -> str:
-    """Read a text of another program in UTF-8, with or without byte order mark.
-
-    Raises:
-        AwError: as `read_bytes`, or another encoding.
-    """
-    try:
-        return read_bytes(path, most).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
-    except UnicodeDecodeError:
-        raise AwError(f"cannot read {path}: it is not UTF-8 text; export it again") from None
-
-
-def read_json(path: Path | str) -> Any:
-    """Read a JSON file of another program; no key may stand twice in an object.
-
-    Raises:
-        AwError: as `read_text`, or it does not parse.
-    """
-    try:
-        return json.loads(read_text(path), object_pairs_hook=unique_keys)
-    except (ValueError, RecursionError) as error:
-        raise AwError(f"{path} is no JSON ({error}); copy it again") from None
-
-
 def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Make a JSON object; a key that stands in it twice is a ValueError (for `object_pairs_hook`)."""
     found: dict[str, Any] = {}

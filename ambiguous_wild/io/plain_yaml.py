@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io import files
+from ambiguous_wild.io import untrusted
 
 LARGEST = 1_000_000  # bytes; our files have a few thousand
 DEEPEST = 50  # nested lists and mappings
@@ -80,7 +80,7 @@ def read_text(path: Path) -> str:
     Raises:
         AwError: it cannot be read, is no UTF-8, or too large.
     """
-    return files.read_text(path, LARGEST)
+    return untrusted.read_text(path, LARGEST)
 
 
 def read_mapping(path: Path) -> dict[Any, Any]:

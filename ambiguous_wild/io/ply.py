@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io.files import read_bytes, write_bytes
+from ambiguous_wild.io.files import write_bytes
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, checked_place
+from ambiguous_wild.io.untrusted import read_bytes
 
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
 _TYPES = {

@@ -10,12 +10,13 @@ import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.compressed_ply import decode_compressed_ply, encode_compressed_ply
-from ambiguous_wild.io.files import read_bytes, write_bytes
+from ambiguous_wild.io.files import write_bytes
 from ambiguous_wild.io.gltf import decode_gltf, encode_gltf
 from ambiguous_wild.io.ply import decode_ply, encode_ply, has_chunks
 from ambiguous_wild.io.sog import decode_sog, encode_sog
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite, morton_order
 from ambiguous_wild.io.spz import decode_spz, encode_spz
+from ambiguous_wild.io.untrusted import read_bytes
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ import numpy as np
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, SceneTransform, View
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.scene import together
-from ambiguous_wild.io.files import read_bytes, sweep_killed
+from ambiguous_wild.io.files import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite
 from ambiguous_wild.io.splat_files import FORMATS, read_splats, write_splats
+from ambiguous_wild.io.untrusted import read_bytes
 from ambiguous_wild.metrics.image import psnr
 
 if TYPE_CHECKING:

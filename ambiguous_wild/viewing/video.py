@@ -14,7 +14,8 @@ from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.camera import pose_at, rigid
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.core.scene import NO_PHOTO, centred, together
-from ambiguous_wild.io.files import atomic_path, read_json
+from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.untrusted import read_json
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back

@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, SceneTransform
-from ambiguous_wild.io.files import read_bytes
 from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
 from ambiguous_wild.io.splat_arrays import SH_C0, finite
 from ambiguous_wild.io.splat_files import FORMATS, read_splats, write_splats
 from ambiguous_wild.io.spz import decode_spz, encode_spz
+from ambiguous_wild.io.untrusted import read_bytes
 
 THEIRS = Path(__file__).parent / "data" / "splats"
 Arrays = dict[str, np.ndarray]

@@ -17,7 +17,7 @@ from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.readers import posed_photos
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS, ModelCamera
-from ambiguous_wild.io.files import read_text
+from ambiguous_wild.io.untrusted import read_text
 
 FISHEYES = ("fisheye", "equidistant_fisheye")  # one lens: Metashape 2.3 calls it by the longer name
 LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

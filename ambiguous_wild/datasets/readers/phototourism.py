@@ -15,7 +15,7 @@ from ambiguous_wild.datasets.readers.colmap import (
     read_lists,
     read_named_model,
 )
-from ambiguous_wild.io.files import read_text
+from ambiguous_wild.io.untrusted import read_text
 
 COLUMNS = ("filename", "id", "split", "dataset")
 NERF_W: Evaluation = {

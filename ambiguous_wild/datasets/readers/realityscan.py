@@ -18,8 +18,8 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.readers import posed_photos
 from ambiguous_wild.io.colmap_records import ModelCamera
-from ambiguous_wild.io.files import read_text
 from ambiguous_wild.io.images import header_size, pillow
+from ambiguous_wild.io.untrusted import read_text
 
 NAMES = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}  # other names in RealityScan 2.2
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")

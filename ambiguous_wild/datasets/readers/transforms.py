@@ -13,10 +13,10 @@ from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, inside, sp
 from ambiguous_wild.datasets.readers.colmap import sides
 from ambiguous_wild.datasets.readers.posed_photos import brown_camera, model_of_poses
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, points_without_tracks
-from ambiguous_wild.io.files import read_json
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
 from ambiguous_wild.io.scene_folder import SIDES
+from ambiguous_wild.io.untrusted import read_json
 
 _MODELS = ["OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
 _LENS = ("k1", "k2", "p1", "p2")

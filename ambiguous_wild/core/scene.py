@@ -112,6 +112,13 @@ class SparsePoints:
     track_views: np.ndarray  # [L] int32, index into Scene.views; -1 = a view out of the split, or no position
     track_xy: np.ndarray  # [L, 2] float32, px of the *loaded* image of that view
 
+    @classmethod
+    def without_tracks(cls, xyz: np.ndarray) -> SparsePoints:
+        """Return black points [M, 3] that no view is known to see."""
+        count, rows = len(xyz), np.zeros((0, 2), np.float32)
+        rgb, offsets = np.zeros((count, 3), np.uint8), np.zeros(count + 1, np.int64)
+        return cls(xyz, rgb, np.zeros(count), offsets, np.zeros(0, np.int32), rows)
+
     def __len__(self) -> int:
         return len(self.xyz)
 

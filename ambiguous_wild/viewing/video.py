@@ -86,11 +86,7 @@ def scene_around(model: ViewedModel) -> Scene:
     for k, center in enumerate(_circle(middle, up, first, _AWAY * size, _VIEWS)):
         camera = replace(lens, cam_from_world=_looking(center, middle, up))
         views.append(View(f"render_{k}.png", NO_PHOTO, camera, "test" if k == 0 else "train"))
-    nothing = np.zeros(0)
-    points = SparsePoints(
-        xyz, np.zeros(xyz.shape, np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, np.int64),
-        nothing.astype(np.int32), nothing.reshape(0, 2).astype(np.float32),
-    )  # fmt: skip
+    points = SparsePoints.without_tracks(xyz)
     return centred(Scene(model.ply.parent, model.label, tuple(views), points))
 
 

@@ -63,12 +63,8 @@ def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: b
     offset = 0
     for name, values in columns.items():
         data = values if values.dtype == np.uint8 else values.astype("<f4")
-        accessor: dict[str, object] = {
-            "bufferView": len(views),
-            "componentType": _BYTE if data.dtype == np.uint8 else _FLOAT,
-            "count": n,
-            "type": _TYPES[data.shape[1] if data.ndim > 1 else 1],
-        }
+        kind = {"componentType": _BYTE if data.dtype == np.uint8 else _FLOAT, "count": n}
+        accessor = {"bufferView": len(views), **kind, "type": _TYPES[data.shape[1] if data.ndim > 1 else 1]}
         if data.dtype == np.uint8:
             accessor["normalized"] = True
         if name == "POSITION":
@@ -85,6 +81,7 @@ def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: b
         "sortingMethod": "cameraDistance",
         "projection": "perspective",
     }
+    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
     x, y, z = place.centre
     node = {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
     if place.turn != UNMOVED.turn:  # the caller turned the model so that y is up
@@ -99,13 +96,7 @@ def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: b
         "buffers": [{"byteLength": len(body)}],
         "bufferViews": views,
         "accessors": accessors,
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
     }
     text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode("ascii")
     text += b" " * (-len(text) % 4)

@@ -22,6 +22,7 @@ from ambiguous_wild.cli.options import (
 )
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
+from ambiguous_wild.io.splat_files import FORMATS
 
 if TYPE_CHECKING:
     from ambiguous_wild.viewing.model import ExportedModel
@@ -168,14 +169,13 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
 
 
-FORMATS = ("compressed-ply", "spz", "sog", "gltf")
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
 @click.command(name="export")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "--format", "formats", multiple=True, type=click.Choice((*FORMATS, "ply")), default=FORMATS,
+    "--format", "formats", multiple=True, type=click.Choice(FORMATS), default=[name for name in FORMATS if name != "ply"],
     show_default="all but ply", help="Repeatable.",
 )  # fmt: skip
 @click.option(

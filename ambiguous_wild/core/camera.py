@@ -1,4 +1,4 @@
-"""A pinhole camera in OpenCV axes: x right, y down, z forward; pixel centres at +0.5."""
+"""A pinhole camera in OpenCV axes: x right, y down, z forward; pixel centres at +0.5. Poses and rotations."""
 
 from __future__ import annotations
 
@@ -7,6 +7,38 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+
+
+def rigid(
+    rotation: np.ndarray,  # [3, 3]
+    translation: np.ndarray,  # [3]
+) -> np.ndarray:  # [4, 4] float64
+    """Return the matrix of ``x -> rotation x + translation``."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def pose_at(
+    center: np.ndarray,  # [3], world
+    rotation: np.ndarray,  # [3, 3], world to camera
+) -> np.ndarray:  # [4, 4] float64
+    """Return cam_from_world of a camera at `center`."""
+    return rigid(rotation, -rotation @ center)
+
+
+def rotation_from_quat(
+    quat: np.ndarray,  # [4] w, x, y, z; of any length but 0
+) -> np.ndarray:  # [3, 3] float64
+    """Return the rotation of a quaternion, which is normalised first."""
+    w, x, y, z = np.asarray(quat, dtype=np.float64) / float(np.linalg.norm(quat))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -47,6 +79,10 @@ class Camera:
     def intrinsics(self) -> np.ndarray:
         """K, [3, 3] float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def to_camera(self, points: np.ndarray) -> np.ndarray:
+        """Return points [..., 3] of the world in the camera's axes; z is the depth."""
+        return points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image of another size; each axis scales by actual over model size."""

@@ -67,8 +67,13 @@ class AwError(Exception):
 
 def disk_line(error: OSError) -> str:
     """Return the error of a disk as one line: the file, the reason, and what to do where the disk is full."""
-    room = "; free space, or choose another folder" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+    room = "; free space, or choose another folder" if is_full(error) else ""
     return f"{error.filename or 'input or output'}: {error.strerror or error}{room}"
+
+
+def is_full(error: OSError) -> bool:
+    """Tell whether there is no space left on the disk, or in the user's share of it."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwError:

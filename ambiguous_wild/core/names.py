@@ -22,15 +22,16 @@ def check_name(kind: str, name: str) -> str:
     """
     stripped = name.strip()
     size = len(stripped.encode("utf-8", errors="replace"))
+    shown = quoted(stripped, 40)
     if not stripped:
         raise AwError(f"the {kind} is empty; give it at least one letter")
     bad = next((c for c in stripped if c in "/\\" or _unprintable(c)), None)
     if bad is not None:
-        raise AwError(f"{kind} {_short(stripped)} holds {bad!a}; leave out '/', '\\' and control characters")
+        raise AwError(f"{kind} {shown} holds {bad!a}; leave out '/', '\\' and control characters")
     if stripped.startswith("."):
-        raise AwError(f"{kind} {_short(stripped)} starts with a dot, which hides files; leave out the dot")
+        raise AwError(f"{kind} {shown} starts with a dot, which hides files; leave out the dot")
     if size > LONGEST:
-        raise AwError(f"{kind} {_short(stripped)} has {size} bytes; at most {LONGEST} are allowed")
+        raise AwError(f"{kind} {shown} has {size} bytes; at most {LONGEST} are allowed")
     return stripped
 
 
@@ -61,5 +62,10 @@ def _unprintable(char: str) -> bool:
     return unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
-def _short(name: str) -> str:
-    return ascii(name if len(name) <= 40 else name[:37] + "...")
+def quoted(value: object, longest: int = 60) -> str:
+    """Return a value of an untrusted file for a message: in ASCII, at most `longest` characters."""
+    try:
+        text = ascii(value)
+    except ValueError:  # a whole number of thousands of digits
+        text = "a huge number"
+    return text if len(text) <= longest else text[: longest - 3] + "..."

@@ -9,7 +9,7 @@ from typing import Literal, TypedDict
 
 import numpy as np
 
-from ambiguous_wild.core.camera import Camera
+from ambiguous_wild.core.camera import Camera, rotation_from_quat
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 
@@ -34,9 +34,7 @@ class SceneTransform:
     @property
     def rotation(self) -> np.ndarray:
         """R, [3, 3]."""
-        w, x, y, z = np.array(self.turn) / np.linalg.norm(self.turn)
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return np.eye(3) + 2.0 * (w * cross + cross @ cross)
+        return rotation_from_quat(np.array(self.turn))
 
     def inside(self, camera: Camera) -> Camera:
         """Return a camera of the files' coordinates in those of training."""
@@ -113,6 +111,13 @@ class SparsePoints:
     track_offsets: np.ndarray  # [M + 1] int64
     track_views: np.ndarray  # [L] int32, index into Scene.views; -1 = a view out of the split, or no position
     track_xy: np.ndarray  # [L, 2] float32, px of the *loaded* image of that view
+
+    @classmethod
+    def without_tracks(cls, xyz: np.ndarray) -> SparsePoints:
+        """Return black points [M, 3] that no view is known to see."""
+        count, rows = len(xyz), np.zeros((0, 2), np.float32)
+        rgb, offsets = np.zeros((count, 3), np.uint8), np.zeros(count + 1, np.int64)
+        return cls(xyz, rgb, np.zeros(count), offsets, np.zeros(0, np.int32), rows)
 
     def __len__(self) -> int:
         return len(self.xyz)

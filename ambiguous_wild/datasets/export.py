@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 
+from ambiguous_wild.builder.scene_package import nerfbaselines_info
 from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.datasets.foreign import without_suffix
 from ambiguous_wild.datasets.imported_photos import link_file
 from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
-from ambiguous_wild.io.files import atomic_dir, check_output
+from ambiguous_wild.io.files import atomic_dir, check_output, write_json
 from ambiguous_wild.io.images import read_mask, write_png
 from ambiguous_wild.io.ply import write_point_ply
-from ambiguous_wild.io.scene_folder import load_scene, model_folder
+from ambiguous_wild.io.scene_folder import load_scene, model_folder, without_suffix
 
 Form = Literal["nerfstudio", "nerfbaselines", "colmap", "on-the-go"]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -54,11 +53,7 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     if form not in WRITERS:
         raise unknown("layout", form, WRITERS)
     scene = load_scene(path, raw=True)
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise AwError(f"{output} exists; nothing is overwritten: choose another -o or remove it")
-    if output.resolve().is_relative_to(scene.root.resolve()):
-        raise AwError(f"{output} lies inside the scene {path}; choose a folder outside it for -o")
-    check_output(output)
+    check_output(output, outside={f"the scene {path}": scene.root}, new=True)
     with atomic_dir(output, replace=False) as folder:
         place = _copy if copy else link_file
         left_out = [*WRITERS[form](scene, folder, place)]
@@ -132,14 +127,8 @@ def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
             target = folder / "masks" / f"{without_suffix(view.name)}.png"
             if not target.is_file():
                 write_png(target, np.full((view.camera.height, view.camera.width), 255, np.uint8))
-    info = {
-        "loader": "colmap",
-        "loader_kwargs": {"images_path": "images"},
-        "scene": scene.name,
-        "evaluation_protocol": "nerfw" if _half(scene) else "default",
-        "downscale_factor": 1,
-    }
-    _write_json(folder / "nb-info.json", info)
+    protocol = {"evaluation_protocol": "nerfw"} if _half(scene) else {}
+    write_json(folder / "nb-info.json", nerfbaselines_info(1, scene.name) | protocol)
     return []
 
 
@@ -170,7 +159,7 @@ def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
         "val_filenames": [f"images/{_stored(v)}" for v in scene.test],
         "test_filenames": [f"images/{_stored(v)}" for v in scene.test],
     }
-    _write_json(folder / "transforms.json", data)
+    write_json(folder / "transforms.json", data)
     return [*_protocol_lost(scene), "tracks of the points"]
 
 
@@ -204,10 +193,10 @@ def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
         own = {} if len(lenses) == 1 else _intrinsics(view)
         frames.append({"file_path": name, **own, "transform_matrix": _camera_to_world(view)})
     shared = _intrinsics(views[0]) if len(lenses) == 1 else {}
-    _write_json(folder / "transforms.json", {**shared, "frames": frames})
+    write_json(folder / "transforms.json", {**shared, "frames": frames})
     sides = {"clutter": "train", "extra": "test"}
     split = {word: [i for i, v in enumerate(views) if v.split == side] for word, side in sides.items()}
-    _write_json(folder / "split.json", {**split, "clean": []})
+    write_json(folder / "split.json", {**split, "clean": []})
     masks = ["keep masks"] if any(v.keep_path for v in scene.train) else []
     return [*_protocol_lost(scene), "points", *masks]
 
@@ -233,10 +222,6 @@ def _write_mask(view: View, target: Path) -> None:
     else:
         pixels = read_mask(view.keep_path)
     write_png(target, pixels)
-
-
-def _write_json(path: Path, data: Mapping[str, object]) -> None:
-    path.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 WRITERS: dict[str, Callable[[Scene, Path, Place], list[str]]] = {

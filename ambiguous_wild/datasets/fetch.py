@@ -7,7 +7,6 @@ trusted: it may break off, state a wrong length, ignore a request to resume, or 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import time
@@ -20,6 +19,8 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any, TypedDict
 from urllib.parse import urlsplit
+
+import msgspec
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, unknown
@@ -278,12 +279,8 @@ def _read_record(folder: Path) -> dict[str, Download]:
     if not path.is_file():
         return {}
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        return {
-            name: Download(url=str(e["url"]), sha256=str(e["sha256"]), bytes=int(e["bytes"]))
-            for name, e in record.items()
-        }
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        return msgspec.json.decode(path.read_bytes(), type=dict[str, Download])
+    except (msgspec.DecodeError, ValueError) as error:
         raise AwError(
             f"{path} is damaged ({error}); restore it, or remove it to record hashes anew"
         ) from error

@@ -9,13 +9,12 @@ from typing import Literal
 
 import numpy as np
 
+from ambiguous_wild.core.camera import pose_at
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
-from ambiguous_wild.io.scene_folder import TEST_EVERY
+from ambiguous_wild.io.scene_folder import SIDES, TEST_EVERY, without_suffix
 
-SIDES: tuple[Split, Split] = ("train", "test")
-LARGEST = 100_000_000  # bytes of a text file
 SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
 
 
@@ -51,27 +50,6 @@ def inside(name: str, root: Path) -> str:
     if pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or "\0" in name:
         raise AwError(f"{root} names a file outside itself: {name[:80]!r}; do not use this dataset")
     return str(pure)
-
-
-def read_text(path: Path) -> str:
-    """Read a text file in UTF-8, with or without byte order mark.
-
-    Raises:
-        AwError: unreadable, too large, or another encoding.
-    """
-    try:
-        if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB")
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise AwError(f"{path} is no text in UTF-8; export it again") from error
-
-
-def without_suffix(name: str) -> str:
-    """Return the name without its last extension."""
-    return str(PurePosixPath(name).with_suffix(""))
 
 
 def plain(name: str) -> str:
@@ -173,7 +151,4 @@ def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:
         raise AwError("a transform_matrix has no rotation in its left 3x3 part (scaled or mirrored)")
     if not (np.abs(c2w[:3, 3]) < LARGEST_COORDINATE).all():
         raise AwError(f"a transform_matrix has the position {c2w[:3, 3].tolist()}, which is too far away")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ c2w[:3, 3]
-    return pose
+    return pose_at(c2w[:3, 3], rotation.T)

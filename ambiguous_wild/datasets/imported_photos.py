@@ -15,7 +15,7 @@ import numpy as np
 from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo, downsampled_size
 from ambiguous_wild.builder.undistort import MOST_LOST, Lens, make_lens
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, without_suffix
+from ambiguous_wild.datasets.foreign import ForeignScene, find_photo
 from ambiguous_wild.io.colmap_records import ONE_FOCAL, ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import (
     MAX_PIXELS,
@@ -28,6 +28,7 @@ from ambiguous_wild.io.images import (
     write_png,
 )
 from ambiguous_wild.io.safe_pycolmap import pycolmap
+from ambiguous_wild.io.scene_folder import refuse_same_stems, without_suffix
 
 ENOUGH_POINTS = 20  # points in a photo whose colours show which way it was turned
 TURNED = 0.7  # a photo was turned if that reduces the difference of colours below this share
@@ -119,7 +120,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
         else:
             size = size[::-1] if turn > 4 else size
             plans.append(_plan(scene, image, source, camera, size, only_small, turn))
-    _refuse_same_stems(scene)
+    refuse_same_stems(scene.root, sorted(scene.split))
     total = len(scene.split)
     if absent:
         raise AwError(
@@ -159,17 +160,6 @@ def _turn(model: ColmapModel, image: ModelImage, source: Path, size: tuple[int, 
     flat = (lens.remap(pixels, nearest=False)[at] for pixels in (stored, upright(stored, tag)))
     as_is, turned = (float(np.abs(pixels - colours[shown]).mean()) for pixels in flat)
     return tag if turned < TURNED * as_is else 1
-
-
-def _refuse_same_stems(scene: ForeignScene) -> None:
-    """Raise AwError where two photos differ in their extension only, as both would be one PNG."""
-    seen: dict[str, str] = {}
-    for name in sorted(scene.split):
-        other = seen.setdefault(without_suffix(name), name)
-        if other != name:
-            raise AwError(
-                f"{scene.root}: photos {other!r} and {name!r} differ in their extension only; rename one"
-            )
 
 
 def _plan(

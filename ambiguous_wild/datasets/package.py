@@ -23,8 +23,8 @@ from ambiguous_wild.core.names import check_name, csv_text
 from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
 from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
-from ambiguous_wild.io.files import atomic_dir, check_output, list_names, refuse_foreign_files
-from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
+from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable, write_json
+from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files, without_suffix
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
@@ -75,15 +75,9 @@ def package_scenes(
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise AwError(f"two scenes are called {twice[0]}: their archives would be one file; rename one")
-    for root, name, _ in opened:
-        if output.resolve().is_relative_to(root.resolve()):
-            raise AwError(f"{output} lies inside the scene {name} and would change it; choose another -o")
-    check_output(output)
-    if output.is_dir() and any(output.iterdir()):
-        ours = {*FIXED, *(n for n in list_names(output) if n.endswith(".zip"))}
-        if not (output / "croissant.json").is_file():
-            raise AwError(f"{output} exists and is no package; choose another -o")
-        refuse_foreign_files(output, ours)
+    check_output(output, outside={f"the scene {name}": root for root, name, _ in opened})
+    ours = (output / "croissant.json").is_file()
+    check_replaceable(output, "package", {*FIXED, *(p.name for p in output.glob("*.zip"))} if ours else None)
     bar = Bar(progress)
     file_rows: list[list[Any]] = []
     photo_rows: list[list[Any]] = []
@@ -104,7 +98,7 @@ def package_scenes(
         people = [f"{r[0]}/{r[1]}" for r in photo_rows if r[6]] if look_for_people else None
         facts = [_facts(name, scene_info) for _, name, scene_info in opened]
         data = croissant(info, facts, packed, {"files.csv": FILES, "photos.csv": PHOTOS})
-        (folder / "croissant.json").write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", "utf-8")
+        write_json(folder / "croissant.json", data)
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):
             every = [*packed, *(_described(folder / n, "") for n in ("croissant.json", "README.md"))]
@@ -154,7 +148,7 @@ def _pack(
         if (root / f"{side}_list.txt").is_file()
         for line in (root / f"{side}_list.txt").read_text(encoding="utf-8").splitlines()
     }
-    stems = {str(PurePosixPath(n).with_suffix("")): n for n in split}
+    stems = {without_suffix(n): n for n in split}
     removed: dict[str, set[str]] = {}
     rows = []
     names = sorted(info["files"])
@@ -204,7 +198,7 @@ def _photo_of(path: str, stems: dict[str, str]) -> str | None:
     if len(parts) < 2 or not parts[0].startswith(("images", "masks")):
         return None
     rest = parts[2:] if parts[0] == "masks" else parts[1:]
-    return stems.get(str(PurePosixPath(*rest).with_suffix(""))) if rest else None
+    return stems.get(without_suffix(str(PurePosixPath(*rest)))) if rest else None
 
 
 def _role(path: str) -> str:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.foreign import read_text
 from ambiguous_wild.datasets.package import FILES, FIXED
 from ambiguous_wild.datasets.release_facts import NOT_FOR_RELEASE, VERSION
 from ambiguous_wild.io.archive import extract
 from ambiguous_wild.io.files import list_names, sha256_file
 from ambiguous_wild.io.images import image_size
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
+from ambiguous_wild.io.untrusted import read_json, read_text
 
 
 @dataclass
@@ -99,10 +97,7 @@ def _check_md5(path: Path) -> None:
 
 def _check_croissant(path: Path, sums: dict[str, str]) -> None:
     where = path / "croissant.json"
-    try:
-        data: Any = json.loads(read_text(where))
-    except (ValueError, RecursionError) as error:
-        raise AwError(f"{where} is no JSON ({error})") from error
+    data = read_json(where)
     if not isinstance(data, dict) or data.get("conformsTo") != VERSION:
         raise AwError(f"{where} is not in Croissant 1.1")
     listed = {}

@@ -22,7 +22,7 @@ from ambiguous_wild.builder.workspace import content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split
-from ambiguous_wild.datasets.foreign import SIDES, ForeignScene
+from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.imported_photos import (
     PhotoPlan,
     PlacedPhoto,
@@ -38,14 +38,15 @@ from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.files import (
     check_output,
+    check_replaceable,
     folder_lock,
-    refuse_foreign_files,
+    replace_folder,
     sweep,
     write_json,
     write_text,
 )
 from ambiguous_wild.io.images import read_gray
-from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, read_scene_json, verify_files
+from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, SIDES, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
 LARGER = 1.5  # times; cameras that are this much larger than their photos belong to other files
@@ -165,13 +166,7 @@ def import_scene(
             raise
         finally:
             bar.finish()
-        if target.exists():
-            old = target.parent / f".{target.name}.old-{time.time_ns()}"
-            os.replace(target, old)
-            os.replace(work / "scene", target)
-            shutil.rmtree(old)
-        else:
-            os.replace(work / "scene", target)
+        replace_folder(work / "scene", target)
         for left in target.parent.glob(f".{target.name}.import-*"):
             shutil.rmtree(left, ignore_errors=True)
     info = json.loads((target / "scene.json").read_text(encoding="utf-8"))
@@ -210,20 +205,17 @@ def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings
 
 
 def _existing(target: Path, key: str, overwrite: bool) -> ImportRecord | None:
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return None
-    info = read_scene_json(target) if target.is_dir() else None
-    if info is None:
-        raise AwError(f"{target} exists and is no scene of 'aw import'; choose another -o")
-    if info.get("build_key") == key:
+    info = read_scene_json(target)
+    if info is not None and info.get("build_key") == key:
         verify_files(target, info, quick=True)
         return cast(ImportRecord, info)  # the key shows that this code wrote it
-    if not overwrite:
+    if info is not None and not overwrite:
         raise AwError(
             f"{target} exists, from other files or settings; pass --overwrite to replace it, or "
             "choose another -o"
         )
-    refuse_foreign_files(target, {"scene.json", *info.get("files", {})})
+    ours = None if info is None else {"scene.json", *info.get("files", {})}
+    check_replaceable(target, "scene of 'aw import'", ours)
     return None
 
 
@@ -274,10 +266,8 @@ def _write_scene(
     for side in SIDES:
         lines = sorted(n for n, s in sides.items() if s == side)
         write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))
-    info = nerfbaselines_info(foreign.factor, name)
-    if foreign.evaluation.get("protocol") == "half":
-        info["evaluation_protocol"] = "nerfw"
-    write_json(folder / "nb-info.json", info)
+    protocol = {"evaluation_protocol": "nerfw"} if foreign.evaluation.get("protocol") == "half" else {}
+    write_json(folder / "nb-info.json", nerfbaselines_info(foreign.factor, name) | protocol)
     record = _record(foreign, settings, name, sides, scene_model, placed, notes, key)
     sweep(folder)  # remove temporary files of killed calls
     record["files"] = list_files(folder, jobs)

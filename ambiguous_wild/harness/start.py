@@ -11,7 +11,8 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.ply import has_splats, read_point_ply
-from ambiguous_wild.io.splat_files import SplatFile, read_splats
+from ambiguous_wild.io.splat_arrays import SplatFile
+from ambiguous_wild.io.splat_files import read_splats
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.method_hooks import MethodHooks

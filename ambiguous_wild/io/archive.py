@@ -21,7 +21,8 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.files import atomic_dir
+from ambiguous_wild.core.names import quoted
+from ambiguous_wild.io.files import atomic_dir, is_free
 
 _CHUNK = 1 << 20
 _HEADER = 4 << 20  # bytes that all headers of one tar member may have
@@ -61,7 +62,7 @@ def extract(archive: Path | str, target: Path | str, limits: Limits | None = Non
         AwError: another format, damaged, or refused; the message names the member.
     """
     source, out = Path(archive), Path(target)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if not is_free(out):
         raise AwError(f"{out} exists; nothing is overwritten: choose another folder or remove it")
     with atomic_dir(out) as folder:
         return sorted(unpack(source, folder, limits))
@@ -186,7 +187,7 @@ class _UnpackFolder:
         key = unicodedata.normalize("NFC", str(path)).casefold()
         if key in self.names:
             raise AwError(
-                f"{self.archive} holds {_short(name)} and {_short(self.names[key])}, the same file; "
+                f"{self.archive} holds {quoted(name)} and {quoted(self.names[key])}, the same file; "
                 "pack it again"
             )
         self.names[key] = name
@@ -218,9 +219,9 @@ def _zip_members(raw: IO[bytes], source: Path) -> Iterator[tuple[str, IO[bytes] 
             if stat.S_IFMT(mode) and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 raise _refused(source, member.filename, "a link or device")
             if member.flag_bits & 0x1:
-                raise NotImplementedError(f"{_short(member.filename)} is encrypted")
+                raise NotImplementedError(f"{quoted(member.filename)} is encrypted")
             if member.compress_type not in _ZIP_METHODS:
-                raise NotImplementedError(f"{_short(member.filename)} uses an unsupported compression method")
+                raise NotImplementedError(f"{quoted(member.filename)} uses an unsupported compression method")
             if member.is_dir():
                 yield member.filename, None
             else:
@@ -273,9 +274,4 @@ class _Gate:
 
 
 def _refused(archive: Path, name: str, what: str) -> AwError:
-    return AwError(f"{archive} is not unpacked: its member {_short(name)} is {what}; do not trust it")
-
-
-def _short(name: str) -> str:
-    text = ascii(name)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return AwError(f"{archive} is not unpacked: its member {quoted(name)} is {what}; do not trust it")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -30,10 +31,10 @@ from ambiguous_wild.io.colmap_records import (
     model_of_id,
     points_without_tracks,
 )
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.files import write_bytes
 
+_AGAIN = "the model is damaged; build it again"
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-_POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length
 # An image's line has id, seven numbers, camera id and a name that is no number; observations are numbers.
 _IMAGE_LINE = re.compile(r"\s*\d+(\s+\S+){7}\s+\d+\s+(?![-+.\d]+(\s|$))\S")
 _POINT_ROW = np.dtype(
@@ -62,21 +63,14 @@ def read_model(folder: Path | str) -> ColmapModel:
     names: set[str] = set()
     for image in model.images.values():
         if not PurePosixPath(image.name).name or "\0" in image.name:
-            raise AwError(f"{root}: image {image.image_id} has no name: the model is damaged; build it again")
+            raise AwError(f"{root}: image {image.image_id} has no name: {_AGAIN}")
+        where = f"{root}: image {image.name!r}"
         if image.camera_id not in model.cameras:
-            raise AwError(
-                f"{root}: image {image.name!r} has camera {image.camera_id}, which the model lacks: "
-                "it is damaged; build it again"
-            )
+            raise AwError(f"{where} has camera {image.camera_id}, which the model lacks: {_AGAIN}")
         if not (np.abs(image.tvec) < LARGEST_COORDINATE).all():
-            raise AwError(
-                f"{root}: image {image.name!r} has the translation {image.tvec.tolist()}: the model is "
-                "damaged; build it again"
-            )
+            raise AwError(f"{where} has the translation {image.tvec.tolist()}: {_AGAIN}")
         if image.name in names:
-            raise AwError(
-                f"{root} lists the image {image.name!r} twice: the model is damaged; build it again"
-            )
+            raise AwError(f"{where} is listed twice: {_AGAIN}")
         names.add(image.name)
     ids, counts = np.unique(model.points.ids, return_counts=True)
     if (counts > 1).any():
@@ -85,7 +79,7 @@ def read_model(folder: Path | str) -> ColmapModel:
     if len(odd):
         raise AwError(
             f"{root}: {len(odd)} points have no valid position, the first is {model.points.ids[odd[0]]} at "
-            f"{model.points.xyz[odd[0]].tolist()}: the model is damaged; build it again or remove them"
+            f"{model.points.xyz[odd[0]].tolist()}: {_AGAIN} or remove them"
         )
     return model
 
@@ -185,35 +179,25 @@ def _add(path: Path, records: dict[int, _Record], number: int, record: _Record) 
 def _binary_points(path: Path) -> ModelPoints:
     """Read points3D.bin."""
     reader = _Reader(path)
-    total = reader.count(_POINT.size)
-    ids, xyz = np.empty(total, np.int64), np.empty((total, 3))
-    rgb, error = np.empty((total, 3), np.uint8), np.empty(total)
-    offsets, tracks = np.zeros(total + 1, np.int64), list[np.ndarray]()
-    if len(reader.data) - reader.at == total * _POINT.size:  # no tracks: rows of one size
-        rows = np.frombuffer(reader.take(total * _POINT.size), _POINT_ROW)
-        if rows["track"].any() or (rows["id"] >= 2**63).any():
-            raise AwError(f"{path} is damaged: its ids or tracks do not fit its size; copy it again")
-        none = np.zeros(0, np.int64)
-        return ModelPoints(
-            rows["id"].astype(np.int64),
-            rows["xyz"].copy(),
-            rows["rgb"].copy(),
-            rows["error"].copy(),
-            offsets,
-            none,
-            none,
-        )
-    for i in range(total):
-        row = _POINT.unpack(reader.take(_POINT.size))
-        if row[0] >= 2**63:
-            raise AwError(f"{path} is damaged: a point numbered {row[0]}; copy or build the model again")
-        ids[i], xyz[i], rgb[i], error[i] = row[0], row[1:4], row[4:7], row[7]
-        if row[8] * 8 > len(reader.data) - reader.at:
-            raise AwError(f"{path} is damaged: point {row[0]} announces a track of {row[8]}")
-        tracks.append(np.frombuffer(reader.take(row[8] * 8), dtype="<i4").reshape(-1, 2))
-        offsets[i + 1] = offsets[i] + row[8]
-    flat = np.concatenate(tracks).astype(np.int64) if tracks else np.zeros((0, 2), np.int64)
-    return ModelPoints(ids, xyz, rgb, error, offsets, flat[:, 0], flat[:, 1])
+    total = reader.count(_POINT_ROW.itemsize)
+    heads, tracks = list[bytes](), list[bytes]()
+    if len(reader.data) - reader.at == total * _POINT_ROW.itemsize:  # no tracks: rows of one size
+        heads.append(reader.take(total * _POINT_ROW.itemsize))
+    else:
+        for _ in range(total):
+            heads.append(reader.take(_POINT_ROW.itemsize))
+            length = int.from_bytes(heads[-1][-8:], "little")
+            if length * 8 > len(reader.data) - reader.at:
+                point = int.from_bytes(heads[-1][:8], "little")
+                raise AwError(f"{path} is damaged: point {point} announces a track of {length}")
+            tracks.append(reader.take(length * 8))
+    rows = np.frombuffer(b"".join(heads), _POINT_ROW)
+    flat = np.frombuffer(b"".join(tracks), "<i4").reshape(-1, 2).astype(np.int64)
+    if (rows["id"] >= 2**63).any() or (rows["track"] > len(flat)).any():
+        raise AwError(f"{path} is damaged: its ids or tracks do not fit its size; copy it again")
+    offsets = np.concatenate([[0], np.cumsum(rows["track"].astype(np.int64))])
+    xyz, rgb, error = (rows[name].copy() for name in ("xyz", "rgb", "error"))
+    return ModelPoints(rows["id"].astype(np.int64), xyz, rgb, error, offsets, flat[:, 0], flat[:, 1])
 
 
 def _text_cameras(path: Path) -> dict[int, ModelCamera]:
@@ -341,7 +325,7 @@ def _write_cameras(path: Path, cameras: Iterable[ModelCamera]) -> None:
     for c in ordered:
         parts.append(struct.pack("<iiQQ", c.camera_id, MODELS[c.model][0], c.width, c.height))
         parts.append(struct.pack(f"<{len(c.params)}d", *c.params))
-    _write(path, parts)
+    write_bytes(path, parts)
 
 
 def _write_images(path: Path, images: Iterable[ModelImage]) -> None:
@@ -354,26 +338,18 @@ def _write_images(path: Path, images: Iterable[ModelImage]) -> None:
         rows = np.empty(len(image.xys), _OBSERVATION)
         rows["xy"], rows["point"] = image.xys, image.point_ids
         parts += [struct.pack("<Q", len(rows)), rows.tobytes()]
-    _write(path, parts)
+    write_bytes(path, parts)
 
 
 def _write_points(path: Path, points: ModelPoints) -> None:
     """Write points3D.bin, in the order given."""
     tracks = np.stack([points.track_image_ids, points.track_point2d], axis=1).astype("<i4")
-    parts = [struct.pack("<Q", len(points.ids))]
-    if not len(tracks):
-        rows = np.zeros(len(points.ids), _POINT_ROW)
-        rows["id"], rows["error"] = points.ids, points.error_px
-        rows["xyz"], rows["rgb"] = points.xyz, points.rgb
-        _write(path, [*parts, rows.tobytes()])
-        return
-    for i in range(len(points.ids)):
-        start, end = points.track_offsets[i], points.track_offsets[i + 1]
-        head = (*points.xyz[i], *(int(v) for v in points.rgb[i]), points.error_px[i], end - start)
-        parts += [_POINT.pack(points.ids[i], *head), tracks[start:end].tobytes()]
-    _write(path, parts)
-
-
-def _write(path: Path, parts: list[bytes]) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(b"".join(parts))
+    rows = np.zeros(len(points.ids), _POINT_ROW)
+    rows["id"], rows["error"], rows["track"] = points.ids, points.error_px, np.diff(points.track_offsets)
+    rows["xyz"], rows["rgb"] = points.xyz, points.rgb
+    parts = [struct.pack("<Q", len(rows)), rows.tobytes()]
+    if len(tracks):
+        size, heads = _POINT_ROW.itemsize, parts.pop()
+        for i, (start, end) in enumerate(pairwise(points.track_offsets)):
+            parts += [heads[i * size : (i + 1) * size], tracks[start:end].tobytes()]
+    write_bytes(path, parts)

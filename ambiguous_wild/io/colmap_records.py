@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ambiguous_wild.core.camera import rigid, rotation_from_quat
 from ambiguous_wild.core.errors import AwError
 
 # name -> (COLMAP's id, number of parameters)
@@ -81,11 +82,15 @@ class ModelImage:
     point_ids: np.ndarray  # [K] int64, -1 = no point
 
     def cam_from_world(self) -> np.ndarray:
-        """Return the rigid transform [4, 4] float64."""
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_from_quaternion(self.qvec)
-        pose[:3, 3] = self.tvec
-        return pose
+        """Return the rigid transform [4, 4] float64.
+
+        Raises:
+            AwError: the quaternion is no rotation.
+        """
+        norm = float(np.linalg.norm(self.qvec))
+        if not np.isfinite(norm) or norm == 0.0:
+            raise AwError(f"pose with the quaternion {self.qvec.tolist()}: the COLMAP model is damaged")
+        return rigid(rotation_from_quat(self.qvec), self.tvec)
 
 
 @dataclass(frozen=True)
@@ -152,21 +157,6 @@ def points_without_tracks(
         np.zeros(count + 1, np.int64),
         none,
         none,
-    )
-
-
-def rotation_from_quaternion(q: np.ndarray) -> np.ndarray:
-    """Return the rotation [3, 3] of the quaternion (w, x, y, z), which is normalised first."""
-    norm = float(np.linalg.norm(q))
-    if not np.isfinite(norm) or norm == 0.0:
-        raise AwError(f"pose with the quaternion {[float(v) for v in q]}: the COLMAP model is damaged")
-    w, x, y, z = np.asarray(q, dtype=np.float64) / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
     )
 
 

@@ -11,17 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io.files import atomic_path
-from ambiguous_wild.io.ply import place_comments
+from ambiguous_wild.io.ply import header_place, place_comments
 from ambiguous_wild.io.splat_arrays import (
     SH_C0,
     Arrays,
-    finite,
+    SplatFile,
     from_largest,
     largest_first,
     logit,
-    morton_order,
-    read_bytes,
     rounded,
     sigmoid,
 )
@@ -37,30 +34,22 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _POSITION_BITS = ((11, 21), (10, 11), (11, 0))  # (bits, shift) of x, y, z
 _COLOUR_BITS = ((8, 24), (8, 16), (8, 8), (8, 0))
 _SQRT_2 = 2.0**0.5
-_MOST_BYTES = 1 << 33
 
 
-def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UNMOVED) -> int:
-    """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
-
-    Args:
-        path: the file, usually NAME.compressed.ply.
-        gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
-        place: place of their scene, written as comments.
-    """
-    kept = finite(gaussians)
-    order = morton_order(kept["means"])
-    kept = {name: value[order] for name, value in kept.items()}
-    n, rest = kept["sh_rest"].shape[:2]
-    colour = kept["sh0"] * SH_C0 + 0.5
-    position, position_bounds = _in_chunks(kept["means"])
-    scale, scale_bounds = _in_chunks(np.clip(kept["log_scales"], -20.0, 20.0))
+def encode_compressed_ply(
+    gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False
+) -> list[bytes]:
+    """Return the parts of the file; the place stands in comments. The format cannot say `antialias`."""
+    n, rest = gaussians["sh_rest"].shape[:2]
+    colour = gaussians["sh0"] * SH_C0 + 0.5
+    position, position_bounds = _in_chunks(gaussians["means"])
+    scale, scale_bounds = _in_chunks(np.clip(gaussians["log_scales"], -20.0, 20.0))
     tint, tint_bounds = _in_chunks(colour)
-    largest, others = largest_first(kept["quats"])
+    largest, others = largest_first(gaussians["quats"])
     rotation = largest.astype(np.int64)
     for component in rounded((others * _SQRT_2 * 0.5 + 0.5) * 1023, 1023).T:
         rotation = (rotation << 10) | component
-    with_alpha = np.column_stack([tint, sigmoid(kept["opacity_logits"])])
+    with_alpha = np.column_stack([tint, sigmoid(gaussians["opacity_logits"])])
     words = [_pack(position, _POSITION_BITS), rotation, _pack(scale, _POSITION_BITS)]
     packed = np.column_stack([*words, _pack(with_alpha, _COLOUR_BITS)]).astype("<u4")
     header = ["ply", "format binary_little_endian 1.0", *place_comments(place)]
@@ -69,23 +58,19 @@ def write_compressed_ply(path: Path | str, gaussians: Arrays, *, place: SceneTra
     header += [f"property uint {name}" for name in _PACKED]
     if rest:
         header += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(3 * rest))]
-    channels = kept["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * rest)
+    channels = gaussians["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * rest)
     codes = np.clip(np.trunc((channels / 8.0 + 0.5) * 256.0), 0, 255).astype(np.uint8)
-    with atomic_path(path) as temporary, open(temporary, "wb") as f:
-        f.write("\n".join([*header, "end_header", ""]).encode("ascii"))
-        f.write(np.hstack([position_bounds, scale_bounds, tint_bounds]).astype("<f4").tobytes())
-        f.write(packed.tobytes())
-        f.write(codes.tobytes())
-    return n
+    bounds = np.hstack([position_bounds, scale_bounds, tint_bounds]).astype("<f4")
+    head = "\n".join([*header, "end_header", ""]).encode("ascii")
+    return [head, bounds.tobytes(), packed.tobytes(), codes.tobytes()]
 
 
-def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
-    """Read the raw parameters of a compressed PLY, float32, as `io.ply.read_splat_ply` does.
+def decode_compressed_ply(data: bytes, path: Path | str) -> SplatFile:
+    """Read a compressed PLY.
 
     Raises:
         AwError: no compressed PLY, or cut short.
     """
-    data = read_bytes(path, _MOST_BYTES)
     end = data.find(b"end_header\n", 0, 64 * 1024)
     lines = [] if end < 0 else [line for line in data[:end].decode("latin-1").splitlines() if line]
     lines = [line for line in lines if not line.startswith("comment")]
@@ -122,7 +107,7 @@ def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
     tint = _unpack(packed[:, 3], _COLOUR_BITS)
     others = np.stack([(packed[:, 1] >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023.0
     colour = _between(tint[:, :3], bounds[of, 4], bounds[of, 5])
-    return {
+    arrays = {
         "means": _between(position, bounds[of, 0], bounds[of, 1]),
         "quats": from_largest(packed[:, 1] >> 30, (others - 0.5) * _SQRT_2).astype(np.float32),
         "log_scales": _between(scale, bounds[of, 2], bounds[of, 3]),
@@ -130,6 +115,7 @@ def read_compressed_ply(path: Path | str) -> dict[str, np.ndarray]:
         "sh0": ((colour - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": (((codes.transpose(0, 2, 1) + 0.5) / 256.0 - 0.5) * 8.0).astype(np.float32),
     }
+    return SplatFile(arrays, header_place(data, path))
 
 
 def _in_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,15 @@
 """Safe writes: files and folders appear complete or not at all, replace only ours, and can be locked.
 
-`place_of` decides for all commands where an output may go: to a new name, over a file, or over a link to one.
-Devices and pipes are written into, everything else is refused. Folder locks let one command at a time work on
-a folder, on every system, through filelock. Scenes, runs and cache entries are identified by the sha256 of
-their files and arrays.
+The policy of all outputs:
+
+1. `check_output`, before the work: the place can be written and does not lie in the input; `new`: it is free.
+   A link's target is written, devices and pipes are written into, everything else is refused (`place_of`).
+2. `check_replaceable`: a folder that is not free is replaced only if a record of ours lists all its files;
+   `refuse_files_there`: a file among the user's is replaced only with --overwrite.
+3. `folder_lock` around the work: one command at a time works on a folder, on every system, through filelock.
+4. `atomic_path`, `atomic_dir` write: complete or not at all. `sweep...` removes what killed commands left.
+
+Scenes, runs and cache entries are identified by the sha256 of their files and arrays.
 """
 
 from __future__ import annotations
@@ -19,7 +25,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,7 +33,7 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, is_full
 
 # Time to try again, for the case that the holder unlinked the file between our open and our lock.
 _TRY_S, _AGAIN_S = 0.05, 0.005
@@ -70,8 +76,9 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
             busy.holder = holder
             raise busy from None
         except OSError as error:
+            advice = "free space" if is_full(error) else "make it writable"
             raise AwError(
-                f"cannot write beside {folder}: {error.strerror}; make it writable, or choose another folder"
+                f"cannot write beside {folder}: {error.strerror}; {advice}, or choose another folder"
             ) from error
         yield
 
@@ -198,10 +205,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb") as f:
             os.fsync(f.fileno())
-        # mkstemp makes private files, but the output is to have the permissions of the user's umask.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
+        share(temporary)
         if into:
             _write_into(temporary, target)
             temporary.unlink()
@@ -214,6 +218,13 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' class for OSError
             raise OSError(int(full[1]), os.strerror(int(full[1])), str(target)) from error
         raise
+
+
+def share(path: Path) -> None:
+    """Give a private temporary file or folder the permissions that the user's umask leaves."""
+    umask = os.umask(0)
+    os.umask(umask)
+    os.chmod(path, (0o777 if path.is_dir() else 0o666) & ~umask)
 
 
 def _write_into(source: Path, target: Path) -> None:
@@ -250,9 +261,7 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
     refuse_file(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.tmp-", dir=target.parent))
-    umask = os.umask(0)
-    os.umask(umask)
-    os.chmod(temporary, 0o777 & ~umask)
+    share(temporary)
     try:
         yield temporary
         if not replace:
@@ -264,16 +273,22 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
                 raise AwError(
                     f"another command made {path} meanwhile; nothing of it is replaced: choose another -o"
                 ) from None
-        elif target.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old-", dir=target.parent))
-            os.replace(target, old / target.name)
-            os.replace(temporary, target)
-            shutil.rmtree(old)
         else:
-            os.replace(temporary, target)
+            replace_folder(temporary, target)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def replace_folder(source: Path, target: Path) -> None:
+    """Rename a folder to `target`, over an older folder."""
+    if not target.exists():
+        os.replace(source, target)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old-", dir=target.parent))
+    os.replace(target, old / target.name)
+    os.replace(source, target)
+    shutil.rmtree(old)
 
 
 def refuse_file(path: Path | str) -> None:
@@ -320,15 +335,26 @@ def sweep_siblings(path: Path | str) -> None:
             shutil.rmtree(left, ignore_errors=True)
 
 
-def check_output(path: Path | str) -> Path:
+def check_output(path: Path | str, *, outside: Mapping[str, Path] | None = None, new: bool = False) -> Path:
     """Check, before long work, that `path` can be written; nothing is made.
+
+    Args:
+        path: the output.
+        outside: folders that the command reads, by name, e.g. ``{"the scene porch": root}``.
+        new: it must not exist, or be an empty folder.
 
     Returns:
         The absolute path that will be written: the target of a link.
 
     Raises:
-        AwError: a parent is a file, the folder is not writable, or `place_of` refuses what is there.
+        AwError: a parent is a file, the folder is not writable, `place_of` refuses what is there, the output
+            lies in a folder of `outside`, or it is not `new`.
     """
+    if new and not is_free(path):
+        raise AwError(f"{path} exists; nothing is overwritten: choose another -o or remove it")
+    for name, folder in (outside or {}).items():
+        if Path(path).resolve().is_relative_to(folder.resolve()):
+            raise AwError(f"{path} lies inside {name} and would change it; choose another -o")
     target, into = place_of(path)
     if into:
         return target
@@ -350,6 +376,26 @@ def list_names(folder: Path) -> list[str]:
     """Files and links below a folder, sorted, as paths relative to it with slashes."""
     files = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     return sorted(path.relative_to(folder).as_posix() for path in files)
+
+
+def is_free(path: Path | str) -> bool:
+    """Tell whether nothing lies at a path, or an empty folder."""
+    return not os.path.exists(path) or (os.path.isdir(path) and not os.listdir(path))
+
+
+def check_replaceable(folder: Path, kind: str, ours: Collection[str] | None) -> None:
+    """Raise AwError unless a folder is free, or holds only files that a command of ours wrote.
+
+    Args:
+        folder: the output.
+        kind: what the command writes, for the message, e.g. ``"package"``.
+        ours: names of the files that its record lists; None = it has no record of ours.
+    """
+    if is_free(folder):
+        return
+    if ours is None:
+        raise AwError(f"{folder} exists and is no {kind}; choose another -o")
+    refuse_foreign_files(folder, ours)
 
 
 def refuse_foreign_files(folder: Path, ours: Collection[str]) -> None:
@@ -395,6 +441,12 @@ def own_json(path: Path) -> dict[str, Any]:
 def is_record(path: Path, key: str) -> bool:
     """Tell whether a file is a JSON object with this key, which shows that a command of ours wrote it."""
     return key in own_json(path)
+
+
+def write_bytes(path: Path | str, parts: Iterable[bytes]) -> None:
+    """Write the parts of a file atomically."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        f.writelines(parts)
 
 
 def write_text(path: Path | str, text: str) -> None:

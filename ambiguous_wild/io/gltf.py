@@ -13,15 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     SH_C0,
     Arrays,
-    finite,
+    SplatFile,
     logit,
     place_facts,
     place_from,
-    read_bytes,
     rounded,
     sigmoid,
 )
@@ -31,7 +29,6 @@ _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # x, y, z, w
-_MOST_BYTES = 1 << 33
 
 
 def _harmonics(rest: int) -> list[str]:
@@ -39,29 +36,26 @@ def _harmonics(rest: int) -> list[str]:
     return [f"SH_DEGREE_{d}_COEF_{c}" for d in range(1, degree + 1) for c in range(2 * d + 1)]
 
 
-def write_gltf(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UNMOVED) -> int:
-    """Write a .glb atomically and return how many Gaussians were written.
+def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
+    """Return the parts of a .glb; the offset of the place is the node's translation.
 
-    Args:
-        path: the file, NAME.glb.
-        gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
-        place: place of their scene; its offset becomes the node's translation.
+    The format cannot say `antialias`.
+
+    Raises:
+        AwError: more than 4 GiB.
     """
-    kept = finite(gaussians)
-    n, rest = kept["sh_rest"].shape[:2]
-    if not n:
-        raise AwError(f"cannot write {path}: no Gaussian is finite, and glTF has no empty meshes")
-    alpha = sigmoid(kept["opacity_logits"])
-    colour = np.column_stack([kept["sh0"] * SH_C0 + 0.5, alpha])
+    n, rest = gaussians["sh_rest"].shape[:2]
+    alpha = sigmoid(gaussians["opacity_logits"])
+    colour = np.column_stack([gaussians["sh0"] * SH_C0 + 0.5, alpha])
     columns = {
-        "POSITION": kept["means"],
+        "POSITION": gaussians["means"],
         "COLOR_0": rounded(colour * 255, 255).astype(np.uint8),  # for viewers without the extension
-        f"{EXTENSION}:ROTATION": kept["quats"][:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": np.exp(kept["log_scales"].astype(np.float64)),
+        f"{EXTENSION}:ROTATION": gaussians["quats"][:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": np.exp(gaussians["log_scales"].astype(np.float64)),
         f"{EXTENSION}:OPACITY": alpha,
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": kept["sh0"],
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": gaussians["sh0"],
     }
-    columns |= {f"{EXTENSION}:{name}": kept["sh_rest"][:, k] for k, name in enumerate(_harmonics(rest))}
+    columns |= {f"{EXTENSION}:{name}": gaussians["sh_rest"][:, k] for k, name in enumerate(_harmonics(rest))}
     views: list[dict[str, int]] = []
     accessors: list[dict[str, object]] = []
     attributes: dict[str, int] = {}
@@ -69,12 +63,8 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: SceneTransform = U
     offset = 0
     for name, values in columns.items():
         data = values if values.dtype == np.uint8 else values.astype("<f4")
-        accessor: dict[str, object] = {
-            "bufferView": len(views),
-            "componentType": _BYTE if data.dtype == np.uint8 else _FLOAT,
-            "count": n,
-            "type": _TYPES[data.shape[1] if data.ndim > 1 else 1],
-        }
+        kind = {"componentType": _BYTE if data.dtype == np.uint8 else _FLOAT, "count": n}
+        accessor = {"bufferView": len(views), **kind, "type": _TYPES[data.shape[1] if data.ndim > 1 else 1]}
         if data.dtype == np.uint8:
             accessor["normalized"] = True
         if name == "POSITION":
@@ -91,6 +81,7 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: SceneTransform = U
         "sortingMethod": "cameraDistance",
         "projection": "perspective",
     }
+    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
     x, y, z = place.centre
     node = {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
     if place.turn != UNMOVED.turn:  # the caller turned the model so that y is up
@@ -105,40 +96,23 @@ def write_gltf(path: Path | str, gaussians: Arrays, *, place: SceneTransform = U
         "buffers": [{"byteLength": len(body)}],
         "bufferViews": views,
         "accessors": accessors,
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
     }
     text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode("ascii")
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + len(body)
     if total >= 1 << 32:
-        raise AwError(f"cannot write {path}: {total:,} bytes, and a .glb has at most 4 GiB; export as spz")
-    with atomic_path(path) as temporary, open(temporary, "wb") as f:
-        f.write(struct.pack("<4sII", b"glTF", 2, total))
-        f.write(struct.pack("<II", len(text), _JSON) + text)
-        f.write(struct.pack("<II", len(body), _BIN) + body)
-    return n
+        raise AwError(f"a .glb holds at most 4 GiB, not {total:,} bytes; export as spz")
+    head_bytes = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<II", len(text), _JSON) + text
+    return [head_bytes, struct.pack("<II", len(body), _BIN), body]
 
 
-def gltf_place(path: Path | str) -> SceneTransform:
-    """Return the place of the scene of a file that `read_gltf` has read."""
-    data = read_bytes(path, _MOST_BYTES)
-    (length,) = struct.unpack_from("<I", data, 12)
-    return place_from(json.loads(data[20 : 20 + length])["asset"].get("extras"))
-
-
-def read_gltf(path: Path | str) -> dict[str, np.ndarray]:
-    """Read the raw parameters of a .glb that `write_gltf` wrote, float32.
+def decode_gltf(data: bytes, path: Path | str) -> SplatFile:
+    """Read a .glb that `encode_gltf` made.
 
     Raises:
-        AwError: no such file, or another layout.
+        AwError: another layout.
     """
-    data = read_bytes(path, _MOST_BYTES)
     try:
         magic, version, _ = struct.unpack_from("<4sII", data)
         length, kind = struct.unpack_from("<II", data, 12)
@@ -159,7 +133,7 @@ def read_gltf(path: Path | str) -> dict[str, np.ndarray]:
         rest = sum(name.startswith(f"{EXTENSION}:SH_DEGREE_") for name in attributes) - 1
         means = column("POSITION")
         higher = [column(f"{EXTENSION}:{name}") for name in _harmonics(rest)]
-        return {
+        arrays = {
             "means": means,
             "quats": column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
             "log_scales": np.log(column(f"{EXTENSION}:SCALE")),
@@ -167,12 +141,13 @@ def read_gltf(path: Path | str) -> dict[str, np.ndarray]:
             "sh0": column(f"{EXTENSION}:SH_DEGREE_0_COEF_0"),
             "sh_rest": np.stack(higher, axis=1) if higher else np.zeros((len(means), 0, 3), np.float32),
         }
+        return SplatFile(arrays, place_from(head["asset"].get("extras")))
     except (
         struct.error,
         ValueError,
-        KeyError,
-        IndexError,
+        LookupError,
         TypeError,
+        AttributeError,
         StopIteration,
         RecursionError,
     ) as error:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.files import write_bytes
 
 # Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
 MAX_PIXELS = 120_000_000
@@ -254,8 +254,7 @@ def write_png(
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
         raise AwError(f"{path}: a PNG takes [H, W] or [H, W, 3], got {list(image.shape)}")
     data = _encode_png(path, image)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, [data])
 
 
 def _encode_png(path: Path | str, image: np.ndarray) -> bytes:

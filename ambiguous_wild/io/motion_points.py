@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.files import atomic_path
 
 FILE = "motion.npz"  # in the scene's folder
+_COLUMNS = {"xy": ("f4", (2,)), "static": ("u1", ()), "moving": ("u1", ()), "motion": ("i2", ())}
 _MOST_BYTES = 1 << 28  # largest unpacked size; a thousand photos have about 2e7
 # Exceptions that numpy and zipfile raise for a damaged file, besides their own.
 _DAMAGE = (ValueError, LookupError, OSError, EOFError, TypeError, AttributeError, RuntimeError, MemoryError,
@@ -39,16 +41,13 @@ class MotionPoints:
 def write_motion_points(path: Path, photos: Mapping[str, MotionPoints]) -> None:
     """Write the points of all photos, by their names in the scene."""
     points = list(photos.values())
+    columns: dict[str, Any] = {
+        name: np.concatenate([np.zeros((0, *shape), dtype), *(getattr(p, name) for p in points)])
+        for name, (dtype, shape) in _COLUMNS.items()
+    }
+    names, counts = np.array(list(photos), dtype=np.str_), np.array([len(p.xy) for p in points], np.int64)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(
-            file,
-            names=np.array(list(photos), dtype=np.str_),
-            counts=np.array([len(p.xy) for p in points], np.int64),
-            xy=np.concatenate([np.zeros((0, 2), np.float32), *(p.xy for p in points)]),
-            static=np.concatenate([np.zeros(0, np.uint8), *(p.static for p in points)]),
-            moving=np.concatenate([np.zeros(0, np.uint8), *(p.moving for p in points)]),
-            motion=np.concatenate([np.zeros(0, np.int16), *(p.motion for p in points)]),
-        )
+        np.savez_compressed(file, names=names, counts=counts, **columns)
 
 
 def read_motion_points(scene: Path) -> dict[str, MotionPoints]:
@@ -73,14 +72,12 @@ def read_motion_points(scene: Path) -> dict[str, MotionPoints]:
 def _read(file: Mapping[str, np.ndarray]) -> dict[str, MotionPoints]:
     names, counts = file["names"], file["counts"]
     total = int(counts.sum())
-    shapes = {"xy": ("f4", (total, 2)), "static": ("u1", (total,)), "moving": ("u1", (total,)),
-              "motion": ("i2", (total,))}  # fmt: skip
-    columns = [file[name] for name in shapes]
+    columns = [file[name] for name in _COLUMNS]
     fit = names.dtype.kind == "U" and counts.dtype == np.int64 and counts.ndim == 1
     fit = fit and names.shape == counts.shape and counts.min(initial=0) >= 0
     fit = fit and len(set(names.tolist())) == len(names)
-    for column, (dtype, shape) in zip(columns, shapes.values()):
-        fit = fit and column.dtype == np.dtype(dtype) and column.shape == shape
+    for column, (dtype, shape) in zip(columns, _COLUMNS.values()):
+        fit = fit and column.dtype == np.dtype(dtype) and column.shape == (total, *shape)
     if not fit or not ((columns[0] >= 0) & (columns[0] <= 1)).all():
         raise ValueError("its arrays do not fit together")
     parts = zip(*(np.split(column, np.cumsum(counts)[:-1]) for column in columns))

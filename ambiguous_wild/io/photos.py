@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
-import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Rational
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ PHOTO_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif", ".dng",
 )  # fmt: skip
 TRANSPARENT = "transparency composited over black"  # its alpha may be a keep mask, see `images.read_alpha`
+Named = Callable[[str], Any]  # OpenImageIO's name of a value -> the value; None if it is absent
 MIN_SIDE = 16  # px; smaller photos have no features
 
 # Diagonal of a 36 x 24 mm frame: "35 mm equivalent" focal lengths refer to it (CIPA DCG-001).
@@ -119,7 +121,7 @@ def read_photo(
     if pixels is None or error:
         raise UnreadablePhoto(source, f"damaged or cut {form} ({_one_line(error) or _NO_REASON})")
     rgb, notes = _to_rgb(source, np.asarray(pixels), spec)
-    exif = exif_from_spec(spec)
+    exif = read_exif(spec.getattribute)
     if exif.orientation != 1:
         notes.append(f"turned upright (EXIF orientation {exif.orientation})")
         rgb = upright(rgb, exif.orientation)
@@ -170,23 +172,31 @@ def _register_heif() -> bool:
 
 
 def _block_exif(raw: object) -> Exif:
-    """Read a bare EXIF block by putting it into a JPEG of one pixel; a damaged block gives an empty Exif."""
-    import OpenImageIO as oiio
+    """Read a bare EXIF block; a damaged block gives an empty Exif."""
+    from PIL.ExifTags import GPSTAGS, IFD, TAGS
 
     if not isinstance(raw, bytes):
         return Exif()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "exif.jpg"
-        try:
-            pillow().new("L", (1, 1)).save(path, exif=raw)
-        except (ValueError, OSError):  # longer than a JPEG can hold
-            return Exif()
-        reader = oiio.ImageInput.open(str(path))
-        try:
-            return exif_from_spec(reader.spec()) if reader is not None else Exif()
-        finally:
-            if reader is not None:
-                reader.close()
+    block = pillow().Exif()
+    try:
+        block.load(raw)
+        tags = {TAGS.get(tag): value for tag, value in {**block, **block.get_ifd(IFD.Exif)}.items()}
+        tags |= {GPSTAGS.get(tag): value for tag, value in block.get_ifd(IFD.GPSInfo).items()}
+    except Exception:  # as in `images.header_size`
+        return Exif()
+
+    def named(name: str) -> Any:
+        """Return a value by OpenImageIO's name, in its types."""
+        value = tags.get(name.removeprefix("Exif:").replace("GPS:", "GPS"))
+        if isinstance(value, tuple):
+            return tuple(float(np.float32(part)) for part in value)
+        if isinstance(value, bytes):
+            return value[0] if len(value) == 1 else None
+        return (
+            float(np.float32(value)) if isinstance(value, Rational) and not isinstance(value, int) else value
+        )
+
+    return read_exif(named)
 
 
 def _misnamed(source: Path, form: str) -> list[str]:
@@ -315,58 +325,58 @@ def _one_line(text: object) -> str:
     return " ".join(str(text).split())[-120:]
 
 
-def exif_from_spec(spec: Any) -> Exif:
-    """Read EXIF from an OpenImageIO ImageSpec; damaged values count as absent."""
-    orientation = _number(spec, "Orientation")
-    balance = _number(spec, "Exif:WhiteBalance")
+def read_exif(named: Named) -> Exif:
+    """Read EXIF from values by OpenImageIO's names; damaged values count as absent."""
+    orientation = _number(named, "Orientation")
+    balance = _number(named, "Exif:WhiteBalance")
     return Exif(
-        make=_text(spec, "Make"),
-        model=_text(spec, "Model"),
-        focal_mm=_positive(spec, "Exif:FocalLength"),
-        focal_35mm=_positive(spec, "Exif:FocalLengthIn35mmFilm"),
-        exposure_s=_positive(spec, "ExposureTime"),
-        f_number=_positive(spec, "FNumber"),
-        iso=_positive(spec, "Exif:PhotographicSensitivity") or _positive(spec, "Exif:ISOSpeedRatings"),
+        make=_text(named, "Make"),
+        model=_text(named, "Model"),
+        focal_mm=_positive(named, "Exif:FocalLength"),
+        focal_35mm=_positive(named, "Exif:FocalLengthIn35mmFilm"),
+        exposure_s=_positive(named, "ExposureTime"),
+        f_number=_positive(named, "FNumber"),
+        iso=_positive(named, "Exif:PhotographicSensitivity") or _positive(named, "Exif:ISOSpeedRatings"),
         white_balance=None if balance is None else int(balance),
         orientation=int(orientation) if orientation is not None and orientation in range(1, 9) else 1,
-        latitude_deg=_degrees(spec, "Latitude", "S", 90.0),
-        longitude_deg=_degrees(spec, "Longitude", "W", 180.0),
-        altitude_m=_altitude(spec),
-        taken_at=_text(spec, "Exif:DateTimeOriginal") or _text(spec, "DateTime"),
+        latitude_deg=_degrees(named, "Latitude", "S", 90.0),
+        longitude_deg=_degrees(named, "Longitude", "W", 180.0),
+        altitude_m=_altitude(named),
+        taken_at=_text(named, "Exif:DateTimeOriginal") or _text(named, "DateTime"),
     )
 
 
-def _text(spec: Any, name: str) -> str | None:
-    value = spec.getattribute(name)
+def _text(named: Named, name: str) -> str | None:
+    value = named(name)
     if not isinstance(value, str):
         return None
     return "".join(c for c in value if c.isprintable()).strip() or None
 
 
-def _number(spec: Any, name: str) -> float | None:
-    value = spec.getattribute(name)
+def _number(named: Named, name: str) -> float | None:
+    value = named(name)
     if isinstance(value, (int, float)) and math.isfinite(value):
         return float(value)
     return None
 
 
-def _positive(spec: Any, name: str) -> float | None:
-    value = _number(spec, name)
+def _positive(named: Named, name: str) -> float | None:
+    value = _number(named, name)
     return value if value is not None and value > 0 else None
 
 
-def _degrees(spec: Any, name: str, negative: str, limit: float) -> float | None:
-    parts = spec.getattribute(f"GPS:{name}")
+def _degrees(named: Named, name: str, negative: str, limit: float) -> float | None:
+    parts = named(f"GPS:{name}")
     if not isinstance(parts, tuple) or len(parts) != 3 or not all(math.isfinite(v) for v in parts):
         return None
     value = parts[0] + parts[1] / 60 + parts[2] / 3600
     if abs(value) > limit or value == 0.0:  # cameras without a GPS fix write 0, 0, 0
         return None
-    return -value if _text(spec, f"GPS:{name}Ref") == negative else value
+    return -value if _text(named, f"GPS:{name}Ref") == negative else value
 
 
-def _altitude(spec: Any) -> float | None:
-    value = _number(spec, "GPS:Altitude")
+def _altitude(named: Named) -> float | None:
+    value = _number(named, "GPS:Altitude")
     if value is None:
         return None
-    return -value if _number(spec, "GPS:AltitudeRef") == 1 else value
+    return -value if _number(named, "GPS:AltitudeRef") == 1 else value

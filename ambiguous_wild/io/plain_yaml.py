@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io import untrusted
 
 LARGEST = 1_000_000  # bytes; our files have a few thousand
 DEEPEST = 50  # nested lists and mappings
@@ -79,13 +80,7 @@ def read_text(path: Path) -> str:
     Raises:
         AwError: it cannot be read, is no UTF-8, or too large.
     """
-    try:
-        if path.stat().st_size > LARGEST:
-            raise AwError(f"{path} is larger than {LARGEST // 10**6} MB, the limit for YAML files")
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise AwError(f"cannot read {path}: {reason}") from error
+    return untrusted.read_text(path, LARGEST)
 
 
 def read_mapping(path: Path) -> dict[Any, Any]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.files import write_bytes
+from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, checked_place
+from ambiguous_wild.io.untrusted import read_bytes
 
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
 _TYPES = {
@@ -31,9 +32,7 @@ def _columns(rest: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def write_splat_ply(
-    path: Path | str, gaussians: Mapping[str, np.ndarray], place: SceneTransform = UNMOVED
-) -> None:
+def write_splat_ply(path: Path | str, gaussians: Arrays, place: SceneTransform = UNMOVED) -> None:
     """Write Gaussians atomically.
 
     If the scene was moved, the file has the units of the scene's files, and a comment in the header gives the
@@ -58,14 +57,19 @@ def write_splat_ply(
     rest = gaussians["sh_rest"]
     if rest.ndim != 3 or rest.shape[0] != n or rest.shape[1] not in (0, 3, 8, 15) or rest.shape[2] != 3:
         raise AwError(f"cannot write {path}: sh_rest is {list(rest.shape)}, not [{n}, 0|3|8|15, 3]")
-    names = _columns(rest.shape[1])
+    write_bytes(path, encode_ply(gaussians, place))
+
+
+def encode_ply(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
+    """Return the parts of a splat PLY, see `write_splat_ply`. The format cannot say `antialias`."""
     gaussians = rescaled(gaussians, 1 / place.scale)
+    n, rest = gaussians["sh_rest"].shape[:2]
     table = np.concatenate(
         [
             gaussians["means"],
             np.zeros((n, 3)),
             gaussians["sh0"],
-            rest.transpose(0, 2, 1).reshape(n, 3 * rest.shape[1]),  # channel by channel
+            gaussians["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * rest),  # channel by channel
             gaussians["opacity_logits"][:, None],
             gaussians["log_scales"],
             gaussians["quats"],
@@ -75,13 +79,11 @@ def write_splat_ply(
         casting="same_kind",
     )
     header = ["ply", "format binary_little_endian 1.0", *place_comments(place), f"element vertex {n}"]
-    header += [f"property float {name}" for name in names] + ["end_header", ""]
-    with atomic_path(path) as temporary, open(temporary, "wb") as f:
-        f.write("\n".join(header).encode("ascii"))
-        f.write(table.tobytes())
+    header += [f"property float {name}" for name in _columns(rest)] + ["end_header", ""]
+    return ["\n".join(header).encode("ascii"), table.tobytes()]
 
 
-def rescaled(gaussians: Mapping[str, np.ndarray], factor: float) -> Mapping[str, np.ndarray]:
+def rescaled(gaussians: Arrays, factor: float) -> Arrays:
     """Return the Gaussians in other units: means and scales times `factor`."""
     if factor == 1.0:
         return gaussians
@@ -105,8 +107,12 @@ def read_place(path: Path | str) -> SceneTransform:
     Raises:
         AwError: the numbers in its comments are invalid.
     """
-    with open(path, "rb") as f:
-        head = f.read(_MAX_HEADER).partition(b"\nend_header")[0]
+    return header_place(_head(path), path)
+
+
+def header_place(data: bytes, path: Path | str) -> SceneTransform:
+    """Return the place as `read_place` does, from the file's bytes."""
+    head = data[:_MAX_HEADER].partition(b"\nend_header")[0]
     words = dict(re.findall(rb"^comment (offset|training_scale|rotation) (.+)$", head, re.MULTILINE))
     if not {b"offset", b"training_scale"} <= words.keys():
         return UNMOVED
@@ -120,22 +126,6 @@ def read_place(path: Path | str) -> SceneTransform:
         raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
 
 
-def checked_place(
-    offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn
-) -> SceneTransform:
-    """Return the place that a file records.
-
-    Raises:
-        ValueError: the numbers are invalid.
-    """
-    (x, y, z), (a, b, c, d) = offset, turn
-    if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(turn)):
-        raise ValueError("invalid place")
-    return SceneTransform(
-        (float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d))
-    )
-
-
 def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
 
@@ -145,8 +135,12 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     Raises:
         AwError: no splat PLY, cut short, missing columns, or harmonics of a degree above 3.
     """
-    path = Path(path)
-    table = _vertices(path)
+    return decode_ply(read_bytes(path), path).gaussians
+
+
+def decode_ply(data: bytes, path: Path | str) -> SplatFile:
+    """Read a splat PLY from its bytes, see `read_splat_ply`."""
+    table, place = _vertices(data, path), header_place(data, path)
     count = len(table)
     present = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in present)
@@ -173,7 +167,12 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
-    return dict(rescaled(arrays, read_place(path).scale))
+    return SplatFile(dict(rescaled(arrays, place.scale)), place)
+
+
+def has_chunks(data: bytes) -> bool:
+    """Tell whether these are the bytes of a compressed PLY."""
+    return data.startswith(b"ply") and b"element chunk" in data[:_MAX_HEADER].partition(b"end_header")[0]
 
 
 def has_splats(path: Path) -> bool:
@@ -182,11 +181,7 @@ def has_splats(path: Path) -> bool:
     Raises:
         AwError: it cannot be read.
     """
-    try:
-        with open(path, "rb") as f:
-            head = f.read(_MAX_HEADER).partition(b"\nend_header")[0]
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    head = _head(path).partition(b"\nend_header")[0]
     splats = re.search(rb"^(property \w+ opacity|element chunk)\b", head, re.MULTILINE)
     return not head.startswith(b"ply") or splats is not None
 
@@ -197,7 +192,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         AwError: unreadable, damaged, or without x, y, z.
     """
-    table = _vertices(path)
+    table = _vertices(read_bytes(path), path)
     names = table.dtype.names or ()
     if not all(axis in names for axis in "xyz"):
         raise AwError(f"{path} has no x, y and z")
@@ -238,41 +233,40 @@ def splat_count(path: Path | str) -> int:
     Raises:
         AwError: no such file, or no splat PLY.
     """
-    path = Path(path)
+    return _header(path, _head(path))[0]
+
+
+def _head(path: Path | str) -> bytes:
     try:
         with open(path, "rb") as f:
-            return _header(path, f.read(_MAX_HEADER))[0]
+            return f.read(_MAX_HEADER)
     except OSError as error:
         raise AwError(f"cannot read {path}: {error.strerror or error}") from None
 
 
-def _vertices(path: Path) -> np.ndarray:
+def _vertices(data: bytes, path: Path | str) -> np.ndarray:
     """Read the rows of the first element: [M], with a field for each property.
 
     Raises:
         AwError: no PLY file, or cut short.
     """
-    try:
-        size = path.stat().st_size
-        with open(path, "rb") as f:
-            count, dtype, start, form = _header(path, f.read(_MAX_HEADER))
-            f.seek(start)
-            if form == "ascii":
-                return _ascii_rows(path, f, count, dtype)
-            if count * dtype.itemsize > size - start:
-                raise AwError(
-                    f"{path} is cut short: {count} vertices of {dtype.itemsize} bytes announced, "
-                    f"{size - start} bytes present; copy or export it again"
-                )
-            return np.frombuffer(f.read(count * dtype.itemsize), dtype, count)
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    count, dtype, start, form = _header(path, data[:_MAX_HEADER])
+    if form == "ascii":
+        return _ascii_rows(path, data[start:], count, dtype)
+    if count * dtype.itemsize > len(data) - start:
+        raise AwError(
+            f"{path} is cut short: {count} vertices of {dtype.itemsize} bytes announced, "
+            f"{len(data) - start} bytes present; copy or export it again"
+        )
+    return np.frombuffer(data, dtype, count, start)
 
 
-def _ascii_rows(path: Path, lines: IO[bytes], count: int, dtype: np.dtype) -> np.ndarray:
+def _ascii_rows(path: Path | str, lines: bytes, count: int, dtype: np.dtype) -> np.ndarray:
     width = len(dtype.names or ())
     try:
-        rows = [[float(v) for v in line.split()[:width]] for line in itertools.islice(lines, count)]
+        rows = [
+            [float(v) for v in line.split()[:width]] for line in itertools.islice(io.BytesIO(lines), count)
+        ]
         values = np.array(rows).reshape(count, width)
     except ValueError as error:
         raise AwError(f"{path} is cut short or damaged; copy it again") from error
@@ -286,7 +280,7 @@ def _ascii_rows(path: Path, lines: IO[bytes], count: int, dtype: np.dtype) -> np
     return table
 
 
-def _header(path: Path, head: bytes) -> tuple[int, np.dtype, int, str]:
+def _header(path: Path | str, head: bytes) -> tuple[int, np.dtype, int, str]:
     """Parse the header: number of vertices, their dtype, offset of the data, and format."""
     if not head.startswith(b"ply"):
         raise AwError(f"{path} is no PLY file: it does not start with 'ply'")

@@ -12,7 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.core.names import check_name
+from ambiguous_wild.core.names import check_name, quoted
 from ambiguous_wild.core.scene import SceneInfo, Split, centred, unlikely
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelImage
@@ -21,6 +21,7 @@ from ambiguous_wild.io.images import image_size
 
 SCENE_SCHEMA = 1  # version of scene.json, raised when an older reader would misread it
 MOST_FACTOR = 1000  # largest downsampling factor; the builder allows 64
+SIDES: tuple[Split, Split] = ("train", "test")
 TEST_EVERY = 8  # in scenes without lists every 8th photo is a test photo, as in 3DGS and gsplat
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
@@ -92,7 +93,8 @@ def load_scene(
         for image in sorted(model.images.values(), key=lambda i: i.name)
         if image.name in split
     )
-    _refuse_same_stems(root, views)
+    for side in SIDES:
+        refuse_same_stems(root, [v.name for v in views if v.split == side])
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
     scene = Scene(root, name, views, _points(model, views), info)
@@ -129,13 +131,13 @@ def _check_fields(path: Path, info: dict[str, object]) -> None:
     factor, name, files = info.get("factor"), info.get("name", ""), info.get("files")
     wrong = []
     if not _is_count(factor) or not 1 <= factor <= MOST_FACTOR:
-        wrong.append(f"factor must be a whole number from 1 to {MOST_FACTOR}, not {_short(factor)}")
+        wrong.append(f"factor must be a whole number from 1 to {MOST_FACTOR}, not {quoted(factor)}")
     if not isinstance(name, str):
-        wrong.append(f"name must be a text, not {_short(name)}")
+        wrong.append(f"name must be a text, not {quoted(name)}")
     if not isinstance(files, dict):
         wrong.append("it lists no files")
     else:
-        odd = [_short(file) for file, entry in files.items() if not _is_file_entry(entry)]
+        odd = [quoted(file) for file, entry in files.items() if not _is_file_entry(entry)]
         wrong += (
             [f"under files, sha256 or bytes is absent or has the wrong type: {shortlist(odd)}"] if odd else []
         )
@@ -150,14 +152,6 @@ def _is_file_entry(entry: Any) -> bool:
 
 def _is_count(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _short(value: Any) -> str:
-    try:
-        text = ascii(value)
-    except ValueError:  # a whole number of thousands of digits
-        text = "a huge number"
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def verify_files(root: Path | str, info: SceneInfo, *, quick: bool = False) -> None:
@@ -185,6 +179,11 @@ def verify_files(root: Path | str, info: SceneInfo, *, quick: bool = False) -> N
             f"{shortlist(wrong)}; restore them, or build the scene again with "
             "'aw build-scene PHOTOS -o SCENE --overwrite'"
         )
+
+
+def without_suffix(name: str) -> str:
+    """Return the name without its last extension."""
+    return str(PurePosixPath(name).with_suffix(""))
 
 
 def read_list(path: Path) -> list[str]:
@@ -280,19 +279,22 @@ def model_folder(root: Path) -> Path:
 def _default_factor(root: Path, info: SceneInfo | None) -> int:
     if info is not None:
         return int(info["factor"])
-    found = _factors(root)
+    found = shipped_factors(root)
     return found[0] if len(found) == 1 and not (root / "images").is_dir() else 1
 
 
-def _factors(root: Path) -> list[int]:
+def shipped_factors(root: Path) -> list[int]:
+    """Return the factors N of the downsampled folders images_N, ascending."""
     tails = (p.name.removeprefix("images_") for p in root.glob("images_*") if p.is_dir())
-    return sorted(int(t) for t in tails if t.isdigit())
+    return sorted(int(t) for t in tails if t.isdigit() and 1 < int(t) <= MOST_FACTOR)
 
 
 def _image_folder(root: Path, factor: int) -> Path:
     folder = root / ("images" if factor == 1 else f"images_{factor}")
     if factor < 1 or not folder.is_dir():
-        have = (["1 (images)"] if (root / "images").is_dir() else []) + [str(f) for f in _factors(root)]
+        have = (["1 (images)"] if (root / "images").is_dir() else []) + [
+            str(f) for f in shipped_factors(root)
+        ]
         raise AwError(
             f"{root} has no images at factor {factor}; it has factor {', '.join(have) or 'none'}; "
             f"pass one of those or build with 'aw build-scene --factor {max(factor, 1)}'"
@@ -310,7 +312,7 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
     if len(present) == 1:
         raise AwError(f"{root} has {present[0].name} but not the other list; write both or neither")
     # Some published scenes list names with their extension, some without.
-    by_stem = {str(PurePosixPath(n).with_suffix("")): n for n in registered}
+    by_stem = {without_suffix(n): n for n in registered}
     in_model = set(registered)
     split: dict[str, Split] = {}
     missing: dict[str, list[str]] = {}
@@ -325,17 +327,16 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
     return split, missing
 
 
-def _refuse_same_stems(root: Path, views: tuple[View, ...]) -> None:
-    """Raise AwError where two photos differ in their extension only: their renders would be one PNG."""
-    seen: dict[tuple[str, str], str] = {}
-    for view in views:
-        key = (view.split, str(PurePosixPath(view.name).with_suffix("")))
-        if key in seen:
+def refuse_same_stems(root: Path, names: Iterable[str]) -> None:
+    """Raise AwError where two photos differ in their extension only: their PNGs would be one file."""
+    seen: dict[str, str] = {}
+    for name in names:
+        other = seen.setdefault(without_suffix(name), name)
+        if other != name:
             raise AwError(
-                f"{root}: photos {seen[key]!r} and {view.name!r} differ in their extension only, so their "
-                "renders would be one file; rename one and build the model again"
+                f"{root}: photos {other!r} and {name!r} differ in their extension only, so their renders "
+                "would be one file; rename one and build the model again"
             )
-        seen[key] = view.name
 
 
 def _view(
@@ -351,8 +352,7 @@ def _view(
             "aspect ratio, so the photo was cropped or turned; use the photos the model was built from"
         )
     camera = Camera(full.width, full.height, fx, fy, cx, cy, image.cam_from_world()).resized(width, height)
-    stem = str(PurePosixPath(image.name).with_suffix(""))
-    keep = root / "masks" / "train" / f"{stem}.png"
+    keep = root / "masks" / "train" / f"{without_suffix(image.name)}.png"
     keep_path = keep if side == "train" and keep.is_file() else mask
     return View(image.name, path, camera, side, keep_path, image.image_id)
 

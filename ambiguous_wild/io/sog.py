@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,17 +17,15 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.images import decode
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
-    finite,
+    SplatFile,
     from_largest,
     largest_first,
     logit,
-    morton_order,
     place_facts,
     place_from,
-    read_bytes,
     rounded,
     sigmoid,
 )
@@ -37,33 +36,26 @@ _ROUNDS = 20  # rounds of Lloyd's algorithm
 _BINS = 1 << 14
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # fixed time of files in the archive: the same model gives the same bytes
 _ROW = 64  # palette entries in a row of their texture
-_MOST_BYTES, _MOST_TEXTURE = 1 << 32, 1 << 28
+_MOST_TEXTURE = 1 << 28
 _LOSSLESS = 101  # WebP quality above 100
 
 
-def write_sog(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UNMOVED) -> int:
-    """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
+def encode_sog(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
+    """Return the file; the place stands in meta.json. The format cannot say `antialias`.
 
-    Args:
-        path: the file, NAME.sog.
-        gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
-        place: place of their scene, written to meta.json.
+    Raises:
+        AwError: more Gaussians than a texture holds.
     """
-    kept = finite(gaussians)
-    order = morton_order(kept["means"])
-    kept = {name: value[order] for name, value in kept.items()}
-    n, rest = kept["sh_rest"].shape[:2]
-    if not n:
-        raise AwError(f"cannot write {path}: no Gaussian is finite")
+    n, rest = gaussians["sh_rest"].shape[:2]
     shape = _texture_shape(n)
-    log_means = np.sign(kept["means"]) * np.log1p(np.abs(kept["means"].astype(np.float64)))
+    log_means = np.sign(gaussians["means"]) * np.log1p(np.abs(gaussians["means"].astype(np.float64)))
     low, high = log_means.min(axis=0), log_means.max(axis=0)
     fixed = rounded((log_means - low) / np.where(high > low, high - low, 1.0) * 65535, 65535)
-    scales, scale_codes = _codebook(kept["log_scales"])
-    tints, tint_codes = _codebook(kept["sh0"])
-    largest, others = largest_first(kept["quats"])
+    scales, scale_codes = _codebook(gaussians["log_scales"])
+    tints, tint_codes = _codebook(gaussians["sh0"])
+    largest, others = largest_first(gaussians["quats"])
     turned = rounded((others * 2.0**0.5 * 0.5 + 0.5) * 255, 255)
-    alpha = rounded(sigmoid(kept["opacity_logits"]) * 255, 255)
+    alpha = rounded(sigmoid(gaussians["opacity_logits"]) * 255, 255)
     textures = {
         "means_l.webp": _texture(fixed & 255, shape),
         "means_u.webp": _texture(fixed >> 8, shape),
@@ -81,7 +73,7 @@ def write_sog(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UN
         "sh0": {"codebook": tints.tolist(), "files": ["sh0.webp"]},
     }
     if rest:
-        palette, labels = _palette(kept["sh_rest"].reshape(n, 3 * rest))
+        palette, labels = _palette(gaussians["sh_rest"].reshape(n, 3 * rest))
         values, codes = _codebook(palette)
         rows = -(-len(palette) // _ROW)
         pixels = codes.reshape(len(palette) * rest, 3)
@@ -94,33 +86,36 @@ def write_sog(path: Path | str, gaussians: Arrays, *, place: SceneTransform = UN
             "codebook": values.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
         for name, texture in textures.items():
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), _webp(texture))
         archive.writestr(zipfile.ZipInfo("meta.json", _EPOCH), json.dumps(meta, allow_nan=False))
-    return n
+    return [file.getvalue()]
 
 
-def read_sog(path: Path | str) -> dict[str, np.ndarray]:
-    """Read the raw parameters of a SOG file of version 2, float32.
+def decode_sog(data: bytes, path: Path | str) -> SplatFile:
+    """Read a SOG file of version 2.
 
     Raises:
         AwError: no SOG of version 2, or damaged.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(path, _MOST_BYTES))) as archive:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
             meta = json.loads(_member(archive, "meta.json"))
             if meta["version"] != 2:
                 raise AwError(f"{path} is SOG of version {meta['version']!r}; this reads version 2")
-            return _decode(archive, meta)
-    except (zipfile.BadZipFile, KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
+            return SplatFile(_decode(archive, meta), place_from(meta.get("asset")))
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        LookupError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:
         raise AwError(f"{path} is no SOG of version 2, or damaged: {error}") from None
-
-
-def sog_place(path: Path | str) -> SceneTransform:
-    """Return the place of the scene of a file that `read_sog` has read."""
-    with zipfile.ZipFile(path) as archive:
-        return place_from(json.loads(_member(archive, "meta.json")).get("asset"))
 
 
 def _decode(archive: zipfile.ZipFile, meta: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -225,7 +220,7 @@ def _webp(image: np.ndarray) -> bytes:
 def _read_webp(data: bytes) -> np.ndarray:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    image = decode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED, "a texture")
     if image is None or image.ndim != 3:
         raise ValueError("a texture is no WebP image in colour")
     if image.shape[2] == 3:

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io.ply import checked_place
+from ambiguous_wild.core import UNMOVED, SceneTransform
 
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 _MOST_LOGIT = 15.0  # its sigmoid is 3e-7 below 1; formats that store alpha cannot hold an infinite logit
+
+
+@dataclass(frozen=True)
+class SplatFile:
+    """Content of a splat file."""
+
+    gaussians: dict[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
+    place: SceneTransform = UNMOVED  # place of the scene in whose coordinates they are
+    antialias: bool = False  # whether the file says that it is drawn with Mip-Splatting's filter
+    left_out: int = 0  # number of Gaussians with values that are not finite
 
 
 def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
@@ -94,19 +103,20 @@ def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats
 
 
-def read_bytes(path: Path | str, most: int) -> bytes:
-    """Read a whole file.
+def checked_place(
+    offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn
+) -> SceneTransform:
+    """Return the place that a file records.
 
     Raises:
-        AwError: it cannot be read, or has more than `most` bytes.
+        ValueError: the numbers are invalid.
     """
-    path = Path(path)
-    try:
-        if path.stat().st_size > most:
-            raise AwError(f"{path} has {path.stat().st_size:,} bytes, more than a model can have")
-        return path.read_bytes()
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
+    (x, y, z), (a, b, c, d) = offset, turn
+    if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(turn)):
+        raise ValueError("invalid place")
+    return SceneTransform(
+        (float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d))
+    )
 
 
 def place_facts(place: SceneTransform) -> dict[str, float | list[float]]:

@@ -1,58 +1,112 @@
-"""Read any splat file: its first bytes tell the format, whatever its name."""
+"""The formats of splat files, one record each; read any of them by its first bytes, write one by its name."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io import compressed_ply, gltf, sog, spz
-from ambiguous_wild.io.ply import read_place, read_splat_ply
-from ambiguous_wild.io.splat_arrays import finite, read_bytes
-
-_HEADER = 64 * 1024
-_MOST_BYTES = 1 << 33
+from ambiguous_wild.io.compressed_ply import decode_compressed_ply, encode_compressed_ply
+from ambiguous_wild.io.files import write_bytes
+from ambiguous_wild.io.gltf import decode_gltf, encode_gltf
+from ambiguous_wild.io.ply import decode_ply, encode_ply, has_chunks
+from ambiguous_wild.io.sog import decode_sog, encode_sog
+from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite, morton_order
+from ambiguous_wild.io.spz import decode_spz, encode_spz
+from ambiguous_wild.io.untrusted import read_bytes
 
 
 @dataclass(frozen=True)
-class SplatFile:
-    """The Gaussians of a file whose values are all finite, at least one."""
+class SplatFormat:
+    """One format of splat files, and what its files cannot hold."""
 
-    gaussians: dict[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
-    place: SceneTransform  # place of the scene in whose coordinates they are
-    antialias: bool  # whether the file says that it is drawn with Mip-Splatting's filter
-    left_out: int  # number of Gaussians with values that are not finite
+    name: str  # of `aw export --format`
+    suffix: str
+    starts: Callable[[bytes], bool]  # whether a file with these bytes is of this format
+    # bytes and name of a file -> its content; AwError with the name if it is damaged
+    decode: Callable[[bytes, Path], SplatFile]
+    # finite Gaussians, the place of their scene, whether Mip-Splatting's filter draws them -> parts of a file
+    encode: Callable[[Arrays, SceneTransform, bool], list[bytes]]
+    ordered: bool = True  # Gaussians are written in the order of a Morton curve
+    # whether it holds the sizes of a scene whose unit is 1/x of the unit of training
+    holds_units: Callable[[float], bool] = lambda scale: True
+    y_up: bool = False  # y points up in every file, and a node of it states the place
+
+
+def _magic(*magic: bytes) -> Callable[[bytes], bool]:
+    return lambda data: data.startswith(magic)
+
+
+_ALL = (
+    SplatFormat(
+        "compressed-ply", ".compressed.ply", has_chunks, decode_compressed_ply, encode_compressed_ply
+    ),
+    # SPZ's scales have a fixed range; SOG's positions are logarithms
+    SplatFormat(
+        "spz",
+        ".spz",
+        _magic(b"NGSP", b"\x1f\x8b"),
+        decode_spz,
+        encode_spz,
+        holds_units=lambda scale: False,
+    ),
+    SplatFormat("sog", ".sog", _magic(b"PK"), decode_sog, encode_sog, holds_units=lambda scale: scale >= 1),
+    SplatFormat("gltf", ".glb", _magic(b"glTF"), decode_gltf, encode_gltf, ordered=False, y_up=True),
+    SplatFormat("ply", ".ply", _magic(b"ply"), decode_ply, encode_ply, ordered=False),
+)
+FORMATS = {form.name: form for form in _ALL}
 
 
 def read_splats(path: Path) -> SplatFile:
-    """Read a splat PLY, a compressed PLY, SPZ, SOG, or a glTF of 'aw export'.
+    """Read the Gaussians of a file in one of `FORMATS` whose values are all finite, at least one.
 
     Raises:
         AwError: no such file, another format, damaged, or no Gaussian is finite.
     """
-    try:
-        with open(path, "rb") as f:
-            head = f.read(_HEADER)
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
-    antialias, place = False, UNMOVED
-    if head[:3] == b"ply":
-        chunks = b"element chunk" in head.partition(b"end_header")[0]
-        arrays = compressed_ply.read_compressed_ply(path) if chunks else read_splat_ply(path)
-        place = read_place(path)
-    elif head[:4] == b"NGSP" or head[:2] == b"\x1f\x8b":
-        data = read_bytes(path, _MOST_BYTES)
-        arrays = spz.spz_arrays(data, path)
-        antialias, place = spz.spz_facts(data)
-    elif head[:2] == b"PK":
-        arrays, place = sog.read_sog(path), sog.sog_place(path)
-    elif head[:4] == b"glTF":
-        arrays, place = gltf.read_gltf(path), gltf.gltf_place(path)
-    else:
-        raise AwError(f"{path} is no splat file: PLY (compressed too), SPZ, SOG and .glb are read")
-    kept = finite(arrays)
+    data = read_bytes(path)
+    form = next((form for form in FORMATS.values() if form.starts(data)), None)
+    if form is None:
+        raise AwError(f"{path} is no splat file: {', '.join(f.suffix for f in FORMATS.values())} are read")
+    splats = form.decode(data, path)
+    kept = finite(splats.gaussians)
     if not len(kept["means"]):
         raise AwError(f"{path} holds no Gaussian that is finite")
-    return SplatFile(kept, place, antialias, len(arrays["means"]) - len(kept["means"]))
+    return replace(splats, gaussians=kept, left_out=len(splats.gaussians["means"]) - len(kept["means"]))
+
+
+def drawable(form: SplatFormat, gaussians: Arrays) -> dict[str, np.ndarray]:
+    """Return the Gaussians that are finite, in the order in which the format writes them."""
+    kept = finite(gaussians)
+    if not form.ordered:
+        return kept
+    order = morton_order(kept["means"])
+    return {name: value[order] for name, value in kept.items()}
+
+
+def write_splats(
+    form: SplatFormat,
+    path: Path | str,
+    gaussians: Arrays,
+    place: SceneTransform = UNMOVED,
+    antialias: bool = False,
+) -> int:
+    """Write the Gaussians that are finite atomically, and return their number.
+
+    Args:
+        form: one of `FORMATS`.
+        path: the file.
+        gaussians: raw parameters, see `io.ply.write_splat_ply`.
+        place: place of their scene, which the file records.
+        antialias: Mip-Splatting's 2D filter draws them; recorded where the format can.
+
+    Raises:
+        AwError: no Gaussian is finite, or the format cannot hold them.
+    """
+    kept = drawable(form, gaussians)
+    if not len(kept["means"]):
+        raise AwError(f"cannot write {path}: no Gaussian is finite")
+    write_bytes(path, form.encode(kept, place, antialias))
+    return len(kept["means"])

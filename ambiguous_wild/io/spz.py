@@ -17,17 +17,14 @@ import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.core.errors import install_command
-from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.splat_arrays import (
     Arrays,
-    finite,
+    SplatFile,
     from_largest,
     largest_first,
     logit,
-    morton_order,
     place_facts,
     place_from,
-    read_bytes,
     rounded,
     sigmoid,
 )
@@ -39,87 +36,53 @@ _VERSION, _ANTIALIASED = 3, 1
 _FINEST = 18  # fractional bits: 4 micrometres where a unit is a metre
 _COLOUR = 0.15  # codes cover coefficients of +-3.3
 _REST = (0, 3, 8, 15)  # coefficients beyond the constant one, by degree
-_MOST_BYTES = 1 << 32
 FLIP = np.array([1.0, -1.0, -1.0], np.float32)  # signs that turn positions from a PLY's axes to the file's
 # Sign that each harmonic takes when y and z change sign.
 SH_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
-def write_spz(
-    path: Path | str, gaussians: Arrays, *, antialias: bool = False, place: SceneTransform = UNMOVED
-) -> int:
-    """Write Gaussians atomically, in the order of a Morton curve, and return how many were written.
-
-    Args:
-        path: the file, NAME.spz.
-        gaussians: raw parameters, see `io.ply.write_splat_ply`; rows that are not finite are left out.
-        antialias: the model is drawn with Mip-Splatting's 2D filter; a flag in the file.
-        place: place of their scene, written as the comment of the gzip stream.
+def encode_spz(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
+    """Return the parts of the file; the place is the comment of the gzip stream, `antialias` a flag.
 
     Raises:
         AwError: positions of more than 8 million units.
     """
-    with atomic_path(path) as temporary:
-        data, count = spz_bytes(gaussians, antialias=antialias)
-        if comment := json.dumps(place_facts(place)) if place != UNMOVED else "":
-            # Set the flag of a comment, which follows the 10 bytes of a gzip header.
-            data = data[:3] + b"\x10" + data[4:10] + comment.encode("ascii") + b"\0" + data[10:]
-        temporary.write_bytes(data)
-    return count
-
-
-def spz_bytes(gaussians: Arrays, *, antialias: bool = False) -> tuple[bytes, int]:
-    """Return the file's bytes and how many Gaussians it holds; see `write_spz`."""
-    kept = finite(gaussians)
-    order = morton_order(kept["means"])
-    kept = {name: value[order] for name, value in kept.items()}
-    n, rest = kept["sh_rest"].shape[:2]
-    furthest = float(np.abs(kept["means"]).max(initial=1e-6))
+    n, rest = gaussians["sh_rest"].shape[:2]
+    furthest = float(np.abs(gaussians["means"]).max(initial=1e-6))
     bits = min(_FINEST, int(np.floor(23 - np.log2(furthest) - 1e-9)))
     if bits < 0:
         raise AwError(f"SPZ holds positions of at most 8 388 607 units; one lies at {furthest:.3g}")
-    fixed = np.rint(kept["means"].astype(np.float64) * FLIP * (1 << bits)).astype(np.int64)
+    fixed = np.rint(gaussians["means"].astype(np.float64) * FLIP * (1 << bits)).astype(np.int64)
     fixed = np.clip(fixed, -(1 << 23), (1 << 23) - 1).astype("<i4")
     head = _HEADER.pack(_MAGIC, _VERSION, n, _REST.index(rest), bits, _ANTIALIASED if antialias else 0, 0)
     parts = [
         head,
         np.ascontiguousarray(fixed.view(np.uint8).reshape(n, 3, 4)[:, :, :3]).tobytes(),
-        rounded(sigmoid(kept["opacity_logits"]) * 255, 255).astype(np.uint8).tobytes(),
-        rounded(kept["sh0"] * (_COLOUR * 255) + 0.5 * 255, 255).astype(np.uint8).tobytes(),
-        rounded((kept["log_scales"] + 10) * 16, 255).astype(np.uint8).tobytes(),
-        _pack_quats(kept["quats"]).tobytes(),
-        _pack_harmonics(kept["sh_rest"]).tobytes(),
+        rounded(sigmoid(gaussians["opacity_logits"]) * 255, 255).astype(np.uint8).tobytes(),
+        rounded(gaussians["sh0"] * (_COLOUR * 255) + 0.5 * 255, 255).astype(np.uint8).tobytes(),
+        rounded((gaussians["log_scales"] + 10) * 16, 255).astype(np.uint8).tobytes(),
+        _pack_quats(gaussians["quats"]).tobytes(),
+        _pack_harmonics(gaussians["sh_rest"]).tobytes(),
     ]
-    return gzip.compress(b"".join(parts), 9, mtime=0), n
+    packed = gzip.compress(b"".join(parts), 9, mtime=0)
+    if place == UNMOVED:
+        return [packed]
+    comment = json.dumps(place_facts(place)).encode("ascii")
+    # Set the flag of a comment, which follows the 10 bytes of a gzip header.
+    return [packed[:3], b"\x10", packed[4:10], comment, b"\0", packed[10:]]
 
 
-def read_spz(path: Path | str) -> dict[str, np.ndarray]:
-    """Read the raw parameters of an SPZ file of version 2 to 4, float32, in a PLY's axes.
+def decode_spz(packed: bytes, path: Path | str) -> SplatFile:
+    """Read an SPZ file of version 2 to 4, in a PLY's axes.
 
     Raises:
         AwError: no SPZ, another version, damaged, or version 4 without the package zstandard.
     """
-    return spz_arrays(read_bytes(path, _MOST_BYTES), path)
-
-
-def spz_facts(packed: bytes) -> tuple[bool, SceneTransform]:
-    """Tell whether an SPZ model is drawn with Mip-Splatting's filter, and return the place of its scene."""
-    zipped = packed[:4] != _FOURTH
-    head = zlib.decompressobj(wbits=31).decompress(packed, _HEADER.size) if zipped else packed
-    comment = packed[10 : packed.find(b"\0", 10)] if zipped and packed[3] == 0x10 else b"0"
-    try:
-        return bool(head[14] & _ANTIALIASED), place_from(json.loads(comment))
-    except (ValueError, RecursionError):  # another program wrote the comment
-        return bool(head[14] & _ANTIALIASED), UNMOVED
-
-
-def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
-    """Read the raw parameters from the bytes of an SPZ file, as `read_spz` does; errors name `path`."""
     inflater = zlib.decompressobj(wbits=31)
     zipped = packed[:4] != _FOURTH
     try:
         head = inflater.decompress(packed, _HEADER.size) if zipped else packed[: _HEADER.size]
-        magic, version, n, degree, bits, _, streams = _HEADER.unpack(head)
+        magic, version, n, degree, bits, flags, streams = _HEADER.unpack(head)
         if magic != _MAGIC or version not in ((2, 3) if zipped else (4,)) or degree > 3 or bits > 24:
             raise AwError(f"{path} is no SPZ of version 2, 3 or 4 with harmonics of degree 0 to 3")
         rest = _REST[degree]
@@ -147,7 +110,7 @@ def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
     fixed = low.reshape(n, 12).view("<i4") >> 8  # the sign is that of the highest byte
     alpha, colour, scale = take(1)[:, 0], take(3), take(3)
     quats, harmonics = take(turned), take(3 * rest).reshape(n, rest, 3)
-    return {
+    arrays = {
         "means": (fixed / float(1 << bits) * FLIP).astype(np.float32),
         "quats": _unpack_quats(quats.copy().view("<u4")[:, 0].astype(np.int64))
         if turned == 4
@@ -157,6 +120,12 @@ def spz_arrays(packed: bytes, path: Path | str) -> dict[str, np.ndarray]:
         "sh0": ((colour / 255.0 - 0.5) / _COLOUR).astype(np.float32),
         "sh_rest": ((harmonics - 128.0) / 128.0 * SH_FLIP[:rest, None]).astype(np.float32),
     }
+    comment = packed[10 : packed.find(b"\0", 10)] if zipped and packed[3] == 0x10 else b"0"
+    try:
+        place = place_from(json.loads(comment))
+    except (ValueError, RecursionError):  # another program wrote the comment
+        place = UNMOVED
+    return SplatFile(arrays, place, bool(flags & _ANTIALIASED))
 
 
 def _unpacked(packed: bytes, streams: int, sizes: Sequence[int], path: Path | str) -> bytes:

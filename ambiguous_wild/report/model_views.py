@@ -16,9 +16,10 @@ from ambiguous_wild.harness.trained_models import find_models, open_scene, read_
 from ambiguous_wild.io.files import check_output, refuse_files_there
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.splat_files import FORMATS
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import FORMATS, ExportedModel, export, space_of
+from ambiguous_wild.viewing.model import ExportedModel, export, space_of
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -54,7 +55,7 @@ def export_runs(
 
     Args:
         paths: run folders, folders of runs, or splat files.
-        formats: names in `viewing.model.FORMATS`.
+        formats: names in `io.splat_files.FORMATS`.
         output: folder for all files, named after the models' labels; None = RUN/export, or beside a file.
         loss: render the test views to measure the loss by rounding; without scene or test views only sizes
             are reported.
@@ -88,7 +89,7 @@ def export_runs(
         check_output(folder / "file")
     if not overwrite:  # files in RUN/export are replaced anyway
         for folder, name in list(zip(folders, names))[len(trained) if output is None else 0 :]:
-            wanted = [name + FORMATS[form][0] for form in formats if form in FORMATS]
+            wanted = [name + FORMATS[form].suffix for form in formats if form in FORMATS]
             refuse_files_there(folder, wanted, "--overwrite")
     if loss:
         prepare_cpu(threads, say)

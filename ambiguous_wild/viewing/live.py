@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.core.camera import pose_at, rotation_from_quat
 from ambiguous_wild.core.errors import install_command
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
 from ambiguous_wild.io.page_parts import narrowed
@@ -226,8 +227,6 @@ class LiveView:
 
 def _camera_of(seen: Any) -> Camera | None:
     """Convert a browser's camera to ours; None if the browser has not sent it yet."""
-    from scipy.spatial.transform import Rotation
-
     wxyz, fov, aspect = np.asarray(seen.wxyz, np.float64), float(seen.fov), float(seen.aspect)
     size = np.linalg.norm(wxyz)
     position = np.asarray(seen.position, np.float64)
@@ -239,13 +238,12 @@ def _camera_of(seen: Any) -> Camera | None:
         and 0.05 < aspect < 20
     ):
         return None
-    to_world = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = to_world.T, -to_world.T @ position
     height = max(16, min(_WIDTH, round(_WIDTH / aspect)))
     width = max(16, round(height * aspect))
     focal = height / 2 / math.tan(fov / 2)
-    return Camera(width, height, focal, focal, width / 2, height / 2, pose)
+    return Camera(
+        width, height, focal, focal, width / 2, height / 2, pose_at(position, rotation_from_quat(wxyz).T)
+    )
 
 
 def _free_port(host: str, port: int) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +13,12 @@ import numpy as np
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, SceneTransform, View
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.scene import together
-from ambiguous_wild.io import compressed_ply, gltf, sog, spz
 from ambiguous_wild.io.files import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
-from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count, write_splat_ply
-from ambiguous_wild.io.splat_arrays import finite
-from ambiguous_wild.io.splat_files import SplatFile, read_splats
+from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
+from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite
+from ambiguous_wild.io.splat_files import FORMATS, read_splats, write_splats
+from ambiguous_wild.io.untrusted import read_bytes
 from ambiguous_wild.metrics.image import psnr
 
 if TYPE_CHECKING:
@@ -28,13 +28,6 @@ AXES = {
     sign + axis: (-1.0 if sign else 1.0) * row for sign in ("", "-") for axis, row in zip("xyz", np.eye(3))
 }
 _FLOOR = 0.02  # share of the Gaussians around the middle that lie below the floor
-FORMATS: Mapping[str, tuple[str, Callable[[Path], dict[str, np.ndarray]]]] = {
-    "ply": (".ply", read_splat_ply),
-    "compressed-ply": (".compressed.ply", compressed_ply.read_compressed_ply),
-    "spz": (".spz", spz.read_spz),
-    "sog": (".sog", sog.read_sog),
-    "gltf": (".glb", gltf.read_gltf),
-}
 
 
 @dataclass(frozen=True)
@@ -55,7 +48,7 @@ def space_of(scene: Scene) -> Space:
     size = np.linalg.norm(up)
     up = up / size if size > 1e-6 else -poses[0, 1, :3]
     centers = np.array([v.camera.center for v in views])
-    depths = np.array([_median_depth(pose, scene.points.xyz) for pose in poses])
+    depths = np.array([_median_depth(v.camera, scene.points.xyz) for v in views])
     finite = np.isfinite(depths)
     depths = np.where(finite, depths, np.median(depths[finite]) if finite.any() else scene.extent)
     middle = (centers + poses[:, 2, :3] * depths[:, None]).mean(axis=0)
@@ -63,16 +56,13 @@ def space_of(scene: Scene) -> Space:
     return Space(up=up, middle=middle, distance=max(distance, 1e-6), extent=scene.extent)
 
 
-def _median_depth(pose: np.ndarray, points: np.ndarray) -> float:
+def _median_depth(camera: Camera, points: np.ndarray) -> float:
     """Return the median depth of points within 45 degrees of the view's axis; NaN without points."""
     if not len(points):
         return np.nan
-    seen = points @ pose[:3, :3].T + pose[:3, 3]
+    seen = camera.to_camera(points)
     ahead = (seen[:, 2] > 0) & (np.linalg.norm(seen[:, :2], axis=1) < seen[:, 2])
     return float(np.median(seen[ahead, 2])) if ahead.any() else np.nan
-
-
-Arrays = Mapping[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
 
 
 @dataclass(frozen=True)
@@ -280,7 +270,7 @@ def export(
     Args:
         model: the model; its PLY is not changed.
         folder: created if it does not exist.
-        formats: some of `FORMATS`.
+        formats: names of `io.splat_files.FORMATS`.
         views: views to measure the loss on, usually the test views; none = only sizes.
         name: name of the files, without extension.
         space: of the scene, needed with `up`.
@@ -295,31 +285,31 @@ def export(
             raise unknown("format", wanted, FORMATS)
     gaussians: Arrays = model.read()
     place = model.place
+    if not len(finite(gaussians)["means"]):
+        raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
     plain = model.ply.stat().st_size
     photos = [read_png_rgb(view.image_path) for view in views]
     before = _renders(gaussians, model.render_settings, views)
     exported = []
-    for wanted in dict.fromkeys(formats):
+    for form in (FORMATS[wanted] for wanted in dict.fromkeys(formats)):
         if up is not None and space is not None:
-            place = upright(model, space, "y" if wanted == "gltf" else up)
+            place = upright(model, space, "y" if form.y_up else up)
             gaussians = moved(model.read(), model.place, place)
-        ending, read = FORMATS[wanted]
-        path = folder / f"{name}{ending}"
+        path = folder / f"{name}{form.suffix}"
         sweep_killed(path)
-        units = place.scale
-        if wanted == "spz" or (wanted == "sog" and units < 1):
-            units = 1.0
+        units = place.scale if form.holds_units(place.scale) else 1.0
         left = replace(place, scale=place.scale / units)
-        count = _write(wanted, path, rescaled(gaussians, 1 / units), model.render_settings, left)
-        if not count:
-            raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
-        there = moved(rescaled(read(path), units), place, model.place)
+        count = write_splats(
+            form, path, rescaled(gaussians, 1 / units), left, model.render_settings.antialias
+        )
+        read_back = form.decode(read_bytes(path), path).gaussians
+        there = moved(rescaled(read_back, units), place, model.place)
         after = _renders(there, model.render_settings, views)
         old, new = _mean(before, photos), _mean(after, photos)
         size = path.stat().st_size
         exported.append(
             ExportedModel(
-                format=wanted,
+                format=form.name,
                 path=path,
                 bytes=size,
                 share=size / plain,
@@ -327,29 +317,11 @@ def export(
                 psnr_to_model=_mean(after, before),
                 psnr=new,
                 lost_db=None if old is None or new is None else old - new,
-                place=UNMOVED if wanted == "gltf" and up is None else left,
+                place=UNMOVED if form.y_up and up is None else left,
                 source="the PLY" if model.ply.suffix == ".ply" else model.ply.name,
             )
         )
     return exported
-
-
-def _write(
-    wanted: str, path: Path, gaussians: Arrays, render_settings: RenderSettings, place: SceneTransform
-) -> int:
-    if wanted == "spz":
-        return spz.write_spz(path, gaussians, antialias=render_settings.antialias, place=place)
-    if wanted == "ply":
-        kept = finite(gaussians)
-        if len(kept["means"]):
-            write_splat_ply(path, kept, place)
-        return len(kept["means"])
-    write = {
-        "compressed-ply": compressed_ply.write_compressed_ply,
-        "sog": sog.write_sog,
-        "gltf": gltf.write_gltf,
-    }
-    return write[wanted](path, gaussians, place=place)
 
 
 def _renders(

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.io.files import check_output, refuse_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.splat_arrays import finite, sigmoid
-from ambiguous_wild.io.spz import spz_arrays, spz_bytes
+from ambiguous_wild.io.splat_files import FORMATS, drawable
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
@@ -29,6 +29,7 @@ MOST_PHOTO_BYTES = 1_000_000  # text of all photos and of the map
 MOST_MAP_BYTES = 200_000
 MOST_POINTS = 20_000  # moving and static features of all photos
 MOST_MASK_BYTES = 300_000  # text of the masks of all models
+_SPZ = FORMATS["spz"]  # the format that the page's renderer reads
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
 WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
@@ -104,7 +105,7 @@ def page_text(
                 f"{model.label}: reduced from {given:,} to {shown:,} Gaussians for this page; "
                 "its PSNR is that of the whole model"
             )
-        packed, _ = spz_bytes(fewer, antialias=model.render_settings.antialias)
+        packed = b"".join(_SPZ.encode(drawable(_SPZ, fewer), UNMOVED, model.render_settings.antialias))
         page_notes += [cost] if (cost := _rounding_cost(model, fewer, packed, cameras[0])) else []
         element = f"model-{number}"
         elements.append(
@@ -140,7 +141,7 @@ def _rounding_cost(
 ) -> str:
     """Return a note on the loss of a model with sizes that the page's format cannot hold; else ""."""
     sizes = np.exp(gaussians["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
-    stored = spz_arrays(packed, model.ply)
+    stored = _SPZ.decode(packed, model.ply).gaussians
     held = np.exp(stored["log_scales"].max(axis=1, initial=-np.inf).astype(np.float64))
     if not len(sizes) or (sizes.max() < 1.1 * held.max() and np.median(sizes) > 0.9 * np.median(held)):
         return ""
@@ -298,7 +299,7 @@ def importance(gaussians: Mapping[str, np.ndarray], cameras: Sequence[Camera]) -
     area = np.pi * scales[:, 1] * scales[:, 2]  # ellipse of the two longest axes, world units squared
     total = np.zeros(len(means))
     for camera in cameras:
-        seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        seen = camera.to_camera(means)
         depth = np.where(seen[:, 2] > _NEAR, seen[:, 2], np.inf)
         u, v = camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy
         inside = (np.abs(u / camera.width - 0.5) < 0.5 + _MARGIN) & (

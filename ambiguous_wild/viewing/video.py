@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -12,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
+from ambiguous_wild.core.camera import pose_at, rigid
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.core.scene import NO_PHOTO, centred, together
 from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.untrusted import read_json
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
-_MOST_BYTES = 64 * 1024 * 1024
 _TILT_DEG = 15.0  # angle of an orbit's cameras above the middle
 _WIDTH, _HEIGHT, _VIEWS = 960, 540, 8  # px and number of cameras without a scene
 _AWAY = 3.0  # distance of these cameras, relative to the Gaussians' median distance from their middle
@@ -86,11 +86,7 @@ def scene_around(model: ViewedModel) -> Scene:
     for k, center in enumerate(_circle(middle, up, first, _AWAY * size, _VIEWS)):
         camera = replace(lens, cam_from_world=_looking(center, middle, up))
         views.append(View(f"render_{k}.png", NO_PHOTO, camera, "test" if k == 0 else "train"))
-    nothing = np.zeros(0)
-    points = SparsePoints(
-        xyz, np.zeros(xyz.shape, np.uint8), np.zeros(len(xyz)), np.zeros(len(xyz) + 1, np.int64),
-        nothing.astype(np.int32), nothing.reshape(0, 2).astype(np.float32),
-    )  # fmt: skip
+    points = SparsePoints.without_tracks(xyz)
     return centred(Scene(model.ply.parent, model.label, tuple(views), points))
 
 
@@ -104,14 +100,7 @@ def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> l
     Raises:
         AwError: another format, fewer than two cameras, or an invalid camera.
     """
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise AwError(f"{path} is larger than a camera path can be")
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise AwError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:
-        raise AwError(f"{path} is no camera path: no JSON ({error})") from None
+    data = read_json(path)
     rows = data.get("camera_path") if isinstance(data, dict) else data
     if not isinstance(rows, list) or len(rows) < 2:
         raise AwError(
@@ -137,9 +126,8 @@ def _camera(row: Any, lens: Camera, size: tuple[int, int]) -> Camera:
             focal = size[1] / 2 / math.tan(math.radians(fov) / 2)
             lens = Camera(size[0], size[1], focal, focal, size[0] / 2, size[1] / 2, np.eye(4))
     else:
-        to_world = np.eye(4)
-        to_world[:3, :3] = np.asarray(row["rotation"], np.float64).reshape(3, 3)
-        to_world[:3, 3] = np.asarray(row["position"], np.float64).reshape(3)
+        rotation = np.asarray(row["rotation"], np.float64).reshape(3, 3)
+        to_world = rigid(rotation, np.asarray(row["position"], np.float64).reshape(3))
         width, height = int(row["width"]), int(row["height"])
         fx, fy = float(row["fx"]), float(row["fy"])
         if not (math.isfinite(fx) and math.isfinite(fy)):
@@ -203,12 +191,10 @@ def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[
     lenses = np.array([fitted(key, size, key.cam_from_world) for key in keys], dtype=object)
     values = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses])
     values = PchipInterpolator(at, values)(wanted)
-    cameras = []
-    for center, rotation, (fx, fy, cx, cy) in zip(centers, rotations, values):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ center
-        cameras.append(Camera(size[0], size[1], fx, fy, cx, cy, pose))
-    return cameras
+    return [
+        Camera(size[0], size[1], fx, fy, cx, cy, pose_at(center, rotation.T))
+        for center, rotation, (fx, fy, cx, cy) in zip(centers, rotations, values)
+    ]
 
 
 def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -216,10 +202,7 @@ def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarr
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
-    return pose
+    return pose_at(center, np.stack([right, np.cross(forward, right), forward]))
 
 
 Frame = np.ndarray  # [H, W, 3] uint8

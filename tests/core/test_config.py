@@ -56,28 +56,6 @@ def test_options_of_the_command_line(options, expected):
     assert with_options(Outer(), options) == expected
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"raet": "2"}, "did you mean 'rate'"),
-        ({"inner.widht": "2"}, "did you mean 'width'"),
-        ({"rate": "fast"}, "expected float, got 'fast'"),
-        ({"mode": "maen"}, "did you mean 'mean'"),
-        ({"rate.x": "1"}, "no keys of its own"),
-        ({"limit": "1.5"}, "limit"),
-        ({"on": "2"}, "expected bool"),
-    ],
-)
-def test_what_does_not_fit_is_named(options, message):
-    with pytest.raises(AwError, match=message):
-        with_options(Outer(), options)
-
-
-def test_unknown_key_of_a_file_names_the_nearest():
-    with pytest.raises(AwError, match="did you mean 'inner'"):
-        from_plain(Outer, {"iner": {}})
-
-
 @dataclass(frozen=True)
 class Ordered:
     low: float = 1.0
@@ -94,8 +72,6 @@ class Ordered:
 def test_options_are_judged_together():
     assert with_options(Ordered(), {"low": "5", "high": "7"}) == Ordered(5.0, 7.0)
     assert with_options(Ordered(), {"high": "7", "low": "5"}) == Ordered(5.0, 7.0)
-    with pytest.raises(AwError, match="low above high"):
-        with_options(Ordered(), {"low": "5"})
 
 
 @dataclass(frozen=True)
@@ -106,20 +82,32 @@ class Unlimited:
 
 
 def test_what_is_positive_by_default_is_not_made_negative():
-    with pytest.raises(AwError, match=r"option rate is at least 0, got -0\.1"):
-        with_options(Unlimited(), {"rate": "-0.1"})
     made = with_options(Unlimited(), {"rate": "0", "shift": "-5", "exposure": "-1"})
     assert made == Unlimited(0.0, -5.0, -1.0)
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("config", "options", "message"),
     [
-        ({"low": "-1"}, "it.low is at least 0, got -1"),
-        ({"share": "0.5,1.5"}, "it.share is from 0 to 1, got 1.5"),
-        ({"some": "4"}, "it.some is from 1 to 3, got 4"),
+        (Outer(), {"raet": "2"}, "did you mean 'rate'"),
+        (Outer(), {"inner.widht": "2"}, "did you mean 'width'"),
+        (Outer(), {"rate": "fast"}, "expected float, got 'fast'"),
+        (Outer(), {"mode": "maen"}, "did you mean 'mean'"),
+        (Outer(), {"rate.x": "1"}, "no keys of its own"),
+        (Outer(), {"limit": "1.5"}, "limit"),
+        (Outer(), {"on": "2"}, "expected bool"),
+        (Ordered(), {"low": "5"}, "low above high"),
+        (Ordered(), {"low": "-1"}, "it.low is at least 0, got -1"),
+        (Ordered(), {"share": "0.5,1.5"}, "it.share is from 0 to 1, got 1.5"),
+        (Ordered(), {"some": "4"}, "it.some is from 1 to 3, got 4"),
+        (Unlimited(), {"rate": "-0.1"}, r"option rate is at least 0, got -0\.1"),
     ],
 )
-def test_numbers_keep_to_their_range(options, message):
+def test_what_does_not_fit_is_named(config, options, message):
     with pytest.raises(AwError, match=message):
-        with_options(Ordered(), options)
+        with_options(config, options)
+
+
+def test_unknown_key_of_a_file_names_the_nearest():
+    with pytest.raises(AwError, match="did you mean 'inner'"):
+        from_plain(Outer, {"iner": {}})

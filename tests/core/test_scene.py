@@ -1,21 +1,21 @@
 """Cameras and scenes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
+from ambiguous_wild.core.camera import pose_at, rotation_from_quat
 
 
 def camera_at(x: float, width: int = 40, height: int = 30) -> Camera:
-    pose = np.eye(4)
-    pose[0, 3] = -x
-    return Camera(width, height, 50.0, 52.0, 20.5, 14.0, pose)
+    return Camera(width, height, 50.0, 52.0, 20.5, 14.0, pose_at(np.array([x, 0, 0]), np.eye(3)))
 
 
 def project(camera: Camera, point: np.ndarray) -> np.ndarray:
-    x, y, z = camera.cam_from_world[:3, :3] @ point + camera.cam_from_world[:3, 3]
+    x, y, z = camera.to_camera(point)
     return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
 
@@ -27,6 +27,10 @@ def test_resizing_scales_every_projection_per_axis():
 
 def test_center_is_where_the_camera_stands():
     assert np.allclose(camera_at(2.5).center, [2.5, 0, 0])
+    turned = rotation_from_quat(np.array([0.5, -0.5, 0.5, 1.0]))
+    camera = replace(camera_at(0), cam_from_world=pose_at(np.array([1.0, 2.0, 3.0]), turned))
+    assert np.allclose(camera.center, [1, 2, 3]) and np.allclose(camera.to_camera(camera.center), 0)
+    assert np.allclose(camera.to_camera(camera.center + turned[2]), [0, 0, 1])  # it looks along its third row
 
 
 def test_pose_cannot_be_changed_behind_ones_back():
@@ -47,16 +51,7 @@ def scene_of(positions: list[tuple[float, str]], points: np.ndarray | None = Non
         for i, (x, split) in enumerate(positions)
     )
     xyz = np.zeros((0, 3)) if points is None else points
-    n = len(xyz)
-    empty = SparsePoints(
-        xyz,
-        np.zeros((n, 3), np.uint8),
-        np.zeros(n),
-        np.zeros(n + 1, np.int64),
-        np.zeros(0, np.int32),
-        np.zeros((0, 2), np.float32),
-    )
-    return Scene(Path(), "s", views, empty)
+    return Scene(Path(), "s", views, SparsePoints.without_tracks(xyz))
 
 
 def test_extent_reads_training_cameras_only():

@@ -10,8 +10,10 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.io.colmap_model import write_model
-from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, ModelPoints
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.ply import write_point_ply
+from tests.io.model_maker import tracked
 
 WIDTH, HEIGHT = 64, 36
 FX, FY, CX, CY = 70.0, 71.0, 31.5, 18.5
@@ -31,35 +33,16 @@ def photo(index: int) -> np.ndarray:
 def make_model(names: list[str] = NAMES, *, points: int = 60, cameras: int = 1) -> ColmapModel:
     """Cameras that step sideways and turn; points with exact tracks, the last ones of test photos."""
     rng = np.random.default_rng(3)
-    xyz = np.column_stack(
-        [rng.uniform(-1.5, 2.5, points), rng.uniform(-1, 1, points), rng.uniform(4, 6, points)]
-    )
-    params = (FX, FY, CX, CY)
-    lenses = {k: ModelCamera(k, "PINHOLE", WIDTH, HEIGHT, params) for k in range(1, cameras + 1)}
-    images, tracks = {}, [[] for _ in range(points)]
+    xyz = np.column_stack([rng.uniform(*ends, points) for ends in ((-1.5, 2.5), (-1, 1), (4, 6))])
+    lens = (FX, FY, CX, CY)
+    lenses = {k: ModelCamera(k, "PINHOLE", WIDTH, HEIGHT, lens) for k in range(1, cameras + 1)}
+    poses = []
     for k, name in enumerate(names):
-        angle = 0.02 * k
-        q = np.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0])
-        rotation = np.array(
-            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-        )
-        t = np.array([-0.3 * k, 0.05 * k, 0.1])
-        cam = xyz @ rotation.T + t
-        xys = cam[:, :2] / cam[:, 2:] * [FX, FY] + [CX, CY]
+        q = np.array([np.cos(0.01 * k), 0.0, np.sin(0.01 * k), 0.0])
         # The last ten points are seen in test photos alone.
-        test = name in TEST or "extra" in name
-        seen = np.flatnonzero((np.arange(points) < points - 10) | test)
-        for j, i in enumerate(seen):
-            tracks[i].append((k + 1, j))
-        camera = 1 + k % cameras
-        images[k + 1] = ModelImage(k + 1, q, t, camera, name, xys[seen], seen + 1)
-    offsets = np.concatenate([[0], np.cumsum([len(t) for t in tracks])]).astype(np.int64)
-    flat = np.array([pair for t in tracks for pair in t], np.int64).reshape(-1, 2)
-    rgb = rng.integers(0, 256, (points, 3), dtype=np.uint8)
-    ids = np.arange(1, points + 1)
-    return ColmapModel(
-        lenses, images, ModelPoints(ids, xyz, rgb, rng.random(points), offsets, flat[:, 0], flat[:, 1])
-    )
+        seen = np.flatnonzero((np.arange(points) < points - 10) | (name in TEST or "extra" in name))
+        poses.append((k + 1, q, np.array([-0.3 * k, 0.05 * k, 0.1]), 1 + k % cameras, name, seen))
+    return tracked(lenses, lens, poses, xyz, 1, rng)
 
 
 def write_photos(folder: Path, names: list[str] = NAMES) -> None:
@@ -143,18 +126,8 @@ def frames(folder: str, names: list[str] = NAMES) -> list[dict]:
 
 
 def shared_camera() -> dict:
-    return {
-        "w": WIDTH,
-        "h": HEIGHT,
-        "fl_x": FX,
-        "fl_y": FY,
-        "cx": CX,
-        "cy": CY,
-        "k1": 0.0,
-        "k2": 0.0,
-        "p1": 0.0,
-        "p2": 0.0,
-    }
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY}
+    return lens | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
 
 
 def instant_ngp(root: Path) -> Path:
@@ -174,11 +147,7 @@ def nerfstudio(root: Path) -> Path:
     )
     listed[0]["mask_path"] = "masks/m.png"
     points = make_model().points
-    head = f"ply\nformat ascii 1.0\nelement vertex {len(points.ids)}\n"
-    head += "".join(f"property float {a}\n" for a in "xyz")
-    head += "".join(f"property uint8 {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
-    body = "".join(f"{p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]}\n" for p, c in zip(points.xyz, points.rgb))
-    (root / "sparse_pc.ply").write_text(head + body)
+    write_point_ply(root / "sparse_pc.ply", points.xyz, points.rgb)
     data = {
         **shared_camera(),
         "camera_model": "OPENCV",
@@ -233,6 +202,18 @@ def on_the_go_undistorted(root: Path) -> Path:
             str(path), cv2.resize(pixels, (WIDTH // 8, round(HEIGHT / 8)), interpolation=cv2.INTER_AREA)
         )
     return root
+
+
+def edited(layout, file: str, change):
+    """A function that writes the layout, and changes the data of one of its JSON files."""
+
+    def write(root: Path) -> Path:
+        layout(root)
+        data = json.loads((root / file).read_text())
+        (root / file).write_text(json.dumps(change(data) or data))
+        return root
+
+    return write
 
 
 LAYOUTS = {

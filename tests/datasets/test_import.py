@@ -15,7 +15,9 @@ from ambiguous_wild.datasets.readers import READERS, recognise
 from ambiguous_wild.datasets.suites import suites
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.grid import plan_cells
-from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.colmap_records import ModelCamera
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.command_line import aw
@@ -129,9 +131,6 @@ def test_lens_distortion_is_taken_out(tmp_path):
     """Oracle: where a point of the world falls in the undistorted photo, by its own camera."""
     root = layouts.robustnerf(tmp_path / "raw")
     model = layouts.make_model([*layouts.NAMES, "clean000.png"])
-    from ambiguous_wild.io.colmap_records import ModelCamera
-    from ambiguous_wild.io.safe_pycolmap import pycolmap
-
     params = (70.0, 71.0, 31.5, 18.5, -0.3, 0.05, 0.001, 0.0)
     lens = pycolmap.Camera(model="OPENCV", width=64, height=36, params=list(params))
     model.cameras[1] = ModelCamera(1, "OPENCV", 64, 36, params)
@@ -144,8 +143,6 @@ def test_lens_distortion_is_taken_out(tmp_path):
     photo = np.zeros((36, 64, 3), np.uint8)
     row, column = int(spot[1]), int(spot[0])
     photo[row - 1 : row + 2, column - 1 : column + 2] = 255
-    from ambiguous_wild.io.images import write_png
-
     write_png(root / "images" / view.name, photo)
     other = load_scene(import_scene(root, tmp_path / "again", ImportSettings(factor=1)).scene).views[0]
     flat = read_png_rgb(other.image_path)[..., 0].astype(float)
@@ -219,130 +216,98 @@ def test_what_is_trained_on_has_the_bits_of_the_native_scene(native, imported):
         assert np.array_equal(getattr(other.points, field.name), getattr(native.points, field.name))
 
 
-def _no_list(root):
-    layouts.native(root)
-    (root / "test_list.txt").unlink()
+def spoilt(layout, spoil):
+    """A function that writes the layout and changes its folder."""
+    return lambda root: spoil(layout(root))
+
+
+def ngp(change):
+    return layouts.edited(layouts.instant_ngp, "transforms.json", change)
+
+
+def _transforms(**changes):
+    return ngp(lambda data: {**data, **changes})
 
 
 def _other_table(root):
-    layouts.phototourism(root)
     rows = [f"other{i}.jpg\t{i}\ttrain\tx" for i in range(9)]
     (root / "toy.tsv").write_text("\n".join(["filename\tid\tsplit\tdataset", *rows]) + "\n")
 
 
-def _mask_size(root):
-    layouts.nerfstudio(root)
-    from ambiguous_wild.io.images import write_png
-
-    write_png(root / "masks" / "m.png", np.zeros((50, 40), np.uint8))
-
-
-def _photo_absent(root):
-    layouts.robustnerf(root)
-    (root / "images" / "extra001.png").unlink()
-
-
-def _two_splits(root):
-    layouts.on_the_go(root)
-    (root / "toy.tsv").write_text("filename\tid\tsplit\tdataset\n")
-
-
-def _keyword(root):
-    layouts.robustnerf(root)
-    layouts.write_model(root / "sparse" / "0", layouts.make_model([*layouts.NAMES, "other.png"]))
-
-
-def _long_split(root):
-    layouts.on_the_go(root)
-    (root / "split.json").write_text(json.dumps({"clutter": [0, 1], "extra": [99]}))
-
-
-def _outside(root):
-    layouts.instant_ngp(root)
-    text = (root / "transforms.json").read_text().replace("./images/extra000.png", "../../secret.png")
-    (root / "transforms.json").write_text(text)
-
-
-def _matrix(root):
-    layouts.instant_ngp(root)
-    data = json.loads((root / "transforms.json").read_text())
+def _matrix(data):
     data["frames"][0]["transform_matrix"] = [[1, 2], [3, 4]]
-    (root / "transforms.json").write_text(json.dumps(data))
 
 
-def _turned(root):
-    layouts.native(root)
-    from ambiguous_wild.io.images import write_png
+def _far(data):
+    data["frames"][1]["transform_matrix"][0][3] = 1e300
 
-    write_png(root / "images" / "clutter001.png", np.zeros((64, 36, 3), np.uint8))
+
+def _transposed(data):
+    for frame in data["frames"]:
+        frame["transform_matrix"] = [list(column) for column in zip(*frame["transform_matrix"])]
+
+
+def _outside(data):
+    return json.loads(json.dumps(data).replace("./images/extra000.png", "../../secret.png"))
 
 
 def _stems(root):
-    layouts.native(root)
-    names = [*layouts.NAMES, "clutter000.jpg"]
     layouts.write_photos(root / "images", ["clutter000.jpg"])
-    layouts.write_model(root / "sparse" / "0", layouts.make_model(names))
+    _other_model([*layouts.NAMES, "clutter000.jpg"])(root)
     layouts.write_lists(root, [*layouts.TRAIN, "clutter000.jpg"])
 
 
-def _newline(root):
-    layouts.native(root)
-    layouts.write_model(root / "sparse" / "0", layouts.make_model([*layouts.NAMES[:-1], "a\nb.png"]))
+def _other_model(names):
+    return lambda root: layouts.write_model(root / "sparse" / "0", layouts.make_model(names))
 
 
-def _transforms(**changes):
-    def spoil(root):
-        layouts.instant_ngp(root)
-        data = json.loads((root / "transforms.json").read_text())
-        (root / "transforms.json").write_text(json.dumps({**data, **changes}))
-
-    return spoil
-
-
-def _far(root):
-    layouts.instant_ngp(root)
-    data = json.loads((root / "transforms.json").read_text())
-    data["frames"][1]["transform_matrix"][0][3] = 1e300
-    (root / "transforms.json").write_text(json.dumps(data))
-
-
-def _transposed(root):
-    layouts.instant_ngp(root)
-    data = json.loads((root / "transforms.json").read_text())
-    for frame in data["frames"]:
-        frame["transform_matrix"] = [list(column) for column in zip(*frame["transform_matrix"])]
-    (root / "transforms.json").write_text(json.dumps(data))
-
-
-def _protocol(root):
-    layouts.nerfbaselines(root)
-    (root / "nb-info.json").write_text(json.dumps({"loader": ["colmap"], "evaluation_protocol": {}}))
+def _picture(name, *size):
+    return lambda root: write_png(root / name, np.zeros(size, np.uint8))
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (_stems, "'clutter000.jpg' and 'clutter000.png' differ in their extension only"),
-        (_newline, "which no list can hold"),
+        (spoilt(layouts.native, _stems), "'clutter000.jpg' and 'clutter000.png' differ in their extension"),
+        (spoilt(layouts.native, _other_model([*layouts.NAMES[:-1], "a\nb.png"])), "which no list can hold"),
+        (spoilt(layouts.native, lambda root: (root / "test_list.txt").unlink()), "test_list.txt"),
+        (
+            spoilt(layouts.native, _picture("images/clutter001.png", 64, 36, 3)),
+            "clutter001.png (36x64, its camera 64x36, turned",
+        ),
+        (
+            spoilt(layouts.nerfstudio, _picture("masks/m.png", 50, 40)),
+            "m.png is 40x50 but its photo clutter000.png 64x36",
+        ),
+        (
+            spoilt(layouts.robustnerf, lambda root: (root / "images" / "extra001.png").unlink()),
+            "1 of 7 photos that the model registers are not in",
+        ),
+        (spoilt(layouts.robustnerf, _other_model([*layouts.NAMES, "other.png"])), "other.png (none)"),
+        (spoilt(layouts.phototourism, _other_table), "table of another scene"),
+        (spoilt(layouts.on_the_go, _other_table), "choose one with --as"),
+        (
+            layouts.edited(layouts.on_the_go, "split.json", lambda _: {"clutter": [0, 1], "extra": [99]}),
+            "they belong to two scenes",
+        ),
+        (
+            layouts.edited(
+                layouts.nerfbaselines,
+                "nb-info.json",
+                lambda _: {"loader": ["colmap"], "evaluation_protocol": {}},
+            ),
+            "unknown loader",
+        ),
         (_transforms(w=64e9, h=36e9, k1=0.1), "the model is damaged"),
         (_transforms(fl_x=0), "the model is damaged"),
         (_transforms(fl_x="wide"), "fl_x is 'wide', not a number"),
         (_transforms(camera_model=["x"]), "camera_model"),
         (_transforms(frames=[{"file_path": 3}]), "frame 0 has no file_path"),
         (_transforms(ply_file_path="../p.ply"), "leads out of"),
-        (_far, "too far away"),
-        (_transposed, "transposed"),
-        (_protocol, "unknown loader"),
-        (_no_list, "test_list.txt"),
-        (_other_table, "table of another scene"),
-        (_mask_size, "m.png is 40x50 but its photo clutter000.png 64x36"),
-        (_photo_absent, "1 of 7 photos that the model registers are not in"),
-        (_two_splits, "choose one with --as"),
-        (_keyword, "other.png (none)"),
-        (_long_split, "they belong to two scenes"),
-        (_outside, "leads out of"),
-        (_matrix, "clutter000.png"),
-        (_turned, "clutter001.png (36x64, its camera 64x36, turned"),
+        (ngp(_far), "too far away"),
+        (ngp(_transposed), "transposed"),
+        (ngp(_outside), "leads out of"),
+        (ngp(_matrix), "clutter000.png"),
         (lambda root: root.mkdir(), "no known layout"),
     ],
 )

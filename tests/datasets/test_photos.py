@@ -130,11 +130,8 @@ def test_a_label_map_is_no_mask(tmp_path):
     with pytest.raises(AwError, match=r"m.png is no mask .* 4 values, 0 \(31 %\), 1 \(31 %\)"):
         import_scene(root, tmp_path / "scene")
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
-    assert (
-        not load_scene(import_scene(root, tmp_path / "scene", ImportSettings(masks=False)).scene)
-        .train[0]
-        .keep_path
-    )
+    done = import_scene(root, tmp_path / "scene", ImportSettings(masks=False))
+    assert load_scene(done.scene).train[0].keep_path is None
 
 
 def test_masks_that_keep_little_are_suspected_to_be_inverted_in_an_import_too(tmp_path):
@@ -149,10 +146,7 @@ def _one_photo(root):
     layouts.write_model(root / "sparse" / "0", layouts.make_model(layouts.NAMES[:1]))
 
 
-def _no_test(root):
-    layouts.nerfstudio(root)
-    data = json.loads((root / "transforms.json").read_text())
-    (root / "transforms.json").write_text(json.dumps({**data, "test_filenames": []}))
+_no_test = layouts.edited(layouts.nerfstudio, "transforms.json", lambda data: {**data, "test_filenames": []})
 
 
 @pytest.mark.parametrize(
@@ -160,11 +154,7 @@ def _no_test(root):
     [
         (_one_photo, (), "has no train photo: 1 photo in the split"),
         (_no_test, (), "none of the 0 test photos"),
-        (
-            layouts.native,
-            ("--factor", 5),
-            "--factor 5 leaves less than 16 px a side, too small to train on, of ",
-        ),
+        (layouts.native, ("--factor", 5), "--factor 5 leaves less than 16 px a side, too small to train on"),
     ],
 )
 def test_a_scene_that_cannot_be_trained_or_measured_is_refused(make, options, message, tmp_path):
@@ -183,10 +173,10 @@ def test_a_bench_that_tests_nothing_is_refused(names, tmp_path):
 
 def test_colours_of_start_points_are_read_under_other_names(tmp_path):
     root = layouts.nerfstudio(tmp_path / "raw")
-    text = (root / "sparse_pc.ply").read_text()
-    for colour in ("red", "green", "blue"):
-        text = text.replace(f"uint8 {colour}", f"uint8 diffuse_{colour}")
-    (root / "sparse_pc.ply").write_text(text)
+    data = (root / "sparse_pc.ply").read_bytes()
+    for colour in (b"red", b"green", b"blue"):
+        data = data.replace(b"uchar " + colour, b"uchar diffuse_" + colour)
+    (root / "sparse_pc.ply").write_bytes(data)
     points = load_scene(import_scene(root, tmp_path / "scene").scene).points
     assert np.array_equal(points.rgb, layouts.make_model().points.rgb)
 

@@ -28,6 +28,7 @@ from ambiguous_wild.simulate.spec_file import parse_spec
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.study.answers import KEY_FORMAT, read_answers, read_key
 from ambiguous_wild.vision.label_maps import read_labels
+from tests.faults.fuzzing.samples import yaml_bomb
 from tests.harness.fake_runs import fake_result
 from tests.io.model_maker import make_model
 from tests.study.studies import METHODS, panel, panel_key
@@ -79,10 +80,7 @@ def test_colmap_binary_with_a_point_number_beyond_all_integers(tmp_path):
 
 
 def test_yaml_bombs_and_brackets_without_end(tmp_path):
-    bomb = "a: &a [x, x, x, x, x, x, x, x, x]\n"
-    for old, new in zip("abcdefghi", "bcdefghij"):
-        bomb += f"{new}: &{new} [{', '.join(['*' + old] * 9)}]\n"
-    for text in (bomb, "[" * 1500, "? [1, 2]\n: 3", "!!python/object/apply:os.system [ls]"):
+    for text in (yaml_bomb(), "[" * 1500, "? [1, 2]\n: 3", "!!python/object/apply:os.system [ls]"):
         with pytest.raises(AwError):
             plain_yaml.parse(text)
         (tmp_path / "config.yaml").write_text(text)

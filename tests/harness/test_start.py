@@ -15,9 +15,9 @@ from ambiguous_wild.harness.cell import RunOptions, reproduce
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.job import make_cell, make_job
 from ambiguous_wild.harness.start import start_file, started
-from ambiguous_wild.io.ply import write_point_ply, write_splat_ply
+from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.io.spz import write_spz
+from ambiguous_wild.io.splat_files import FORMATS, write_splats
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.report.notes import unequal
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -91,7 +91,7 @@ def test_a_start_is_in_the_coordinates_of_the_files(tmp_path, kind, shift, scale
         xyz, _ = started(MethodHooks(), start_file(path), scene).given
         np.testing.assert_allclose(xyz, inner, atol=1e-3)
         return
-    (write_splat_ply if kind == "ply" else write_spz)(path, arrays, place=scene.place)
+    write_splats(FORMATS[kind], path, arrays, scene.place)
     parts = started(MethodHooks(sh_degree=2), start_file(path), scene)
     found = parts.first_gaussians(type("Data", (), {"device": "cpu"})())
     assert isinstance(found, Gaussians) and found.sh_rest.shape == (2500, 8, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,29 +14,39 @@ from ambiguous_wild.io.images import write_png
 WIDTH, HEIGHT, FX, FY = 64, 48, 60.0, 62.0
 
 
+def tracked(
+    cameras: dict[int, ModelCamera], lens: tuple[float, ...], poses: list, xyz: np.ndarray, first: int, rng
+) -> ColmapModel:
+    """A model whose observations are exact projections by `lens` (fx, fy, cx, cy).
+
+    `poses`: (image id, qvec, tvec, camera id, name, rows of its points); point ids count from `first`.
+    """
+    images, tracks = {}, [[] for _ in xyz]
+    for number, qvec, tvec, camera, name, seen in poses:
+        image = ModelImage(number, qvec, tvec, camera, name, np.zeros((0, 2)), seen + first)
+        pose = image.cam_from_world()
+        local = xyz[seen] @ pose[:3, :3].T + tvec
+        images[number] = replace(image, xys=local[:, :2] / local[:, 2:] * lens[:2] + lens[2:])
+        for row, point in enumerate(seen):
+            tracks[point].append((number, row))
+    offsets = np.concatenate([[0], np.cumsum([len(t) for t in tracks])]).astype(np.int64)
+    flat = np.array([pair for t in tracks for pair in t], np.int64).reshape(-1, 2)
+    rgb = rng.integers(0, 256, xyz.shape, dtype=np.uint8)
+    ids = np.arange(len(xyz), dtype=np.int64) + first
+    points = ModelPoints(ids, xyz, rgb, rng.random(len(xyz)), offsets, flat[:, 0], flat[:, 1])
+    return ColmapModel(cameras, images, points)
+
+
 def make_model(names: list[str], points: int = 20, seed: int = 0, camera: str = "PINHOLE") -> ColmapModel:
     rng = np.random.default_rng(seed)
-    xyz = np.column_stack(
-        [rng.uniform(-1, 1, points), rng.uniform(-0.5, 0.5, points), rng.uniform(4, 6, points)]
-    )
+    xyz = np.column_stack([rng.uniform(*ends, points) for ends in ((-1, 1), (-0.5, 0.5), (4, 6))])
     params = {"PINHOLE": (FX, FY, 33.0, 23.0), "SIMPLE_RADIAL": (FX, 32.0, 24.0, -0.05)}[camera]
-    cameras = {7: ModelCamera(7, camera, WIDTH, HEIGHT, params)}
-    images, tracks = {}, [[] for _ in range(points)]
+    identity, poses = np.array([1.0, 0, 0, 0]), []
     for k, name in enumerate(names):
-        shift = np.array([-0.1 * k, 0.02 * k, 0.0])
         seen = np.flatnonzero(rng.random(points) < 0.8)
-        cam = xyz[seen] + shift
-        xys = cam[:, :2] / cam[:, 2:] * [FX, FY] + [33.0, 23.0]
-        for j, i in enumerate(seen):
-            tracks[i].append((10 + k, j))
-        images[10 + k] = ModelImage(10 + k, np.array([1.0, 0, 0, 0]), shift, 7, name, xys, seen + 100)
-    offsets = np.concatenate([[0], np.cumsum([len(t) for t in tracks])]).astype(np.int64)
-    flat = np.array([pair for t in tracks for pair in t], dtype=np.int64).reshape(-1, 2)
-    rgb = rng.integers(0, 256, (points, 3), dtype=np.uint8)
-    ids = np.arange(points, dtype=np.int64) + 100
-    return ColmapModel(
-        cameras, images, ModelPoints(ids, xyz, rgb, rng.random(points), offsets, flat[:, 0], flat[:, 1])
-    )
+        poses.append((10 + k, identity, np.array([-0.1 * k, 0.02 * k, 0.0]), 7, name, seen))
+    cameras = {7: ModelCamera(7, camera, WIDTH, HEIGHT, params)}
+    return tracked(cameras, (FX, FY, 33.0, 23.0), poses, xyz, 100, rng)
 
 
 def write_text(folder: Path, model: ColmapModel) -> None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import json
 import os
 import select
 import socket
@@ -32,6 +31,8 @@ def test_a_failing_write_leaves_the_old_file(tmp_path):
     with pytest.raises(RuntimeError), atomic_path(target) as temporary:
         temporary.write_text("half")
         raise RuntimeError
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(target, {"x": float("nan")})
     assert target.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
@@ -50,46 +51,16 @@ def test_an_error_names_the_file_that_was_asked_for(tmp_path, monkeypatch, late)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failing_folder_leaves_the_old_folder(tmp_path):
-    target = tmp_path / "d"
-    with atomic_dir(target) as temporary:
-        (temporary / "x").write_text("1")
-    with pytest.raises(RuntimeError), atomic_dir(target) as temporary:
-        (temporary / "y").write_text("2")
-        raise RuntimeError
-    assert [p.name for p in target.iterdir()] == ["x"]
-    assert [p.name for p in tmp_path.iterdir()] == ["d"]
-
-
-def test_a_folder_is_replaced_whole(tmp_path):
+def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
     target = tmp_path / "d"
     for name in ("x", "y"):
         with atomic_dir(target) as temporary:
             (temporary / name).write_text(name)
+    with pytest.raises(RuntimeError), atomic_dir(target) as temporary:
+        (temporary / "z").write_text("half")
+        raise RuntimeError
     assert [p.name for p in target.iterdir()] == ["y"]
     assert [p.name for p in tmp_path.iterdir()] == ["d"]
-
-
-def test_json_refuses_nan_and_keeps_the_old(tmp_path):
-    target = tmp_path / "a.json"
-    write_json(target, {"x": 1})
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(target, {"x": float("nan")})
-    assert json.loads(target.read_text()) == {"x": 1}
-
-
-def test_a_locked_folder_names_its_holder_and_is_freed_afterwards(tmp_path):
-    folder = tmp_path / "run"
-    script = (
-        "import sys; from ambiguous_wild.io.files import folder_lock\n"
-        "with folder_lock(sys.argv[1], 'second'): print('got it')"
-    )
-    with folder_lock(folder, "aw bench"):
-        blocked = subprocess.run([sys.executable, "-c", script, folder], capture_output=True, text=True)
-        assert "being worked on by aw bench" in blocked.stderr
-    free = subprocess.run([sys.executable, "-c", script, folder], capture_output=True, text=True)
-    assert free.stdout.strip() == "got it"
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_lock_is_freed_after_an_error(tmp_path):
@@ -98,6 +69,19 @@ def test_a_lock_is_freed_after_an_error(tmp_path):
     assert list(tmp_path.iterdir()) == []
     with folder_lock(tmp_path / "run", "second"):
         assert (tmp_path / ".run.lock").exists()
+
+
+@pytest.mark.parametrize(("number", "advice"), [(28, "free space"), (30, "make it writable")])
+def test_a_lock_that_cannot_be_written_says_what_to_do(tmp_path, monkeypatch, number, advice):
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("filelock.FileLock.acquire", refuse)
+    with (
+        pytest.raises(AwError, match=f"{os.strerror(number)}; {advice}, or choose"),
+        folder_lock(tmp_path / "run", "aw bench"),
+    ):
+        pass
 
 
 def test_a_lock_file_unlinked_under_ones_hands_is_not_held(tmp_path, monkeypatch):
@@ -129,14 +113,6 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
     sweep(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", "mine.txt"]
-
-
-def test_a_file_where_a_folder_is_to_be_made_stays(tmp_path):
-    (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(AwError, match="a file lies there"), atomic_dir(tmp_path / "thesis.txt") as folder:
-        (folder / "a").write_text("b")
-    assert (tmp_path / "thesis.txt").read_text() == "mine"
-    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 def test_a_link_stays_and_its_target_is_written(tmp_path):
@@ -189,6 +165,9 @@ def test_a_device_gets_the_bytes_and_stays(tmp_path):
 def test_what_is_neither_file_nor_pipe_is_refused_and_stays(tmp_path):
     (tmp_path / "d").mkdir()
     (tmp_path / "gone").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(AwError, match="a file lies there"), atomic_dir(tmp_path / "thesis.txt"):
+        pass
     with socket.socket(socket.AF_UNIX) as s:
         s.bind(str(tmp_path / "s"))
     before = {p.name: p.lstat().st_mode for p in tmp_path.iterdir()}
@@ -200,6 +179,7 @@ def test_what_is_neither_file_nor_pipe_is_refused_and_stays(tmp_path):
         with pytest.raises(AwError) if name != "d" else contextlib.nullcontext(), atomic_dir(tmp_path / name):
             pass
     assert {p.name: p.lstat().st_mode for p in tmp_path.iterdir()} == before
+    assert (tmp_path / "thesis.txt").read_text() == "mine"
 
 
 def test_a_check_before_the_work_makes_nothing(tmp_path):

@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.camera import rotation_from_quat
 from ambiguous_wild.io.colmap_model import read_model, write_model
-from ambiguous_wild.io.colmap_records import points_without_tracks, rotation_from_quaternion
+from ambiguous_wild.io.colmap_records import points_without_tracks
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from tests.io.model_maker import make_model
 
@@ -60,7 +61,7 @@ def test_colmap_reads_what_we_write_and_we_read_what_it_writes(tmp_path):
 def test_rotation_agrees_with_scipy(q):
     from scipy.spatial.transform import Rotation
 
-    ours = rotation_from_quaternion(np.array(q))
+    ours = rotation_from_quat(np.array(q))
     assert np.allclose(ours, Rotation.from_quat([q[1], q[2], q[3], q[0]]).as_matrix(), atol=1e-12)
     assert np.allclose(ours @ ours.T, np.eye(3), atol=1e-12)
 

@@ -23,12 +23,15 @@ from ambiguous_wild.io.images import (
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32 - 1))
 def test_png_gives_back_every_pixel(tmp_path_factory, width, height, seed):
-    path = tmp_path_factory.mktemp("png") / "a.png"
+    path = tmp_path_factory.mktemp("png") / "фото é.png"
     image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
     write_png(path, image)
     assert np.array_equal(read_png_rgb(path), image)
     assert image_size(path) == (width, height)
     assert np.array_equal(load_image_float(path), image.astype(np.float32) / np.float32(255))
+    first = path.read_bytes()
+    write_png(path, image)
+    assert path.read_bytes() == first  # the same pixels, the same bytes
 
 
 def test_colours_are_rgb_and_not_bgr(tmp_path):
@@ -43,25 +46,12 @@ def test_sixteen_bits_keep_their_precision(tmp_path):
     assert np.allclose(load_image_float(tmp_path / "deep.png"), image / 65535, atol=1e-7)
 
 
-def test_same_pixels_same_bytes(tmp_path):
-    image = np.random.default_rng(3).integers(0, 256, (20, 30, 3), dtype=np.uint8)
-    write_png(tmp_path / "a.png", image)
-    write_png(tmp_path / "b.png", image)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-
-
 def test_grey_file_reads_as_rgb_and_as_mask(tmp_path):
     gray = np.array([[0, 127, 128, 255]], np.uint8)
     write_png(tmp_path / "m.png", gray)
     assert np.array_equal(read_png_rgb(tmp_path / "m.png"), np.repeat(gray[..., None], 3, 2))
     assert np.array_equal(read_gray(tmp_path / "m.png"), gray)
     assert read_keep_map(tmp_path / "m.png").tolist() == [[0.0, 0.0, 1.0, 1.0]]
-
-
-def test_non_ascii_name(tmp_path):
-    image = np.full((3, 4, 3), 9, np.uint8)
-    write_png(tmp_path / "фото é.png", image)
-    assert np.array_equal(read_png_rgb(tmp_path / "фото é.png"), image)
 
 
 def test_orientation_tag_is_ignored_for_scene_files(tmp_path):

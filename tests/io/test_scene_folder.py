@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -188,10 +189,32 @@ def test_a_plain_folder_gives_its_own_name_which_is_checked_too(tmp_path):
         load_scene(tmp_path / "a\nb")
 
 
-def test_photos_alone_lack_a_model_first_of_all(tmp_path):
-    for factor in (None, 4):
-        with pytest.raises(AwError, match=r"COLMAP model.*aw build-scene"):
-            load_scene(tmp_path, factor=factor)
+def _cropped(root):
+    write_png(root / "images" / "p2.png", np.zeros((HEIGHT, HEIGHT, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "message"),
+    [
+        (None, {}, "no scene folder"),
+        (lambda root: shutil.rmtree(root / "sparse"), {}, r"COLMAP model.*aw build-scene"),
+        (lambda root: shutil.rmtree(root / "sparse"), {"factor": 4}, r"COLMAP model.*aw build-scene"),
+        (lambda root: None, {"factor": 8}, r"factor 8; it has factor 1 \(images\), 2"),
+        (lambda root: (root / "images" / "p2.png").unlink(), {}, r"lacks p2\.png"),
+        (_cropped, {}, r"p2\.png is 48x48"),
+        (
+            lambda root: write_model(root / "sparse/0", make_model(NAMES, camera="SIMPLE_RADIAL")),
+            {},
+            "aw build-scene",
+        ),
+    ],
+)
+def test_what_is_no_whole_scene_is_refused(tmp_path, spoil, options, message):
+    if spoil is not None:
+        write_scene(tmp_path / "s", NAMES)
+        spoil(tmp_path / "s")
+    with pytest.raises(AwError, match=message):
+        load_scene(tmp_path / "s", **options)
 
 
 def test_a_file_is_answered_with_its_folder(tmp_path):
@@ -215,33 +238,6 @@ def test_photos_stripped_of_their_2d_points_lose_their_observations_only(tmp_pat
     short = {i: replace(m, xys=m.xys[:1], point_ids=m.point_ids[:1]) for i, m in model.images.items()}
     write_model(tmp_path / "sparse" / "0", replace(model, images=short))
     with pytest.raises(AwError, match="contradict each other"):
-        load_scene(tmp_path)
-
-
-def test_distorted_model_says_how_to_undistort(tmp_path):
-    write_scene(tmp_path, NAMES, camera="SIMPLE_RADIAL")
-    with pytest.raises(AwError, match="aw build-scene"):
-        load_scene(tmp_path)
-
-
-def test_a_cropped_photo_is_refused(tmp_path):
-    write_scene(tmp_path, NAMES)
-    write_png(tmp_path / "images" / "p2.png", np.zeros((HEIGHT, HEIGHT, 3), np.uint8))
-    with pytest.raises(AwError, match=r"p2\.png is 48x48"):
-        load_scene(tmp_path)
-
-
-def test_missing_folder_factor_and_photo(tmp_path):
-    with pytest.raises(AwError, match="no scene folder"):
-        load_scene(tmp_path / "none")
-    with pytest.raises(AwError, match="is no scene"):
-        (tmp_path / "images").mkdir()
-        load_scene(tmp_path)
-    write_scene(tmp_path, NAMES)
-    with pytest.raises(AwError, match=r"factor 8; it has factor 1 \(images\), 2"):
-        load_scene(tmp_path, factor=8)
-    (tmp_path / "images" / "p2.png").unlink()
-    with pytest.raises(AwError, match=r"lacks p2\.png"):
         load_scene(tmp_path)
 
 

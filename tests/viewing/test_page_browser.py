@@ -82,15 +82,10 @@ def settle(page: Browser) -> None:
 
 def shot(page: Browser, tmp_path: Path) -> np.ndarray:
     """The stage's picture without labels and frames, RGB."""
-    page.run(
-        "for (const e of document.querySelectorAll('#photo, #frame, .pane span, #handle, #slider'))"
-        " e.style.visibility = 'hidden'"
-    )
+    over = "for (const e of document.querySelectorAll('#photo, #frame, .pane span, #handle, #slider'))"
+    page.run(f"{over} e.style.visibility = 'hidden'")
     page.screenshot(tmp_path / "shot.png")
-    page.run(
-        "for (const e of document.querySelectorAll('#photo, #frame, .pane span, #handle, #slider'))"
-        " e.style.visibility = ''"
-    )
+    page.run(f"{over} e.style.visibility = ''")
     image = cv2.imread(str(tmp_path / "shot.png"))[:, :, ::-1]
     x, y, w, h = box(page)
     return image[y : y + h, x : x + w]
@@ -112,6 +107,10 @@ def ours(runs: Path, label: str, view: str, size: tuple[int, int]) -> np.ndarray
     seed = 0 if label == "3dgs" else 1
     (ply,) = (runs / "runs").glob(f"porch/*/seed{seed}/point_cloud.ply")
     return Renderer(read_splat_ply(ply), RenderSettings())(fitted(camera, size, camera.cam_from_world))
+
+
+def mouse(page: Browser, kind: str, x: float, y: float, **more: Any) -> None:
+    page.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -186,7 +185,7 @@ def test_cameras_are_frusta_that_can_be_clicked(page: Browser, tmp_path: Path) -
     assert blue.sum() > 30 and np.abs(drawn.astype(float) - plain).mean() > 0.3
     x, y = facts(page, FACE)  # the middle of a face on the screen
     for kind in ("mousePressed", "mouseReleased"):
-        page.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        mouse(page, kind, x, y, button="left", clickCount=1)
     page.until("state.view !== null")
     settle(page)
     assert page.run("DATA.views[state.view].split") == "train"
@@ -229,25 +228,15 @@ def test_keys_mouse_and_wheel_move_the_camera(page: Browser) -> None:
     page.run("choose({ mode: 'single', frusta: false }).then(() => 1)")
     x, y, w, h = box(page)
     before = facts(page, "camera.position.toArray()")
-    page.call(
-        "Input.dispatchMouseEvent", type="mousePressed", x=x + w / 2, y=y + h / 2, button="left", clickCount=1
-    )
-    page.call(
-        "Input.dispatchMouseEvent",
-        type="mouseMoved",
-        x=x + w / 2 + 60,
-        y=y + h / 2 + 20,
-        button="left",
-        buttons=1,
-    )
-    page.call(
-        "Input.dispatchMouseEvent", type="mouseReleased", x=x + w / 2 + 60, y=y + h / 2 + 20, button="left"
-    )
+    middle, later = (x + w / 2, y + h / 2), (x + w / 2 + 60, y + h / 2 + 20)
+    mouse(page, "mousePressed", *middle, button="left", clickCount=1)
+    mouse(page, "mouseMoved", *later, button="left", buttons=1)
+    mouse(page, "mouseReleased", *later, button="left")
     page.until("state.view === null")
     settle(page)
     turned = facts(page, "camera.position.toArray()")
     assert np.linalg.norm(np.subtract(turned, before)) > 0.05
-    page.call("Input.dispatchMouseEvent", type="mouseWheel", x=x + w / 2, y=y + h / 2, deltaX=0, deltaY=-240)
+    mouse(page, "mouseWheel", *middle, deltaX=0, deltaY=-240)
     page.until(f"camera.position.distanceTo(new T.Vector3(...{json.dumps(turned)})) > 0.02")
     page.run("document.dispatchEvent(new KeyboardEvent('keydown', { key: 'w', bubbles: true }))")
     at = facts(page, "camera.position.toArray()")
@@ -280,20 +269,16 @@ def test_it_opens_with_two_models_under_the_slider_the_best_right(page: Browser,
     settle(page)
     assert page.run("state.mode") == "cut"
     best = facts(page, "DATA.models[state.right].mean")
-    assert (
-        best
-        == max(facts(page, "DATA.models.map((m) => m.mean)"))
-        > facts(page, "DATA.models[state.left].mean")
-    )
+    means = facts(page, "DATA.models.map((m) => m.mean)")
+    assert best == max(means) > facts(page, "DATA.models[state.left].mean")
     psnr = facts(page, "DATA.models[state.right].psnr")
     assert facts(page, "DATA.views[state.view].name") == max(TEST, key=lambda name: psnr[name])
 
 
 def test_the_address_opens_a_place(page: Browser, runs: Path) -> None:
     page.open("about:blank#")
-    page.open(
-        (runs / "view" / "index.html").as_uri() + f"#left=3dgs&right=photo&mode=cut&view={TRAIN[2]}&x=<b>"
-    )
+    place = f"#left=3dgs&right=photo&mode=cut&view={TRAIN[2]}&x=<b>"
+    page.open((runs / "view" / "index.html").as_uri() + place)
     settle(page)
     assert page.run("DATA.models[state.left].label") == "3dgs" and page.run("state.right") == "photo"
     assert page.run("state.mode") == "cut" and page.run("DATA.views[state.view].name") == TRAIN[2]
@@ -318,14 +303,11 @@ def test_nothing_hostile_ran_and_it_fits_a_phone(runs: Path, tmp_path: Path) -> 
         page.open((runs / "view" / "index.html").as_uri())
         settle(page)
         assert page.run("document.querySelectorAll('img').length") == 0
-        assert (
-            page.run("document.title") == HOSTILE
-            and page.run("document.querySelector('h1').textContent") == HOSTILE
-        )
+        assert page.run("document.title") == HOSTILE
+        assert page.run("document.querySelector('h1').textContent") == HOSTILE
         assert page.run("document.documentElement.scrollWidth <= innerWidth")
-        assert page.run(
-            "!under.renderer && document.querySelector('header').offsetHeight <= 0.15 * innerHeight"
-        )
+        assert page.run("!under.renderer")
+        assert page.run("document.querySelector('header').offsetHeight <= 0.15 * innerHeight")
         x, y, w, h = box(page)
         before = facts(page, "camera.position.toArray()")
         for kind, dx in (("touchStart", 0), ("touchMove", 30), ("touchMove", 70), ("touchEnd", None)):

@@ -20,7 +20,7 @@ from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.io.spz import read_spz
+from ambiguous_wild.io.spz import decode_spz
 from ambiguous_wild.viewing import page_file
 from ambiguous_wild.viewing.model import RenderSettings
 from ambiguous_wild.viewing.page_file import MAP, importance, reduced
@@ -37,12 +37,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("shown")
     scene = write_tiny_scene(root / "porch")
     ones = np.ones(2, np.uint8)
-    points = MotionPoints(
-        np.array([[0, 1], [0.5, 0.25]], np.float32),
-        ones,
-        np.array([0, 2], np.uint8),
-        np.array([0, 1], np.int16),
-    )
+    xy, moving = np.array([[0, 1], [0.5, 0.25]], np.float32), np.array([0, 2], np.uint8)
+    points = MotionPoints(xy, ones, moving, np.array([0, 1], np.int16))
     write_motion_points(scene / FILE, {TRAIN[0]: points})
     write_png(scene / MAP, np.full((86, 130, 3), 200, np.uint8))
     write_shown_run(root / "runs", scene, "3dgs", noise=20.0)
@@ -50,10 +46,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "runs"
 
 
+@pytest.fixture(scope="module")
+def hostile_page(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The page of `runs` under a hostile title."""
+    return view_runs([runs], tmp_path_factory.mktemp("page"), title=HOSTILE).path.read_text(encoding="utf-8")
+
+
 def facts(page: str) -> dict[str, Any]:
-    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.S)
-    assert found is not None
-    return json.loads(found[1])
+    (found,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', page, re.S)
+    return json.loads(found)
 
 
 def test_the_page_holds_models_photos_masks_and_numbers(runs: Path, tmp_path: Path) -> None:
@@ -71,41 +72,29 @@ def test_the_page_holds_models_photos_masks_and_numbers(runs: Path, tmp_path: Pa
             np.mean([*model["psnr"].values()])
         )
         assert set(model["masks"]) == set(TRAIN[:2])
-        text = re.search(f'<script id="{model["element"]}" type="text/plain">([^<]*)</script>', page)
-        assert text is not None
-        (tmp_path / "m.spz").write_bytes(base64.b64decode(text[1]))
-        assert len(read_spz(tmp_path / "m.spz")["means"]) == 2500
+        (text,) = re.findall(f'<script id="{model["element"]}" type="text/plain">([^<]*)</script>', page)
+        assert len(decode_spz(base64.b64decode(text), "m").gaussians["means"]) == 2500
     models = sum(map(len, re.findall(r'<script id="model-\d+".*?</script>', page)))
     assert len(page.encode()) - models < 3_000_000
     assert "index.html: " in done.stderr
 
 
-def test_names_stay_text(runs: Path, tmp_path: Path) -> None:
-    view_runs([runs], tmp_path, title=HOSTILE)
-    page = (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert "<img" not in page and page.count("<script") == page.count("</script>") == 5
-    assert "&lt;/script&gt;" in page and "\\u003c/script\\u003e" in page
+def test_names_stay_text(hostile_page: str) -> None:
+    assert "<img" not in hostile_page
+    assert hostile_page.count("<script") == hostile_page.count("</script>") == 5
+    assert "&lt;/script&gt;" in hostile_page and "\\u003c/script\\u003e" in hostile_page
 
 
-def test_the_page_allows_itself_nothing_from_elsewhere(runs: Path, tmp_path: Path) -> None:
-    view_runs([runs], tmp_path)
-    page = (tmp_path / "index.html").read_text(encoding="utf-8")
-    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
-    assert policy is not None
-    assert policy[1].startswith("default-src 'none'") and "connect-src" not in policy[1]
-    assert not re.search(
-        r"https?:|unsafe-inline|unsafe-eval'? |\*", policy[1].replace("'wasm-unsafe-eval'", "")
-    )
+def test_the_page_allows_itself_nothing_from_elsewhere(hostile_page: str) -> None:
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', hostile_page)
+    assert policy.startswith("default-src 'none'") and "connect-src" not in policy
+    assert not re.search(r"https?:|unsafe-inline|unsafe-eval'? |\*", policy.replace("'wasm-unsafe-eval'", ""))
 
 
-def test_licences_of_the_bundled_program_are_in_the_page(runs: Path, tmp_path: Path) -> None:
-    view_runs([runs], tmp_path)
-    page = (tmp_path / "index.html").read_text(encoding="utf-8")
-    comment = re.search(r"<!-- Licences.*?-->", page, re.S)
-    assert comment is not None
-    for name in ("@sparkjsdev/spark 2.2.0", "three 0.180.0", "fflate"):
-        assert name in comment[0]
-    assert comment[0].count("Permission is hereby granted, free of charge") == 3
+def test_licences_of_the_bundled_program_are_in_the_page(hostile_page: str) -> None:
+    (comment,) = re.findall(r"<!-- Licences.*?-->", hostile_page, re.S)
+    assert all(name in comment for name in ("@sparkjsdev/spark 2.2.0", "three 0.180.0", "fflate"))
+    assert comment.count("Permission is hereby granted, free of charge") == 3
 
 
 def test_the_bundle_is_that_of_the_build_script() -> None:

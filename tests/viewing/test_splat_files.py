@@ -14,11 +14,10 @@ from ambiguous_wild.core import SceneTransform
 from ambiguous_wild.harness.trained_models import read_models
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.io.splat_files import read_splats
+from ambiguous_wild.io.splat_files import FORMATS, read_splats
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.viewing.model import (
     AXES,
-    FORMATS,
     Renderer,
     RenderSettings,
     ViewedModel,

@@ -88,7 +88,7 @@ def _candidates(root: Path) -> list[tuple[str, str]]:
         return layouts
     folder = colmap.model_folder(root)
     if (root / "transforms.json").is_file() and (folder is None or not colmap.has_lists(root)):
-        data = transforms.read_json(root / "transforms.json")
+        data = transforms.read_object(root / "transforms.json")
         studio = any(key in data for key in ("ply_file_path", "camera_model", "applied_transform"))
         return [("nerfstudio" if studio else "instant-ngp", "transforms.json")]
     if folder is None:

@@ -8,10 +8,17 @@ from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.errors import AwError, shortlist, unknown
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, every_nth, inside, split_by_lists
+from ambiguous_wild.datasets.foreign import ForeignScene, every_nth, inside, split_by_lists
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ColmapModel
-from ambiguous_wild.io.scene_folder import models_in, read_list, registered, several_models
+from ambiguous_wild.io.scene_folder import (
+    SIDES,
+    models_in,
+    read_list,
+    registered,
+    several_models,
+    shipped_factors,
+)
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
 KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
@@ -79,12 +86,6 @@ def photo_folder(root: Path) -> Path:
     if registered(root):
         return root
     return root / "images"  # absent if a dataset has downsampled photos only
-
-
-def shipped_factors(root: Path) -> list[int]:
-    """Return the factors N of the downsampled folders images_N, ascending."""
-    tails = (p.name.removeprefix("images_") for p in root.glob("images_*") if p.is_dir())
-    return sorted(int(t) for t in tails if t.isdigit() and 1 < int(t) <= 64)
 
 
 def read_lists(root: Path) -> dict[Split, list[str]]:

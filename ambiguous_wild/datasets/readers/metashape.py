@@ -12,10 +12,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from ambiguous_wild.core.camera import rigid
 from ambiguous_wild.core.errors import AwError, counted, shortlist
-from ambiguous_wild.datasets.foreign import ForeignScene, read_text
+from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.readers import posed_photos
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS, ModelCamera
+from ambiguous_wild.io.untrusted import read_text
 
 FISHEYES = ("fisheye", "equidistant_fisheye")  # one lens: Metashape 2.3 calls it by the longer name
 LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -91,10 +93,8 @@ def _move(transform: Element | None) -> np.ndarray | None:
     """Return the transform [4, 4] of a component or chunk; None without one."""
     if transform is None or transform.find("rotation") is None:
         return None
-    move = np.eye(4)
-    move[:3, :3] = _numbers(transform.find("rotation"), 3, 3) * _numbers(transform.find("scale"), 1)
-    move[:3, 3] = _numbers(transform.find("translation"), 3)
-    return move
+    scaled = _numbers(transform.find("rotation"), 3, 3) * _numbers(transform.find("scale"), 1)
+    return rigid(scaled, _numbers(transform.find("translation"), 3))
 
 
 def _camera(sensor: Element, where: str) -> ModelCamera:

@@ -12,7 +12,7 @@ from ambiguous_wild.datasets.foreign import ForeignScene, inside
 from ambiguous_wild.datasets.imported_photos import at_photo_size
 from ambiguous_wild.datasets.readers.colmap import read_plain
 from ambiguous_wild.datasets.readers.phototourism import NERF_W, read_phototourism
-from ambiguous_wild.datasets.readers.transforms import read_blender, read_json, read_transforms
+from ambiguous_wild.datasets.readers.transforms import read_blender, read_object, read_transforms
 
 COLMAP = {"colmap": read_plain, "phototourism": read_phototourism}
 LOADERS: dict[str, Callable[..., ForeignScene]] = {
@@ -36,7 +36,7 @@ def read_nerfbaselines(root: Path, chosen: str = "") -> ForeignScene:
         AwError: another loader, protocol or folder than are supported.
     """
     path = root / "nb-info.json"
-    info = read_json(path)
+    info = read_object(path)
     # The loader is a name or a function: nerfbaselines.datasets.phototourism:load_phototourism_dataset
     loader = str(info.get("loader", "colmap")).partition(":")[0].rpartition(".")[2]
     if loader not in LOADERS:

@@ -15,9 +15,9 @@ from ambiguous_wild.datasets.readers.colmap import (
     photo_folder,
     read_lists,
     read_named_model,
-    shipped_factors,
 )
-from ambiguous_wild.datasets.readers.transforms import frame_name, frames_of, read_frames, read_json
+from ambiguous_wild.datasets.readers.transforms import frame_name, frames_of, read_frames, read_object
+from ambiguous_wild.io.scene_folder import shipped_factors
 
 DATASET = "NeRF On-the-go"
 FACTOR, LOW_FACTOR = 8, 4
@@ -45,7 +45,7 @@ def read_split(path: Path, count: int) -> dict[str, list[int]]:
     Raises:
         AwError: damaged, without clutter or extra, or positions that the frames do not have.
     """
-    data = read_json(path)
+    data = read_object(path)
     positions: dict[str, list[int]] = {}
     for key in ("clutter", "extra", "clean"):
         rows: Any = data.get(key, [])
@@ -79,7 +79,7 @@ def read_on_the_go(root: Path, chosen: str = "") -> ForeignScene:
             f"{root} has split.json without transforms.json, whose sorted frames its numbers count; "
             "copy it too"
         )
-    data = read_json(path)
+    data = read_object(path)
     names = sorted(
         (PurePosixPath(frame_name(f, root)) for f in frames_of(data, path)), key=lambda p: (p.name, str(p))
     )

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.readers.posed_photos import find_posed, posed_scene, tool_errors
-from ambiguous_wild.datasets.readers.transforms import frame_camera, read_json
+from ambiguous_wild.datasets.readers.transforms import frame_camera, read_object
 
 LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
@@ -32,7 +32,7 @@ def read_polycam(root: Path) -> ForeignScene:
         raise AwError(f"{cameras} holds no cameras: export raw data from Polycam, in its developer mode")
     rows = []
     for path, name in zip(files, find_posed(photos, [f.stem for f in files], cameras)):
-        data = read_json(path)
+        data = read_object(path)
         with tool_errors("Polycam", path):
             pose = [[data[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
             lens = {k: data[v] for k, v in zip(LENS, ("fx", "fy", "cx", "cy", "width", "height"))}
@@ -44,7 +44,7 @@ def find_metadata(root: Path) -> Path | None:
     """Find Record3D's metadata in an exported folder or an unpacked .r3d; None without it."""
     for path in (root / "metadata.json", root / "metadata"):
         with suppress(AwError):
-            if {"poses", "K"} <= set(read_json(path)):
+            if {"poses", "K"} <= set(read_object(path)):
                 return path
     return None
 
@@ -54,7 +54,7 @@ def read_record3d(root: Path) -> ForeignScene:
     path = find_metadata(root)
     if path is None:
         raise AwError(f"{root} has no metadata.json of Record3D, with poses and K")
-    data = read_json(path)
+    data = read_object(path)
     with tool_errors("Record3D", path):
         poses = np.array(data["poses"], np.float64).reshape(-1, 7)  # quaternion (x, y, z, w), position
         turns = Rotation.from_quat(poses[:, :4]).as_matrix()

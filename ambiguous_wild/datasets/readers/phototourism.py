@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Evaluation, Split
-from ambiguous_wild.datasets.foreign import ForeignScene, read_text, split_by_lists
+from ambiguous_wild.datasets.foreign import ForeignScene, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import (
     has_lists,
     model_names,
@@ -15,6 +15,7 @@ from ambiguous_wild.datasets.readers.colmap import (
     read_lists,
     read_named_model,
 )
+from ambiguous_wild.io.untrusted import read_text
 
 COLUMNS = ("filename", "id", "split", "dataset")
 NERF_W: Evaluation = {

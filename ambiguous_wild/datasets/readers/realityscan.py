@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ambiguous_wild.core.camera import rigid
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.datasets.foreign import ForeignScene, read_text
+from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.readers import posed_photos
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import header_size, pillow
+from ambiguous_wild.io.untrusted import read_text
 
 NAMES = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}  # other names in RealityScan 2.2
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")
@@ -62,10 +64,9 @@ def read_realityscan(root: Path) -> ForeignScene:
     photos = root / "images" if (root / "images").is_dir() else root
     rows = []
     for name, row in zip(posed_photos.find_posed(photos, [row["name"] for row in stated], path), numbers):
-        pose = np.eye(4)
         angles = [-row["heading"], row["pitch"], row["roll"]]
-        pose[:3, :3] = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
-        pose[:3, 3] = row["x"], row["y"], row["alt"]
+        rotation = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
+        pose = rigid(rotation, np.array([row["x"], row["y"], row["alt"]]))
         rows.append((name, pose, _camera(row, photos / name, path)))
     notes = [] if "k1" in columns else [f"{path.name} states no lens: the photos are taken as undistorted"]
     return posed_photos.posed_scene("realityscan", root, photos, rows, notes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -10,29 +9,27 @@ from typing import Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import SIDES, ForeignScene, find_photo, inside, read_text, split_by_lists
+from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, inside, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import sides
 from ambiguous_wild.datasets.readers.posed_photos import brown_camera, model_of_poses
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, points_without_tracks
-from ambiguous_wild.io.files import unique_keys
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
+from ambiguous_wild.io.scene_folder import SIDES
+from ambiguous_wild.io.untrusted import read_json
 
 _MODELS = ["OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
 _LENS = ("k1", "k2", "p1", "p2")
 WHITE = (255, 255, 255)
 
 
-def read_json(path: Path) -> dict[str, object]:
+def read_object(path: Path) -> dict[str, object]:
     """Read a JSON file that holds a mapping.
 
     Raises:
         AwError: unreadable, too large, or no mapping.
     """
-    try:
-        data = json.loads(read_text(path), object_pairs_hook=unique_keys)
-    except (ValueError, RecursionError) as error:
-        raise AwError(f"{path} is no JSON ({error}); copy it again") from error
+    data = read_json(path)
     if not isinstance(data, dict):
         raise AwError(f"{path} holds no mapping; copy it again")
     return data
@@ -156,7 +153,7 @@ def read_frames(
 def read_transforms(root: Path) -> ForeignScene:
     """Read transforms.json of nerfstudio or instant-ngp."""
     path = root / "transforms.json"
-    data = read_json(path)
+    data = read_object(path)
     model, folder, named = read_frames(root, path, data)
     names = sorted(named)
     notes: list[str] = []
@@ -211,7 +208,7 @@ def read_blender(root: Path) -> ForeignScene:
     rows, split = [], dict[str, Split]()
     for side in SIDES:
         path = root / f"transforms_{side}.json"
-        data = read_json(path)
+        data = read_object(path)
         for frame in frames_of(data, path):
             name = frame_name(frame, root)
             photo = find_photo(root, name)

@@ -22,8 +22,9 @@ from ambiguous_wild.core.weight_files import read_tensors
 from ambiguous_wild.harness.cell_run import refuse_other_config
 from ambiguous_wild.harness.effects_plan import read_plan
 from ambiguous_wild.harness.store import read_runs
-from ambiguous_wild.io import archive, images, ply, scene_folder
+from ambiguous_wild.io import archive, images, scene_folder
 from ambiguous_wild.io.photos import read_photo
+from ambiguous_wild.io.splat_files import FORMATS, read_splats
 from ambiguous_wild.report import board, board_pictures
 from ambiguous_wild.report.audit_numbers import read_tables
 from ambiguous_wild.simulate import capture_writer, spec_file
@@ -165,15 +166,15 @@ def _cache(path: Path) -> None:
 
 
 def _many() -> list[Reader]:
-    photos = [
-        Reader(f"photo {k}", s, functools.partial(valid.photos, k), read_photo, m)
-        for k, s, m in (
-            ("jpeg", ".jpg", damages.damage),
-            ("png", ".png", damages.png),
-            ("tiff", ".tif", damages.damage),
-            ("bmp, webp, jp2", ".img", damages.damage),
+    photos = []
+    for kind, suffix in (("jpeg", ".jpg"), ("png", ".png"), ("tiff", ".tif"), ("bmp, webp, jp2", ".img")):
+        samples, mutate = (
+            functools.partial(valid.photos, kind),
+            damages.png if kind == "png" else damages.damage,
         )
-    ]
+        photos.append(Reader(f"photo {kind}", suffix, samples, read_photo, mutate))
+        if suffix != ".img":
+            photos.append(Reader(f"scene image {kind}", suffix, samples, _scene_images, mutate))
     models = [
         _inside_scene(f"COLMAP {n}.{kind}", f"sparse/0/{n}.{kind}")
         for kind in ("bin", "txt")
@@ -184,18 +185,12 @@ def _many() -> list[Reader]:
     return [
         *photos,
         Reader("EXIF", ".jpg", valid.with_exif, read_photo, damages.exif),
-        Reader(
-            "scene image png",
-            ".png",
-            functools.partial(valid.photos, "png"),
-            _scene_images,
-            damages.png,
-        ),
-        Reader("scene image jpeg", ".jpg", functools.partial(valid.photos, "jpeg"), _scene_images),
-        Reader("scene image tiff", ".tif", functools.partial(valid.photos, "tiff"), _scene_images),
         *models,
         _inside_scene("split list", "train_list.txt"),
-        Reader("splat PLY", ".ply", valid.plys, ply.read_splat_ply),
+        *(
+            Reader(f"splats {name}", form.suffix, functools.partial(valid.splats, name), read_splats)
+            for name, form in FORMATS.items()
+        ),
         Reader("spec YAML", ".yaml", valid.specs, spec_file.read_spec, yaml_tree),
         Reader("config YAML", ".yaml", valid.configs, _config),
         Reader("scene.json", ".json", valid.scene_jsons, _scene_json, tree),
@@ -212,13 +207,7 @@ def _many() -> list[Reader]:
         Reader("archive tar", ".tar", functools.partial(valid.archives, "tar"), _unpack),
         Reader("checkpoint", ".safetensors", valid.checkpoints, checkpoint.load),
         Reader("LPIPS weights", ".pth", valid.weights, read_tensors),
-        Reader(
-            "label map PNG",
-            ".png",
-            functools.partial(valid.label_maps, "png"),
-            read_labels,
-            damages.png,
-        ),
+        Reader("label map PNG", ".png", functools.partial(valid.label_maps, "png"), read_labels, damages.png),
         Reader("label map npy", ".npy", functools.partial(valid.label_maps, "npy"), read_labels),
         Reader("cut-out", ".png", valid.cutouts, _cutout, damages.png),
         Reader("feature and mask cache", ".npz", valid.caches, _cache),

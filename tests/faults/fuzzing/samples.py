@@ -24,8 +24,9 @@ import numpy as np
 import torch
 import yaml
 
-from ambiguous_wild.io import images, ply
+from ambiguous_wild.io import images
 from ambiguous_wild.io.colmap_model import write_model
+from ambiguous_wild.io.splat_files import FORMATS, write_splats
 from ambiguous_wild.report import board_pictures
 from ambiguous_wild.report.board import Entry, board_csv, wide
 from ambiguous_wild.simulate import spec_file
@@ -64,17 +65,10 @@ def photos(name: str) -> list[bytes]:
         return [encoded(".png", i) for i in (color, gray, alpha, picture(3, np.uint16))]
     if name == "tiff":
         return [
-            encoded(".tif", color),
-            encoded(".tif", gray, 259, 1),
-            encoded(".tif", picture(3, np.uint16)),
+            encoded(".tif", i, *o) for i, o in ((color, ()), (gray, (259, 1)), (picture(3, np.uint16), ()))
         ]
-    others = [
-        encoded(".bmp", color),
-        encoded(".bmp", gray),
-        encoded(".webp", color),
-        encoded(".webp", alpha),
-    ]
-    return [*others, encoded(".jp2", color)]
+    others = ((".bmp", color), (".bmp", gray), (".webp", color), (".webp", alpha), (".jp2", color))
+    return [encoded(suffix, image) for suffix, image in others]
 
 
 @functools.cache
@@ -117,20 +111,13 @@ def scene(use: str) -> Path:
 
 
 @functools.cache
-def plys() -> list[bytes]:
+def splats(form: str) -> list[bytes]:
+    shapes = {"means": (9, 3), "quats": (9, 4), "log_scales": (9, 3), "opacity_logits": (9,), "sh0": (9, 3)}
     rng, found = np.random.default_rng(0), []
     for rest in (0, 15):
-        shapes = {
-            "means": (9, 3),
-            "quats": (9, 4),
-            "log_scales": (9, 3),
-            "opacity_logits": (9,),
-            "sh0": (9, 3),
-        }
-        arrays = {k: rng.random(s, dtype=np.float32) for k, s in shapes.items()}
-        path = workshop() / "a.ply"
-        ply.write_splat_ply(path, arrays | {"sh_rest": np.zeros((9, rest, 3), np.float32)})
-        found.append(path.read_bytes())
+        arrays = {k: rng.random(s, dtype=np.float32) for k, s in (shapes | {"sh_rest": (9, rest, 3)}).items()}
+        write_splats(FORMATS[form], workshop() / "a.splats", arrays)
+        found.append((workshop() / "a.splats").read_bytes())
     return found
 
 
@@ -144,10 +131,15 @@ def configs() -> list[bytes]:
     config = {"method": "3dgs", "options": {}, "train": {"iterations": 60, "rates": [1.0, 0.5]},
               "scene": {"name": "s", "sha256": "0" * 64, "factor": 1, "path": "/x"},
               "config_hash": "h"}  # fmt: skip
+    return [yaml.safe_dump(config).encode(), (yaml_bomb() + "method: *j\nscene: {name: *j}\n").encode()]
+
+
+def yaml_bomb() -> str:
+    """Nine levels of nine aliases each."""
     bomb = "a: &a [x, x, x, x, x, x, x, x, x]\n"
     for old, new in zip("abcdefghi", "bcdefghij"):
         bomb += f"{new}: &{new} [{', '.join(['*' + old] * 9)}]\n"
-    return [yaml.safe_dump(config).encode(), (bomb + "method: *j\nscene: {name: *j}\n").encode()]
+    return bomb
 
 
 @functools.cache
@@ -182,13 +174,8 @@ def plans() -> list[bytes]:
 
 @functools.cache
 def captures() -> list[bytes]:
-    facts = {
-        "identity": "i",
-        "preset": "tiny",
-        "seed": 0,
-        "files": {"a": hashlib.sha256(b"x").hexdigest()},
-        "photos": {},
-    }
+    files = {"a": hashlib.sha256(b"x").hexdigest()}
+    facts = {"identity": "i", "preset": "tiny", "seed": 0, "files": files, "photos": {}}
     return [json.dumps(facts).encode()]
 
 

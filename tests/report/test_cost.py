@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ambiguous_wild.report.cost_targets import first_time, times_to_reach
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,7 +29,6 @@ from ambiguous_wild.report.cost_curves import (
 from ambiguous_wild.report.cost_plots import draw_all, spread_out
 from ambiguous_wild.report.cost_report import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, read_cost_runs
-from ambiguous_wild.report.cost_targets import first_time, times_to_reach
 from tests.harness.fake_runs import failed
 from tests.report.fake_cost import cost_run
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ambiguous_wild.report.cost_targets import answers
 from click.testing import CliRunner
 
 from ambiguous_wild.cli.cost import command
@@ -18,7 +19,6 @@ from ambiguous_wild.report.cost_curves import changes, curves_of
 from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, value_at, words_of
 from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text
 from ambiguous_wild.report.cost_runs import CostRuns, read_cost_runs
-from ambiguous_wild.report.cost_targets import answers
 from tests.report.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene
 

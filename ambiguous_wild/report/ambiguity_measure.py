@@ -137,7 +137,7 @@ class MeasuredScene:
     objects: bool  # compared with the objects of --objects, not with every static region
 
     def cosine_map(self, index: int, photo: np.ndarray) -> np.ndarray | None:  # [h, w] in [-1, 1]
-        """Return the cosine of each cell with the photo's largest distractor; None if it has no distractor."""
+        """Return the cosine of each cell with the photo's largest distractor; None if it has none."""
         import torch
 
         regions = self.distractors[index]

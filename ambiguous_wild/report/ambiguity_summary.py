@@ -29,7 +29,7 @@ REAL = "raw cosine, as in the paper"
 
 # Number of distractors, of those that a kind of evidence reveals (None = not available), and of the others.
 EvidenceCounts = dict[str, int | None]
-# The content of ambiguity.json, and its parts. Two keys are names of metrics, so that a type cannot list them.
+# The content of ambiguity.json, and its parts; two keys are names of metrics, which a type cannot list.
 Summary = dict[str, Any]
 PhotoRow = dict[str, str | float | None]  # a row of photos.csv, by column
 

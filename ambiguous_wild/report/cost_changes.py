@@ -16,7 +16,8 @@ import numpy as np
 
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_curves import MeanAndDeviation
-from ambiguous_wild.report.cost_runs import CostRun, grouped, why_unranked
+from ambiguous_wild.report.cost_runs import CostRun, why_unranked
+from ambiguous_wild.report.grouping import grouped
 
 SAME_TIME = 0.01  # of the training: a smaller difference of times counts as none
 ABSENT = "(absent)"

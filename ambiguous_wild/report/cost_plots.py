@@ -16,7 +16,7 @@ from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.report.cost_changes import KINDS, Change
 from ambiguous_wild.report.cost_curves import Curve, MeanAndDeviation, Point, pareto, summary, timeline
 from ambiguous_wild.report.cost_report import PLOTS, CostReport, TimeUnit, per_minute
-from ambiguous_wild.report.cost_runs import grouped
+from ambiguous_wild.report.grouping import grouped
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))  # when colours run out
 GREY = "0.45"

@@ -27,7 +27,8 @@ from ambiguous_wild.report.cost_curves import (
     points,
     times_to_reach,
 )
-from ambiguous_wild.report.cost_runs import CostRuns, grouped, why_unranked
+from ambiguous_wild.report.cost_runs import CostRuns, why_unranked
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.table_layout import Table, text_table
 
 PLOTS = ("timelines", "budgets", "front", "changes")

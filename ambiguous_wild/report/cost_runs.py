@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -22,9 +22,8 @@ from ambiguous_wild.harness.store import BOOKKEEPING, ReadConfig, check_names, f
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.io.files import own_json
 from ambiguous_wild.metrics import stats
+from ambiguous_wild.report.grouping import grouped
 
-T = TypeVar("T")
-K = TypeVar("K")
 SETTINGS = ("resolution", "max_gaussians")  # settings of training that are compared like options
 NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")
 
@@ -264,14 +263,6 @@ def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[tuple[float,
         # The timeline rounds to milliseconds. Its last probe is the result itself, before it was saved.
         points = [p for p in points if p[0] < train_s - 0.002] + [(train_s, psnr)]
     return tuple(sorted(points)), damage
-
-
-def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Return the items by key, in the order in which the keys first occur."""
-    groups: dict[K, list[T]] = {}
-    for item in items:
-        groups.setdefault(key(item), []).append(item)
-    return groups
 
 
 def _refuse_twice(runs: Iterable[CostRun]) -> None:

@@ -16,6 +16,7 @@ from ambiguous_wild.harness.result_file import Options
 from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
 
 LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps
@@ -98,14 +99,11 @@ def _failed(runs: Runs) -> list[str]:
 
 def _absent(runs: Runs, methods: Sequence[str], scenes: Sequence[str]) -> list[str]:
     done = set(zip(runs.runs["method"], runs.runs["scene"]))
-    # methods that lack the same scenes share a line
-    lacking: dict[tuple[str, ...], list[str]] = {}
-    for method in methods:
-        if absent := tuple(scene for scene in scenes if (method, scene) not in done):
-            lacking.setdefault(absent, []).append(method)
+    lacking = grouped(methods, lambda method: tuple(s for s in scenes if (method, s) not in done))
     return [
         f"no result: {', '.join(names)} on {shortlist(absent)}; no mean over scenes"
         for absent, names in lacking.items()
+        if absent
     ]
 
 
@@ -129,12 +127,12 @@ def _fitted(runs: Runs) -> list[str]:
     ok = runs.runs[runs.runs["status"] == "ok"]
     if not len(ok) or set(ok["fit"]) == {"full"}:
         return []
-    lines = []
-    for kind, text in FITTED.items():
-        names = sorted(set(ok[ok["fit"] == kind]["method"]))
-        if names:
-            lines.append(f"test photos: {shortlist(names, limit=30)}: {text}")
-    return lines
+    by_kind = {kind: sorted(set(of["method"])) for kind, of in ok.groupby("fit")}
+    return [
+        f"test photos: {shortlist(by_kind[kind], limit=30)}: {text}"
+        for kind, text in FITTED.items()
+        if kind in by_kind
+    ]
 
 
 def _unfitted(runs: Runs) -> list[str]:
@@ -223,15 +221,14 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
-    for _, group in ok.groupby(["method", "scene"]):
-        if group["options_hash"].nunique() > 1:
-            method, scene = group["method"].iloc[0], group["scene"].iloc[0]
+    for (method, scene), count in ok.groupby(["method", "scene"])["options_hash"].nunique().items():
+        if count > 1:
             lines.append(f"{UNEQUAL}: runs of {method} on {scene} have different options")
-    for method, group in ok.groupby("method"):
-        if group["source"].nunique() > 1:
+    for method, count in ok.groupby("method")["source"].nunique().items():
+        if count > 1:
             lines.append(
-                f"{UNEQUAL}: results of {method!s} come from {group['source'].nunique()} versions of its "
-                "file (source in config.yaml differs); run them again with one"
+                f"{UNEQUAL}: results of {method!s} come from {count} versions of its file (source in "
+                "config.yaml differs); run them again with one"
             )
     if "iterations" in ok and not any("lengths differ" in line for line in unequal(ok)):
         lengths = ok["iterations"].astype(float)
@@ -284,14 +281,11 @@ def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
     """Return a line for each reason why times are not ranked."""
     if not any(c.timed for c in columns):
         return []
-    reasons: dict[str, list[str]] = {}
-    for (method, scene), reason in untimed(frame).items():
-        reasons.setdefault(reason, []).append(f"{method} on {scene}")
     total = len(frame[frame["status"] == "ok"].groupby(["method", "scene"]))
-    lines = [
-        f"times not ranked: {'all' if len(who) == total else shortlist(who)} ({reason})"
-        for reason, who in reasons.items()
-    ]
+    lines = []
+    for reason, of in grouped(untimed(frame).items(), lambda item: item[1]).items():
+        who = shortlist(f"{method} on {scene}" for (method, scene), _ in of)
+        lines.append(f"times not ranked: {'all' if len(of) == total else who} ({reason})")
     unranked = incomparable(frame, columns)
     if unranked - {REFERENCE}:
         machines = sorted(set(frame[frame["timing"] == "alone"]["hardware"]))

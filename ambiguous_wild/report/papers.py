@@ -70,7 +70,7 @@ def paper(
 def _by_dataset(
     runs: Runs, metrics: Sequence[str], scenes: Sequence[str], datasets: Mapping[str, Sequence[str]]
 ) -> Iterator[tuple[str, tuple[str, ...], list[Table]]]:
-    """Yield each dataset with its scenes and the tables of `comparison`, ties marked; the mean comes first."""
+    """Yield each dataset with its scenes and the tables of `comparison`, ties marked; the mean is first."""
     ties, shown = Ties(runs), metrics or quality_columns(runs)
     for name, members in divided(runs, scenes, datasets).items():
         tables = comparison(runs, metrics=shown, scenes=members, drop_empty=not metrics)
@@ -94,11 +94,10 @@ def means(
         notes |= dict.fromkeys(tables[-1].notes)
     rows = []
     for method in sorted({row.name for part in parts for row in part.rows}):
-        own = ([row for row in part.rows if row.name == method] for part in parts)
-        absent = ((TableCell(state="absent"),) * len(part.columns) for part in parts)
-        cells = (
-            cell for rows_of, none in zip(own, absent) for cell in (rows_of[0].cells if rows_of else none)
-        )
+        cells: list[TableCell] = []
+        for part in parts:
+            absent = (TableCell(state="absent"),) * len(part.columns)
+            cells += next((row.cells for row in part.rows if row.name == method), absent)
         rows.append(Row(method, tuple(cells)))
     columns = tuple(column for part in parts for column in part.columns)
     return [Table("means over scenes, by dataset (number of scenes)", columns, tuple(rows), tuple(notes))]
@@ -245,7 +244,7 @@ class Ties:
                 return False
             a, b = values[best].to_numpy(float), values[other].to_numpy(float)
             finite = ~(np.isinf(a) | np.isinf(b))  # means leave out infinite values, so differences do too
-            differences.append((a - b)[finite])
+            differences.append(a[finite] - b[finite])
         low, high = difference_interval(differences)
         few = sum(map(len, differences)) < LEAST and not math.isnan(low)
         return few or low <= 0.0 <= high

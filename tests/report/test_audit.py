@@ -110,7 +110,7 @@ PLANTS: dict[str, tuple[str, Callable[[list[Row]], object]]] = {
     "impossible": ("out of place", lambda rows: shift(entry(rows)["ssim"], 1.0, 3)),
     "slipped point": ("out of place", slipped_point),
     "wrong rank": ("rank", wrong_rank),
-    "lost digit": ("digits", lambda rows: entry(rows)["psnr"].update(value=entry(rows)["psnr"]["value"] + "1")),
+    "lost digit": ("digits", lambda rows: shift(entry(rows)["psnr"], 0.001, 3)),
     "no unit": ("unit", lambda rows: pick(rows, metric="memory")[0].update(variant="")),
 }  # fmt: skip
 

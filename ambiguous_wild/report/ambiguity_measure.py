@@ -253,10 +253,10 @@ def _fitted(scene: Scene, spec: str) -> Any:
     from ambiguous_wild.vision.protocols import SceneFeatures
 
     backend = make_features(spec)
-    learns = isinstance(backend, SceneFeatures)
-    views = scene.train if learns else spread(list(scene.train), FIT_PHOTOS)
+    views = list(scene.train)
+    views = views if isinstance(backend, SceneFeatures) else spread(views, FIT_PHOTOS)
     photos = [torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in views]
-    if learns:
+    if isinstance(backend, SceneFeatures):
         backend.fit_scene(photos, train_tracks(scene), None)
     else:
         backend.fit(photos)

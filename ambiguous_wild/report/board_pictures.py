@@ -144,7 +144,9 @@ class BoardPictures:
                 self.write(render.photo, _jpeg(path))
             path = (run.run / RENDERS / name).with_suffix(".png")
             self.write(render, _jpeg(path), e.seed, run.psnr[name])
-        views = {} if scene is None else {v.name: v for v in scene.train}
+        if scene is None:
+            return
+        views = {v.name: v for v in scene.train}
         masks = {n: path for n in views if (path := (run.run / MASKS / n).with_suffix(".png")).is_file()}
         for name in chosen(tuple(sorted(masks)), count):
             view, mask = views[name], replace(own, image=name, kind=TRAIN)
@@ -152,7 +154,7 @@ class BoardPictures:
                 continue
             self.write(mask.photo, _jpeg(view.image_path))
             size = (view.camera.width, view.camera.height)
-            exact = run.scene.root / "truth" / "distractor" / Path(name).with_suffix(".png")
+            exact = scene.root / "truth" / "distractor" / Path(name).with_suffix(".png")
             if exact.is_file():
                 drawn = _overlay(read_gray(exact) >= 128, size, EXACT_RGBA)
                 self.write(replace(mask.photo, kind=EXACT), drawn)

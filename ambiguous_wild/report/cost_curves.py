@@ -126,7 +126,7 @@ def timeline(curve: Curve, scenes: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     if end < begin:
         return np.empty(0), np.empty(0)
     seconds = np.linspace(begin, end, 120)
-    means = [np.mean([np.interp(seconds, *zip(*r.points)) for r in runs], axis=0) for runs in by_scene]
+    means = [np.mean([np.interp(seconds, *np.array(r.points).T) for r in runs], axis=0) for runs in by_scene]
     return seconds, np.mean(means, axis=0)
 
 

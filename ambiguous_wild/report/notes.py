@@ -221,14 +221,15 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
-    for (method, scene), count in ok.groupby(["method", "scene"])["options_hash"].nunique().items():
-        if count > 1:
+    for _, group in ok.groupby(["method", "scene"]):
+        if group["options_hash"].nunique() > 1:
+            method, scene = group["method"].iloc[0], group["scene"].iloc[0]
             lines.append(f"{UNEQUAL}: runs of {method} on {scene} have different options")
-    for method, count in ok.groupby("method")["source"].nunique().items():
-        if count > 1:
+    for method, group in ok.groupby("method"):
+        if group["source"].nunique() > 1:
             lines.append(
-                f"{UNEQUAL}: results of {method!s} come from {count} versions of its file (source in "
-                "config.yaml differs); run them again with one"
+                f"{UNEQUAL}: results of {method!s} come from {group['source'].nunique()} versions of its "
+                "file (source in config.yaml differs); run them again with one"
             )
     if "iterations" in ok and not any("lengths differ" in line for line in unequal(ok)):
         lengths = ok["iterations"].astype(float)

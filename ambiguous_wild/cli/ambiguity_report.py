@@ -86,7 +86,7 @@ def command(
         raise AwError(f"{folder} is inside {scene} and would change the scene; choose another -o")
     check_output(folder / "index.html" if folder.is_dir() else folder)
     ambiguity_page.check_folder(folder)
-    measured, look = ambiguity_measure.measure(
+    measured = ambiguity_measure.measure(
         loaded,
         found,
         behind,
@@ -94,10 +94,8 @@ def command(
         objects=objects,
         progress=lambda v: tqdm(v, unit="photo", desc="measure", disable=as_json or None),
     )
-    facts = ambiguity_summary.summarise(
-        loaded, measured, look, features=features, masks=found.source, background=behind.source, seed=seed
-    )
-    ambiguity_page.write_report(loaded, found, behind, measured, look, facts, folder)
+    facts = ambiguity_summary.summarise(measured, seed)
+    ambiguity_page.write_report(measured, facts, folder)
     # scene.json is not part of the scene's identity, which is a hash of the other files.
     info = read_scene_json(scene) if record else None
     if info is not None:
@@ -109,4 +107,4 @@ def command(
     for line in ambiguity_summary.describe(facts):
         click.echo(line)
     saved = ", scores saved in scene.json" if info is not None else ""
-    click.echo(f"wrote {folder / 'index.html'} ({len(measured)} photos){saved}")
+    click.echo(f"wrote {folder / 'index.html'} ({len(measured.photos)} photos){saved}")

@@ -36,6 +36,7 @@ from ambiguous_wild.methods.ablation_groups import DEFAULT
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_plots import label_points, new_figure
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell, ranks
 
@@ -130,13 +131,11 @@ def csv_of(data: StudyReport) -> str:
     """Return one line for each variant; cells are empty where a value is missing."""
     lines = []
     for row in data["rows"]:
-        line: Facts = {"group": row["group"], "variant": row["variant"], "status": row["status"]}
-        line |= {"reason": row["reason"], "same_as": row["same_as"]}
+        line: Facts = {key: row[key] for key in ("group", "variant", "status", "reason", "same_as")}
         line |= {"settings": " ".join(row["settings"]), "runs": len(row["runs"])}
-        for key, entry in row["values"].items():
-            line |= {key: entry["mean"], f"{key}_spread": entry["spread"]}
-        for key, entry in row["differences"].items():
-            line |= {f"difference_{key}": entry["mean"], f"difference_{key}_spread": entry["spread"]}
+        for begin, entries in (("", row["values"]), ("difference_", row["differences"])):
+            for key, entry in entries.items():
+                line |= {f"{begin}{key}": entry["mean"], f"{begin}{key}_spread": entry["spread"]}
         lines.append(line)
     return to_csv(list(lines[0]), (line.values() for line in lines))
 
@@ -225,11 +224,9 @@ def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
         for name in metrics:
             if name not in keys:
                 raise AwError(f"{path} has no {name!r}: it has {', '.join(keys)}")
-        with_value = {
-            key for row in data["rows"] for key in keys if not math.isnan(_mean(row, "values", key))
-        }
         columns = {m.key: m for m in METRICS}
-        shown = metrics or [key for key in SHOWN if key in with_value]
+        present = (k for k in SHOWN if any(not math.isnan(_mean(row, "values", k)) for row in data["rows"]))
+        shown = metrics or list(present)
         return _tables(data, [columns.get(key, measure(key)) for key in shown])
     except FileNotFoundError:
         raise AwError(f"no {REPORT} in {folder}: 'aw ablate -o {folder}' writes it") from None
@@ -248,16 +245,11 @@ def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool 
         untimed = {
             r["variant"]: why for r in members for run in r.get("runs", ()) if (why := run.get("untimed"))
         }
-        by_column = [
-            ranks(
-                [
-                    math.nan if c.timed and row["variant"] in untimed else _mean(row, "values", c.key)
-                    for row in members
-                ],
-                c,
-            )
-            for c in columns
-        ]
+        by_column = []
+        for c in columns:
+            ranked = (not c.timed or row["variant"] not in untimed for row in members)
+            values = [_mean(row, "values", c.key) if ok else math.nan for row, ok in zip(members, ranked)]
+            by_column.append(ranks(values, c))
         lines = []
         for k, row in enumerate(members):
             cells = [_cell(row, c, rank[k]) for c, rank in zip(columns, by_column)]
@@ -265,9 +257,8 @@ def _tables(data: StudyReport, columns: Sequence[Measure], *, differences: bool 
                 cells = [*(_difference(row, c) for c in DIFFERENCES), *cells, _what(row)]
             lines.append(Row(str(row["variant"]), tuple(cells), note=str(row["text"])))
         notes = [f"{r['variant']} {r['status']}: {r['reason']}" for r in members if r["status"] != "ok"]
-        for reason in dict.fromkeys(untimed.values()):
-            names = shortlist(name for name, why in untimed.items() if why == reason)
-            notes.append(f"times not ranked: {names} ({reason})")
+        for reason, of in grouped(untimed.items(), lambda item: item[1]).items():
+            notes.append(f"times not ranked: {shortlist(name for name, _ in of)} ({reason})")
         heads = [Column("", c) for c in columns]
         if differences:
             first = (Column("", replace(c, label=f"d {c.label}", better=None)) for c in DIFFERENCES)

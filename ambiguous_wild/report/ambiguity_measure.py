@@ -119,11 +119,15 @@ class PhotoMeasures:
 
 
 @dataclass(frozen=True)
-class MappedFeatures:
-    """The features of a scene and of its regions, from which maps are drawn."""
+class MeasuredScene:
+    """A scene, what its distractors are compared with, the measurements of its train photos, and features."""
 
-    spec: str  # name of the features
-    features: Any
+    scene: Scene
+    masks: DistractorMasks
+    background: Background
+    photos: list[PhotoMeasures]
+    features: str  # name of the back end
+    backend: Any
     whitened: bool
     mean: np.ndarray  # [C], subtracted if whitened
     whiten: np.ndarray  # [C, C]
@@ -131,6 +135,21 @@ class MappedFeatures:
     anchors: sem.Anchors
     usual: float  # cosine at which a match is as good as those within the static scene; NaN = unknown
     objects: bool  # compared with the objects of --objects, not with every static region
+
+    def cosine_map(self, index: int, photo: np.ndarray) -> np.ndarray | None:  # [h, w] in [-1, 1]
+        """Return the cosine of each cell with the photo's largest distractor; None if it has none."""
+        import torch
+
+        regions = self.distractors[index]
+        if not len(regions):
+            return None
+        which = int(np.argmax(regions.pixels))
+        direction = regions.means[which] / max(float(np.linalg.norm(regions.means[which])), 1e-12)
+        with torch.no_grad():
+            grid = self.backend(torch.from_numpy(seen_by(self.features, photo))).numpy().astype(np.float64)
+        if self.whitened:
+            grid = (grid - self.mean) @ self.whiten
+        return grid @ direction / np.maximum(np.linalg.norm(grid, axis=2), 1e-12)
 
 
 def feature_family(spec: str) -> str:
@@ -154,9 +173,8 @@ def measure(
     *,
     features: str = "labhog",
     objects: Path | None = None,
-    cache: Path | None = None,
     progress: Bar = iter,
-) -> tuple[list[PhotoMeasures], MappedFeatures]:
+) -> MeasuredScene:
     """Score every train photo.
 
     Args:
@@ -165,7 +183,6 @@ def measure(
         background: the background behind them.
         features: name of a back end, see `vision.backends`.
         objects: folder with masks of static objects to compare with, white = object; None: all segments.
-        cache: folder for features that learn from the scene.
         progress: wraps the list of views, to show a bar.
 
     Raises:
@@ -177,7 +194,7 @@ def measure(
     from ambiguous_wild.vision.segments import GraphSegments
 
     views = list(scene.train)
-    backend = fitted(scene, features, cache)
+    backend = _fitted(scene, features)
     segments = GraphSegments()
     statistics = sem.ChannelStatistics()
     named = _object_masks(objects, views) if objects is not None else None
@@ -195,37 +212,35 @@ def measure(
         statistics.add(grid)
         regions, _ = ndimage.label(hidden)
         whole = segments.labels(torch.from_numpy(seen))
-        parts = np.where(hidden, 0, whole)
         moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))
-        every.append(sem.region_means(grid, parts, sem.MIN_SHARE))
+        every.append(sem.region_means(grid, np.where(hidden, 0, whole), sem.MIN_SHARE))
         static.append(every[-1])
         if named is not None:
-            things = _objects(features, named, view, hidden)
-            static[-1] = sem.region_means(grid, things, sem.MIN_SHARE)
+            things = np.zeros(hidden.shape, bool)  # a photo without a mask has no objects
+            if view.name in named:
+                things = small_mask(features, load_mask(named[view.name], view)) & ~hidden
+            static[-1] = sem.region_means(grid, ndimage.label(things)[0], sem.MIN_SHARE)
         evidence.append(distractors(regions, photo, behind, known, whole, points.get(view.name)))
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
     mean, whiten = statistics.whitening()
     whitened = weight_free(features)
     if whitened:
-        moving = [r.whitened(mean, whiten) for r in moving]
-        static = [r.whitened(mean, whiten) for r in static]
-        every = [r.whitened(mean, whiten) for r in every]
-    matches = sem.matches(moving, static)
+        moving, static, every = ([r.whitened(mean, whiten) for r in rs] for rs in (moving, static, every))
     anchors, usual = sem.anchors(static, every), sem.usual_match(every)
-    look = MappedFeatures(
-        features, backend, whitened, mean, whiten, moving, anchors, usual, objects is not None
-    )
-    measured = []
-    for score, of_photo, in_photo in zip(scores, matches, evidence):
+    photos = []
+    for score, of_photo, in_photo in zip(scores, sem.matches(moving, static), evidence):
         cosines = {} if math.isnan(usual) else {match.label: match.cosine for match in of_photo}
         in_photo = [
             replace(d, features=cosines[d.label] < usual if d.label in cosines else None) for d in in_photo
         ]
-        measured.append(PhotoMeasures(*score, of_photo, in_photo))
-    return measured, look
+        photos.append(PhotoMeasures(*score, of_photo, in_photo))
+    return MeasuredScene(
+        scene, masks, background, photos, features, backend, whitened, mean, whiten, moving, anchors, usual,
+        named is not None,
+    )  # fmt: skip
 
 
-def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
+def _fitted(scene: Scene, spec: str) -> Any:
     """Make features by name and fit them to the scene's train photos.
 
     Raises:
@@ -239,29 +254,13 @@ def fitted(scene: Scene, spec: str, cache: Path | None) -> Any:
 
     backend = make_features(spec)
     views = list(scene.train)
+    views = views if isinstance(backend, SceneConv) else spread(views, FIT_PHOTOS)
+    photos = [torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in views]
     if isinstance(backend, SceneConv):
-        photos = [torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in views]
-        backend.fit_scene(photos, train_tracks(scene), cache)
-        return backend
-    chosen = spread(views, FIT_PHOTOS)
-    backend.fit([torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in chosen])
+        backend.fit_scene(photos, train_tracks(scene), None)
+    else:
+        backend.fit(photos)
     return backend
-
-
-def cosine_map(look: MappedFeatures, index: int, photo: np.ndarray) -> np.ndarray | None:  # [h, w] in [-1, 1]
-    """Return the cosine of each cell with the photo's largest distractor; None if it has no distractor."""
-    import torch
-
-    regions = look.distractors[index]
-    if not len(regions):
-        return None
-    which = int(np.argmax(regions.pixels))
-    direction = regions.means[which] / max(float(np.linalg.norm(regions.means[which])), 1e-12)
-    with torch.no_grad():
-        grid = look.features(torch.from_numpy(seen_by(look.spec, photo))).numpy().astype(np.float64)
-    if look.whitened:
-        grid = (grid - look.mean) @ look.whiten
-    return grid @ direction / np.maximum(np.linalg.norm(grid, axis=2), 1e-12)
 
 
 def seen_by(features: str, photo: np.ndarray) -> np.ndarray:  # [h, w, 3]
@@ -286,25 +285,10 @@ def _size(features: str, shape: tuple[int, ...]) -> tuple[int, int] | None:
     return max(round(shape[1] * scale), 1), max(round(shape[0] * scale), 1)
 
 
-def _objects(
-    features: str, named: dict[str, Path], view: View, distractor: np.ndarray
-) -> np.ndarray:  # [h, w] int
-    """Return labels of the static objects of a photo from 1, 0 elsewhere and on distractors.
-
-    Without a mask for the photo all are 0. The size is that of `seen_by`.
-    """
-    from scipy import ndimage
-
-    if view.name not in named:
-        return np.zeros(distractor.shape, int)
-    mask = small_mask(features, load_mask(named[view.name], view))
-    return np.asarray(ndimage.label(mask & ~distractor)[0])
-
-
 def _object_masks(folder: Path, views: list[View]) -> dict[str, Path]:
     if not folder.is_dir():
         raise AwError(f"there is no folder {folder} of object masks (--objects)")
-    masks = {v.name: folder / f"{stem(v)}.png" for v in views if (folder / f"{stem(v)}.png").is_file()}
+    masks = {v.name: path for v in views if (path := folder / f"{stem(v)}.png").is_file()}
     if not masks:
         raise AwError(
             f"{folder} holds no mask of a train photo: name them as the photos, {stem(views[0])}.png"

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.core import Scene
 from ambiguous_wild.harness.sheets import spread
 from ambiguous_wild.io.files import (
     atomic_dir,
@@ -26,8 +25,7 @@ from ambiguous_wild.io.page_parts import data_uri, jpeg_bytes, narrowed
 from ambiguous_wild.io.palette import ADDED, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.report.ambiguity_measure import BINS, MappedFeatures, PhotoMeasures, cosine_map
-from ambiguous_wild.report.ambiguity_sources import Background, DistractorMasks
+from ambiguous_wild.report.ambiguity_measure import BINS, MeasuredScene, PhotoMeasures
 from ambiguous_wild.report.ambiguity_summary import (
     NO_DISTRACTORS,
     PhotoRow,
@@ -46,19 +44,7 @@ SIDE = 480  # px a picture in the figure at most
 FILES = ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv")
 SHOWN = 8  # photos with maps on the page
 WIDTH = 420  # px of a picture on the page
-_STYLE = """
-:root{--back:#fff;--text:#222;--line:#ddd}
-@media(prefers-color-scheme:dark){:root{--back:#14181b;--text:#e6e9eb;--line:#343c42}}
-body{font:16px/1.45 system-ui,sans-serif;max-width:90em;margin:1.5em auto;padding:0 1em}
-body{background:var(--back);color:var(--text)}figure{margin:0}figcaption{font-size:13px;opacity:.8}
-img{max-width:100%;height:auto}table{border-collapse:collapse;font-size:14px}
-td,th{padding:3px 9px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
-th:first-child{text-align:left;font-weight:normal}.wide{overflow-x:auto}.class{font-size:1.25em;font-weight:600}
-.row{display:grid;grid-template-columns:repeat(auto-fit,minmax(15em,1fr));gap:6px;margin-bottom:1.2em}
-.row img{width:100%;display:block}h3{margin:.6em 0 .2em;font-size:1em;overflow-wrap:anywhere}
-.bar{height:.9em;max-width:24rem;background:linear-gradient(90deg,#5fbaa8,#b2e0a2,#ffffbf,#fdb466,#f06744)}
-.ends{display:flex;justify-content:space-between;max-width:24rem;font-size:13px}
-"""
+PAGE = Path(__file__).parent / "page"
 _CLASSES = {
     "both": "ambiguous in colour and semantically",
     "colour": "ambiguous in colour",
@@ -99,52 +85,42 @@ def residual_picture(
     return shown
 
 
-def cosine_picture(
-    look: MappedFeatures, index: int, photo: np.ndarray, distractor: np.ndarray
-) -> np.ndarray | None:
+def cosine_picture(cosines: np.ndarray | None, distractor: np.ndarray) -> np.ndarray | None:
     """Draw the cosine of every cell with the photo's largest distractor; distractors are outlined."""
     import cv2
 
-    cosines = cosine_map(look, index, photo)
     if cosines is None:
         return None
-    size = (photo.shape[1], photo.shape[0])
-    shown = cv2.resize(ramp(1.0 - cosines, 0.0, 1.0), size, interpolation=cv2.INTER_NEAREST)
+    height, width = distractor.shape
+    shown = cv2.resize(ramp(1.0 - cosines, 0.0, 1.0), (width, height), interpolation=cv2.INTER_NEAREST)
     edges, _ = cv2.findContours(distractor.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(cv2.drawContours(shown, edges, -1, (20, 20, 20), max(1, photo.shape[1] // 240)))
+    return np.asarray(cv2.drawContours(shown, edges, -1, (20, 20, 20), max(1, width // 240)))
 
 
 def _maps(
-    scene: Scene, masks: DistractorMasks, background: Background, look: MappedFeatures, index: int
+    measured: MeasuredScene, index: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray | None, ...]]:
     """Return a photo, its mask, and three pictures of it: overlay, residual, cosine; None where unknown."""
-    view = scene.train[index]
-    photo, distractor = load_image_float(view.image_path), masks.load(view)
-    behind, known = background.load(index, view)
+    view = measured.scene.train[index]
+    photo, distractor = load_image_float(view.image_path), measured.masks.load(view)
+    behind, known = measured.background.load(index, view)
     residual = None if behind is None else residual_picture(photo, behind, known, distractor)
-    cosine = cosine_picture(look, index, photo, distractor)
+    cosine = cosine_picture(measured.cosine_map(index, photo), distractor)
     return photo, distractor, (overlay(photo, distractor), residual, cosine)
 
 
-def write_figure(
-    scene: Scene,
-    masks: DistractorMasks,
-    background: Background,
-    measured: list[PhotoMeasures],
-    look: MappedFeatures,
-    path: Path,
-) -> None:
+def write_figure(measured: MeasuredScene, path: Path) -> None:
     """Write the figure with photos, maps and histograms as PNG."""
     from matplotlib.figure import Figure
 
-    picks = chosen(measured)
+    picks = chosen(measured.photos)
     columns = max(len(picks), 3)
     figure = Figure(figsize=(3.6 * columns, 9.2), layout="constrained", dpi=110)
     grid = figure.add_gridspec(4, 12)
     for column, index in enumerate(picks):
-        view = scene.train[index]
-        _, distractor, pictures = _maps(scene, masks, background, look, index)
-        name = view.name if len(view.name) <= 28 else f"…{view.name[-27:]}"
+        name = measured.scene.train[index].name
+        _, distractor, pictures = _maps(measured, index)
+        name = name if len(name) <= 28 else f"…{name[-27:]}"
         captions = [
             f"{name}: {100 * distractor.mean():.0f} % covered",
             "residual to the background",
@@ -153,7 +129,7 @@ def write_figure(
         span = slice(12 * column // len(picks), 12 * (column + 1) // len(picks))
         for line, (picture, caption) in enumerate(zip(pictures, captions)):
             _panel(figure.add_subplot(grid[line, span]), picture, caption)
-    _histograms(figure, grid, measured, look)
+    _histograms(figure, grid, measured)
     _legend(figure)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})
@@ -194,21 +170,21 @@ def _legend(figure: Any) -> None:
     )
 
 
-def _histograms(figure: Any, grid: Any, measured: list[PhotoMeasures], seen: MappedFeatures) -> None:
+def _histograms(figure: Any, grid: Any, measured: MeasuredScene) -> None:
     colour, cover, look = (figure.add_subplot(grid[3, s]) for s in (slice(0, 4), slice(4, 8), slice(8, 12)))
-    counts = np.sum([m.histogram for m in measured], axis=0)
+    counts = np.sum([m.histogram for m in measured.photos], axis=0)
     colour.stairs(counts / max(counts.sum(), 1), BINS, fill=True, color=plot_colour(ADDED))
     colour.axvline(am.COLOUR_THRESHOLD, color="k", ls="--", lw=1)
     colour.set_xlabel(f"colour difference (close: below {am.COLOUR_THRESHOLD})", fontsize=9)
     colour.set_ylabel("share of distractor px", fontsize=9)
-    cover.hist([100 * m.counts.occlusion for m in measured], bins=12, color=plot_colour(LOCAL))
+    cover.hist([100 * m.counts.occlusion for m in measured.photos], bins=12, color=plot_colour(LOCAL))
     cover.set_xlabel("% of a photo covered", fontsize=9)
-    cosines = [c for m in measured if not math.isnan(c := sem.photo_cosine(m.matches))]
+    cosines = [c for m in measured.photos if not math.isnan(c := sem.photo_cosine(m.matches))]
     look.hist(cosines, bins=24, range=(-0.2, 1.0), color=plot_colour(NEUTRAL))
-    limit = seen.usual if seen.whitened else sem.AMBIGUOUS_ABOVE
+    limit = measured.usual if measured.whitened else sem.AMBIGUOUS_ABOVE
     if not math.isnan(limit):
         look.axvline(limit, color="k", ls="--", lw=1)
-    what = "95 % of static regions reach" if seen.whitened else "limit"
+    what = "95 % of static regions reach" if measured.whitened else "limit"
     look.set_xlabel(f"cosine of the most similar distractor ({what} {limit:.2f})", fontsize=9)
     for axes in (cover, look):
         axes.set_ylabel("photos", fontsize=9)
@@ -225,43 +201,27 @@ def check_folder(folder: Path) -> None:
             refuse_files_there(folder, FILES)
 
 
-def write_report(
-    scene: Scene,
-    masks: DistractorMasks,
-    background: Background,
-    measured: list[PhotoMeasures],
-    look: MappedFeatures,
-    summary: Summary,
-    out: Path,
-) -> None:
+def write_report(measured: MeasuredScene, summary: Summary, out: Path) -> None:
     """Write the report into `out`, complete or not at all; an earlier report is replaced."""
-    metric = cosine_column(summary["features"])
-    rows = [row(m, metric) for m in measured]
+    metric = cosine_column(measured.features)
+    rows = [row(m, metric) for m in measured.photos]
     with atomic_dir(out) as folder:
         write_text(folder / "photos.csv", to_csv(list(rows[0]), (r.values() for r in rows)))
         write_json(folder / "ambiguity.json", {**summary, "per_photo": rows})
-        write_figure(scene, masks, background, measured, look, folder / "ambiguity.png")
-        pictures = list(_pictures(scene, masks, background, measured, look))
-        write_text(
-            folder / "index.html", page(summary, rows, (folder / "ambiguity.png").read_bytes(), pictures)
-        )
+        write_figure(measured, folder / "ambiguity.png")
+        picture = (folder / "ambiguity.png").read_bytes()
+        write_text(folder / "index.html", page(summary, rows, picture, list(_pictures(measured))))
 
 
-def _pictures(
-    scene: Scene,
-    masks: DistractorMasks,
-    background: Background,
-    measured: list[PhotoMeasures],
-    look: MappedFeatures,
-) -> Iterator[tuple[str, list[tuple[str, bytes]]]]:
+def _pictures(measured: MeasuredScene) -> Iterator[tuple[str, list[tuple[str, bytes]]]]:
     """Yield the name and JPEGs (photo, overlay, residual, cosine) of each photo on the page."""
     captions = ("photo", "distractors", "difference in colour to the background",
                 "similarity to the largest distractor")  # fmt: skip
-    for index in sorted(chosen(measured, SHOWN)):
-        photo, _, maps = _maps(scene, masks, background, look, index)
+    for index in sorted(chosen(measured.photos, SHOWN)):
+        photo, _, maps = _maps(measured, index)
         images = zip(captions, ((255 * photo + 0.5).astype(np.uint8), *maps))
         jpegs = [(caption, jpeg_bytes(narrowed(i, WIDTH), 85)) for caption, i in images if i is not None]
-        yield scene.train[index].name, jpegs
+        yield measured.scene.train[index].name, jpegs
 
 
 def page(
@@ -282,13 +242,14 @@ def page(
         f"<h3>{html.escape(name)}</h3><div class=row>{''.join(_shown(name, *i) for i in images)}</div>"
         for name, images in photos
     )
+    style = (PAGE / "ambiguity.css").read_text(encoding="utf-8")
     head = [_HEADS.get(key, "semantic: cosine") for key in rows[0]]
     table = html_table(text_table("", head, ([_cell(value) for value in r.values()] for r in rows)))
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
-        f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>"
+        f"<title>{title}</title><style>\n{style}</style></head><body><h1>{title}</h1>"
         f"<p class=class>{html.escape(verdict)}</p><ul>{lines}</ul><p>{html.escape(sources)}</p>"
         "<h2>Photos</h2><p>From the left: the photo; its distractors in red; how much they differ from the "
         "background; how similar everything is to the largest distractor. Colours of the last two:</p>"

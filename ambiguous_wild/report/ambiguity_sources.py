@@ -68,23 +68,16 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool
                 "--distractor-masks or --keep-masks DIR (PNG of the photo's stem) or --run RUN of a method "
                 "that masks"
             )
-    if choice == "truth" and not keep:
-        return DistractorMasks(
-            "truth", _all(scene, truth, "add them (all black where there is no distractor)"), False
-        )
-    if choice == "scene" and not keep:
-        folder = scene.root / "masks" / "train"
-        return DistractorMasks(
-            "scene", _all(scene, folder, "add them (all white where there is no distractor)"), True
-        )
-    if choice == "run" and not keep:
-        if run is None:
-            raise AwError("--distractor-masks run needs --run RUN, a folder of 'aw bench'")
-        return DistractorMasks(
-            "run", _all(scene, run / "masks", "this method draws no masks; take another run"), True
-        )
-    wanted = f"add them (all {'white' if keep else 'black'} where there is no distractor)"
-    return DistractorMasks("folder", _all(scene, Path(choice), wanted), keep)
+    if choice == "run" and run is None and not keep:
+        raise AwError("--distractor-masks run needs --run RUN, a folder of 'aw bench'")
+    black, white = (f"add them (all {colour} where there is no distractor)" for colour in ("black", "white"))
+    sources = {"truth": (truth, False, black), "scene": (scene.root / "masks" / "train", True, white)}
+    if run is not None:
+        sources["run"] = (run / "masks", True, "this method draws no masks; take another run")
+    if choice in sources and not keep:
+        folder, is_keep, advice = sources[choice]
+        return DistractorMasks(choice, _all(scene, folder, advice), is_keep)
+    return DistractorMasks("folder", _all(scene, Path(choice), white if keep else black), keep)
 
 
 def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any, TypedDict
+from typing import Any
 
-from ambiguous_wild.core import Scene
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
 from ambiguous_wild.metrics.stats import Interval
 from ambiguous_wild.report.ambiguity_measure import (
     KINDS,
-    MappedFeatures,
+    MeasuredScene,
     PhotoMeasures,
     feature_family,
     weight_free,
@@ -28,53 +27,11 @@ NO_DISTRACTORS = "no distractors"  # the class of a scene whose masks are empty
 REAL = "raw cosine, as in the paper"
 
 
-class Scored(TypedDict):
-    """A score with its 95 % interval over photos; None = undefined."""
-
-    value: float | None
-    low: float | None
-    high: float | None
-
-
-class OcclusionScore(Scored):
-    """Share of a train photo that distractors cover."""
-
-    min: float
-    max: float
-
-
-class ColourScore(Scored):
-    """Share of the distractor pixels whose colour is close to their background."""
-
-    threshold: float
-    ambiguous_above: float
-    ambiguous: bool | None  # None = no verdict
-    mean_residual: float | None
-    distractor_px: int
-    unknown_px: int  # with an unknown background
-
-
 # Number of distractors, of those that a kind of evidence reveals (None = not available), and of the others.
 EvidenceCounts = dict[str, int | None]
-# The content of ambiguity.json. Two keys are names of metrics, so that the type cannot list them.
+# The content of ambiguity.json, and its parts; two keys are names of metrics, which a type cannot list.
 Summary = dict[str, Any]
 PhotoRow = dict[str, str | float | None]  # a row of photos.csv, by column
-
-
-class SemanticScore(Scored):
-    """Similarity of distractors to the static scene."""
-
-    ambiguous_above: float
-    ambiguous: bool | None  # None = no verdict
-    compared_with: str
-    cosine_most_similar: float | None
-    cosine_mean: float | None
-    usual_match: float | None
-    same_surface: float | None
-    unrelated: float | None
-    calibrated: float | None
-    photos: int
-    note: str
 
 
 def semantic_metric(features: str) -> str:
@@ -92,38 +49,29 @@ def _family(features: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", feature_family(features).lower())
 
 
-def summarise(
-    scene: Scene,
-    measured: list[PhotoMeasures],
-    look: MappedFeatures,
-    *,
-    features: str = "labhog",
-    masks: str = "truth",
-    background: str = "clean",
-    seed: int = 0,
-) -> Summary:
+def summarise(measured: MeasuredScene, seed: int = 0) -> Summary:
     """Compute the scene's scores with 95 % intervals over photos; undefined scores are None."""
-    colour, semantic = _colour(measured, seed), _semantic(measured, look, features, seed)
-    counts = [m.counts for m in measured]
+    counts = [m.counts for m in measured.photos]
+    colour, semantic = _colour(counts, seed), _semantic(measured, seed)
     covered = am.ratio_interval([c.distractor for c in counts], [c.pixels for c in counts], seed=seed)
-    shares = [c.occlusion for c in counts]
+    shares = [c.occlusion for c in counts]  # of a train photo that distractors cover
     return {
-        "scene": scene.name,
-        "photos": len(measured),
-        "masks": masks,
-        "background": background,
-        "features": features,
+        "scene": measured.scene.name,
+        "photos": len(counts),
+        "masks": measured.masks.source,
+        "background": measured.background.source,
+        "features": measured.features,
         "seed": seed,
         "class": classify(colour["ambiguous"], semantic["ambiguous"]) if covered.mean else NO_DISTRACTORS,
-        "doubts": _doubts(masks, colour, semantic),
+        "doubts": _doubts(measured.masks.source, colour, semantic),
         "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
         am.COLOUR_METRIC: colour,
-        semantic_metric(features): semantic,
-        "told": _count_evidence(measured),
+        semantic_metric(measured.features): semantic,
+        "told": _count_evidence(measured.photos),
     }
 
 
-def _doubts(masks: str, colour: ColourScore, semantic: SemanticScore) -> list[str]:
+def _doubts(masks: str, colour: Summary, semantic: Summary) -> list[str]:
     """Return why the class may be wrong."""
     found = ["the masks are a run's guesses"] if masks == "run" else []
     if _crosses(colour) or _crosses(semantic):
@@ -149,49 +97,50 @@ def classify(colour: bool | None, semantic: bool | None) -> str:
     return "colour" if colour else "semantic" if semantic else "neither"
 
 
-def _colour(measured: list[PhotoMeasures], seed: int) -> ColourScore:
-    counts = [m.counts for m in measured]
+def _colour(counts: list[am.ColourCounts], seed: int) -> Summary:
+    """Return the share of the distractor pixels whose colour is close to their background."""
     total = am.pooled(counts)
     share = am.ratio_interval([c.close for c in counts], [c.known for c in counts], seed=seed)
     return {
         **_interval(share),
         "threshold": am.COLOUR_THRESHOLD,
         "ambiguous_above": am.COLOUR_AMBIGUOUS_ABOVE,
-        "ambiguous": am.verdict(share.mean, am.COLOUR_AMBIGUOUS_ABOVE),
+        "ambiguous": am.verdict(share.mean, am.COLOUR_AMBIGUOUS_ABOVE),  # None = no verdict
         "mean_residual": _number(total.mean_residual),
         "distractor_px": total.distractor,
-        "unknown_px": total.unknown,
+        "unknown_px": total.unknown,  # with an unknown background
     }
 
 
-def _semantic(measured: list[PhotoMeasures], look: MappedFeatures, features: str, seed: int) -> SemanticScore:
-    photos = [m.matches for m in measured if m.matches]
+def _semantic(measured: MeasuredScene, seed: int) -> Summary:
+    """Return the similarity of distractors to the static scene."""
+    photos = [m.matches for m in measured.photos if m.matches]
     # a mean as a ratio to the number of photos, so that it is missing, and no error, without any
     best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
     score, limit = best, sem.AMBIGUOUS_ABOVE
-    if look.whitened:
-        alike = [sum(m.pixels for m in p if m.cosine >= look.usual) for p in photos]
-        pixels = [sum(m.pixels for m in p) for p in photos] if not math.isnan(look.usual) else []
+    if measured.whitened:
+        alike = [sum(m.pixels for m in p if m.cosine >= measured.usual) for p in photos]
+        pixels = [sum(m.pixels for m in p) for p in photos] if not math.isnan(measured.usual) else []
         score, limit = am.ratio_interval(alike[: len(pixels)], pixels, seed=seed), sem.LOOKALIKE_ABOVE
-    note = REAL if not look.whitened else NAMED if look.objects else LOOKS
+    anchors = measured.anchors
     return {
         **_interval(score),
         "ambiguous_above": limit,
-        "ambiguous": am.verdict(score.mean, limit),
-        "compared_with": "objects" if look.objects else "static segments",
+        "ambiguous": am.verdict(score.mean, limit),  # None = no verdict
+        "compared_with": "objects" if measured.objects else "static segments",
         "cosine_most_similar": _number(best.mean),
         "cosine_mean": _number(sem.mean_cosine([m for p in photos for m in p])),
-        "usual_match": _number(look.usual),
-        "same_surface": _number(look.anchors.same),
-        "unrelated": _number(look.anchors.different),
-        "calibrated": _number(look.anchors.calibrated(best.mean)),
+        "usual_match": _number(measured.usual),
+        "same_surface": _number(anchors.same),
+        "unrelated": _number(anchors.different),
+        "calibrated": _number(anchors.calibrated(best.mean)),
         "photos": len(photos),
-        "note": note,
+        "note": REAL if not measured.whitened else NAMED if measured.objects else LOOKS,
     }
 
 
-def _count_evidence(measured: list[PhotoMeasures]) -> EvidenceCounts:
-    every = [d for m in measured for d in m.distractors]
+def _count_evidence(photos: list[PhotoMeasures]) -> EvidenceCounts:
+    every = [d for m in photos for d in m.distractors]
 
     def count(kind: str) -> int | None:
         answers = [answer for d in every if (answer := getattr(d, kind)) is not None]
@@ -226,13 +175,12 @@ def row(m: PhotoMeasures, metric: str) -> PhotoRow:
 
 def describe(summary: Summary) -> list[str]:
     """Return the scores as sentences, for the terminal and the page."""
-    colour: ColourScore = summary[am.COLOUR_METRIC]
-    covered: OcclusionScore = summary["occlusion"]
+    colour, covered = summary[am.COLOUR_METRIC], summary["occlusion"]
     if summary["class"] == NO_DISTRACTORS:
         return [
             f"the masks of all {summary['photos']} photos are empty: without distractors nothing is ambiguous"
         ]
-    look: SemanticScore = summary[semantic_metric(summary["features"])]
+    look = summary[semantic_metric(summary["features"])]
     lines = [
         f"occlusion: {_percent(covered)} of a train photo, from {100 * covered['min']:.1f} to "
         f"{100 * covered['max']:.1f} %",
@@ -256,7 +204,7 @@ def describe(summary: Summary) -> list[str]:
     return lines
 
 
-def _colour_line(colour: ColourScore) -> str:
+def _colour_line(colour: Summary) -> str:
     if colour["value"] is None:
         return "colour: no verdict, because no background of a distractor is known"
     return (
@@ -265,13 +213,14 @@ def _colour_line(colour: ColourScore) -> str:
     )
 
 
-def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
+def _semantic_line(look: Summary, lookalike: bool) -> str:
     if look["value"] is None:
         return f"semantic: no verdict, because no distractor is comparable with the {look['compared_with']}"
     if lookalike:
+        one = "named object" if look["compared_with"] == "objects" else "static region"
         return (
-            f"semantic: {_percent(look)} of the distractor pixels lie in regions that resemble a "
-            f"{_one(look)} of another photo as closely as static regions resemble each other: {_word(look)} "
+            f"semantic: {_percent(look)} of the distractor pixels lie in regions that resemble a {one} of "
+            f"another photo as closely as static regions resemble each other: {_word(look)} "
             f"(limit {100 * sem.LOOKALIKE_ABOVE:.0f} %)"
         )
     return (
@@ -280,15 +229,11 @@ def _semantic_line(look: SemanticScore, lookalike: bool) -> str:
     )
 
 
-def _one(look: SemanticScore) -> str:
-    return "named object" if look["compared_with"] == "objects" else "static region"
-
-
-def _percent(score: Scored) -> str:
+def _percent(score: Summary) -> str:
     return _with_interval(score, 100, 1, " %")
 
 
-def _with_interval(score: Scored, times: int, digits: int, unit: str) -> str:
+def _with_interval(score: Summary, times: int, digits: int, unit: str) -> str:
     """Return the score as text, behind it its interval, both multiplied by `times`."""
     value, low, high = (
         None if x is None else f"{times * x:.{digits}f}"
@@ -299,17 +244,17 @@ def _with_interval(score: Scored, times: int, digits: int, unit: str) -> str:
     return value + unit + ("" if low is None or high is None else f" [{low}, {high}]")
 
 
-def _word(score: ColourScore | SemanticScore) -> str:
+def _word(score: Summary) -> str:
     word = {None: "no verdict", True: "AMBIGUOUS", False: "not ambiguous"}[score["ambiguous"]]
     return f"{word}, but the interval crosses the limit" if _crosses(score) else word
 
 
-def _crosses(score: ColourScore | SemanticScore) -> bool:
+def _crosses(score: Summary) -> bool:
     low, high = score["low"], score["high"]
     return low is not None and high is not None and low <= score["ambiguous_above"] <= high
 
 
-def _interval(interval: Interval) -> Scored:
+def _interval(interval: Interval) -> Summary:
     return {"value": _number(interval.mean), "low": _number(interval.low), "high": _number(interval.high)}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator
 from itertools import combinations
 
@@ -16,11 +16,13 @@ from ambiguous_wild.report.audit_numbers import (
     MEAN,
     UNKNOWN,
     AuditFinding,
+    Pair,
     PrintedNumber,
     finding,
     method_name,
     place_name,
 )
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import markdown_text, to_csv
 
 LOWER = ("lpips", "flip", "memory", "gpu_hours", "train_s", "ms", "model_mb", "peak", "gaussians")
@@ -31,20 +33,19 @@ FULL = 12  # digits of a number that was never rounded, whose last ones may be z
 
 def contradictions(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find different numbers, beyond rounding, for the same method, setting, scene and metric."""
-    clashes: dict[tuple[str, ...], list[tuple[PrintedNumber, PrintedNumber]]] = defaultdict(list)
-    groups: dict[tuple[str, ...], list[PrintedNumber]] = defaultdict(list)
-    for n in numbers:
-        if n.known:
-            groups[(*n.identity, n.metric)].append(n)
-    for group in groups.values():
-        for a, b in combinations(group, 2):
-            same_variant = a.variant == b.variant or UNKNOWN in (a.variant, b.variant)
-            if same_variant and abs(a.value - b.value) > a.half + b.half + 1e-12:
-                clashes[(*a.identity, a.table, b.table)].append((a, b))
-    exchanged = _exchanged([p for pairs in clashes.values() for p in pairs])
+    results = grouped((n for n in numbers if n.known), lambda n: (*n.identity, n.metric))
+    clashes = [
+        (a, b)
+        for group in results.values()
+        for a, b in combinations(group, 2)
+        if (a.variant == b.variant or UNKNOWN in (a.variant, b.variant))
+        and abs(a.value - b.value) > a.half + b.half + 1e-12
+    ]
+    by_entry = grouped(clashes, lambda pair: (*pair[0].identity, pair[0].table, pair[1].table)).values()
+    exchanged = list(_exchanged([pair for pairs in by_entry for pair in pairs]))
     findings = [f for f, _ in exchanged]
-    explained = {id(n) for _, pairs in exchanged for p in pairs for n in p}
-    for pairs in clashes.values():
+    explained = {id(n) for _, of in exchanged for n in of}
+    for pairs in by_entry:
         left = [(a, b) for a, b in pairs if id(a) not in explained]
         if left:
             a, b = left[0]
@@ -54,11 +55,8 @@ def contradictions(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     return findings
 
 
-def _exchanged(
-    clashes: list[tuple[PrintedNumber, PrintedNumber]],
-) -> list[tuple[AuditFinding, list[tuple[PrintedNumber, PrintedNumber]]]]:
-    """Find pairs of methods whose numbers are exchanged between two tables."""
-    findings = []
+def _exchanged(clashes: list[Pair]) -> Iterator[tuple[AuditFinding, tuple[PrintedNumber, ...]]]:
+    """Yield findings of two methods whose numbers are exchanged between two tables, and these numbers."""
     for (a, a2), (b, b2) in combinations(clashes, 2):
         alike = (a.place, a.metric, a.table, a2.table) == (b.place, b.metric, b.table, b2.table)
         if alike and a.method != b.method and a.value == b2.value and b.value == a2.value:
@@ -66,43 +64,36 @@ def _exchanged(
                 f"{a.method} and {b.method} on {place_name(a)}: {a.metric} {a.text} and {b.text} in "
                 f"{a.table} are exchanged in {a2.table}"
             )
-            findings.append((finding("swapped", text, (a, b, a2, b2)), [(a, a2), (b, b2)]))
-    return findings
+            yield finding("swapped", text, (a, b, a2, b2)), (a, b, a2, b2)
 
 
 def means(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find means over scenes, and over datasets, that differ from their parts by more than rounding."""
-    wrong: dict[tuple[str, ...], list[tuple[PrintedNumber, float, list[PrintedNumber]]]] = defaultdict(list)
+    wrong = []
     for n in numbers:
         if n.scene != MEAN or n.setting:
             continue
         parts = _of_datasets(n, numbers) if n.dataset == ALL else _of_scenes(n, numbers)
-        if len(parts) < 2:
-            continue
-        value = float(np.mean([p.value for p in parts]))
-        if abs(value - n.value) > n.half + max(p.half for p in parts) + 1e-9:
-            wrong[n.table, n.method, n.dataset].append((n, value, parts))
-    return [_mean(cases) for cases in wrong.values()]
-
-
-def _mean(cases: list[tuple[PrintedNumber, float, list[PrintedNumber]]]) -> AuditFinding:
-    first, _, parts = cases[0]
-    what = "datasets" if first.dataset == ALL else f"scenes of {first.dataset}"
-    words = ", ".join(
-        f"{n.metric} {n.text}, but the parts give {value:.{n.digits + 1}f}" for n, value, _ in cases
-    )
-    text = f"{first.method}, mean over the {len(parts)} {what}: {words} ({first.table})"
-    return finding("mean", text, [m for n, _, parts in cases for m in (n, *parts)])
+        value = float(np.mean([p.value for p in parts])) if len(parts) > 1 else n.value
+        if abs(value - n.value) > n.half + max((p.half for p in parts), default=0.0) + 1e-9:
+            wrong.append((n, value, parts))
+    findings = []
+    for cases in grouped(wrong, lambda case: (case[0].table, case[0].method, case[0].dataset)).values():
+        first, _, parts = cases[0]
+        what = "datasets" if first.dataset == ALL else f"scenes of {first.dataset}"
+        words = ", ".join(
+            f"{n.metric} {n.text}, but the parts give {value:.{n.digits + 1}f}" for n, value, _ in cases
+        )
+        text = f"{first.method}, mean over the {len(parts)} {what}: {words} ({first.table})"
+        findings.append(finding("mean", text, [m for n, _, parts in cases for m in (n, *parts)]))
+    return findings
 
 
 def _of_datasets(mean: PrintedNumber, numbers: list[PrintedNumber]) -> list[PrintedNumber]:
     """Return the means over single datasets in the same line of the same table."""
+    line = (mean.table, mean.method, mean.setting, mean.metric, MEAN)
     return [
-        n
-        for n in numbers
-        if (n.table, n.method, n.setting, n.metric, n.scene)
-        == (mean.table, mean.method, mean.setting, mean.metric, MEAN)
-        and n.dataset != ALL
+        n for n in numbers if (n.table, n.method, n.setting, n.metric, n.scene) == line and n.dataset != ALL
     ]
 
 
@@ -111,7 +102,11 @@ def _of_scenes(mean: PrintedNumber, numbers: list[PrintedNumber]) -> list[Printe
     of_dataset = [
         n
         for n in numbers
-        if n.dataset == mean.dataset and n.metric == mean.metric and not n.setting and _one_scene(n)
+        if n.dataset == mean.dataset
+        and n.metric == mean.metric
+        and not n.setting
+        and n.scene not in (MEAN, UNKNOWN, ALL)
+        and "+" not in n.scene
     ]
     inside = [n for n in of_dataset if n.table == mean.table]
     of_dataset = inside or of_dataset
@@ -125,27 +120,19 @@ def _of_scenes(mean: PrintedNumber, numbers: list[PrintedNumber]) -> list[Printe
     return [best[s] for s in sorted(scenes)] if scenes == best.keys() else []
 
 
-def _one_scene(n: PrintedNumber) -> bool:
-    return n.scene not in (MEAN, UNKNOWN, ALL) and "+" not in n.scene
-
-
 def ranks(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find marks for first, second and third that contradict the numbers of the column."""
-    columns: dict[tuple[str, ...], list[PrintedNumber]] = defaultdict(list)
-    for n in numbers:
-        if not n.setting:
-            columns[(n.table, *n.place, n.metric)].append(n)
     findings = []
+    columns = grouped((n for n in numbers if not n.setting), lambda n: (n.table, *n.place, n.metric))
     for column in columns.values():
-        better = _sign(column[0].metric)
-        if better is None or not any(n.mark for n in column):
-            continue
-        wrong = [n for n in column if n.mark and n.mark not in _places(n, column, better)]
+        metric = column[0].metric
+        better = 1 if metric.startswith(HIGHER) else -1 if metric.startswith(LOWER) else 0
+        wrong = [n for n in column if n.mark and better and n.mark not in _places(n, column, better)]
         if wrong:
             order = sorted(column, key=lambda n: -better * n.value)
             right = ", ".join(f"{i} {n.method} {n.text}" for i, n in enumerate(order[:3], start=1))
             marks = ", ".join(f"{n.method} {n.text} as {n.mark}" for n in wrong)
-            text = f"{column[0].metric} on {place_name(column[0])}: marks {marks}, but the order is {right}"
+            text = f"{metric} on {place_name(column[0])}: marks {marks}, but the order is {right}"
             findings.append(finding("rank", text, wrong))
     return findings
 
@@ -157,41 +144,27 @@ def _places(n: PrintedNumber, column: list[PrintedNumber], better: int) -> range
     return range(1 + len(ahead), 1 + before + sum(m.value == n.value for m in column))
 
 
-def _sign(metric: str) -> int | None:
-    if metric.startswith(HIGHER):
-        return 1
-    return -1 if metric.startswith(LOWER) else None
-
-
 def digits(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find quality metrics printed with another number of digits than most of their column."""
-    columns: dict[tuple[str, str], list[PrintedNumber]] = defaultdict(list)
-    for n in numbers:
-        if n.metric.startswith(("psnr", "ssim", "lpips")):
-            columns[n.table, n.metric].append(n)
-    return [f for column in columns.values() for f in _odd_digits(column)]
-
-
-def _odd_digits(column: list[PrintedNumber]) -> Iterator[AuditFinding]:
-    usual, count = Counter(n.digits for n in column).most_common(1)[0]
-    if usual >= FULL:
-        return
-    odd = [n for n in column if n.digits != usual]
-    if odd and count >= 0.8 * len(column):
-        words = ", ".join(f"{n.method} on {place_name(n)} {n.text}" for n in odd)
-        text = f"{column[0].metric} has {usual} digits in {column[0].table}, but {words}"
-        yield finding("digits", text, odd)
+    quality = (n for n in numbers if n.metric.startswith(("psnr", "ssim", "lpips")))
+    findings = []
+    for (table, metric), column in grouped(quality, lambda n: (n.table, n.metric)).items():
+        usual, count = Counter(n.digits for n in column).most_common(1)[0]
+        odd = [n for n in column if n.digits != usual]
+        if odd and usual < FULL and count >= 0.8 * len(column):
+            words = ", ".join(f"{n.method} on {place_name(n)} {n.text}" for n in odd)
+            findings.append(finding("digits", f"{metric} has {usual} digits in {table}, but {words}", odd))
+    return findings
 
 
 def units(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find quantities without a unit, one finding for each metric."""
+    bare = (n for n in numbers if n.metric in UNITLESS and n.variant == UNKNOWN)
     findings = []
-    for metric in sorted({n.metric for n in numbers if n.metric in UNITLESS}):
-        bare = [n for n in numbers if n.metric == metric and n.variant == UNKNOWN]
-        if bare:
-            tables = ", ".join(dict.fromkeys(n.table for n in bare))
-            text = f"{len(bare)} values of {metric} have neither unit nor definition ({tables})"
-            findings.append(finding("unit", text, bare))
+    for metric, of in sorted(grouped(bare, lambda n: n.metric).items()):
+        tables = ", ".join(dict.fromkeys(n.table for n in of))
+        text = f"{len(of)} values of {metric} have neither unit nor definition ({tables})"
+        findings.append(finding("unit", text, of))
     return findings
 
 
@@ -208,26 +181,19 @@ def audit(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     return sorted(findings, key=lambda f: order.index(f.kind))
 
 
-def _by_kind(findings: list[AuditFinding]) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield (kind, its meaning, texts of its findings) for each kind that was found."""
-    for kind, meaning in KINDS.items():
-        if texts := [f.text for f in findings if f.kind == kind]:
-            yield kind, meaning, texts
-
-
 def text_of(findings: list[AuditFinding]) -> str:
     """Return the findings by kind, as text for a terminal."""
     lines = []
-    for kind, meaning, texts in _by_kind(findings):
-        lines += [f"{kind}: {meaning} ({len(texts)})", *(f"  {plain(text)}" for text in texts), ""]
+    for kind, of in grouped(findings, lambda f: f.kind).items():
+        lines += [f"{kind}: {KINDS[kind]} ({len(of)})", *(f"  {plain(f.text)}" for f in of), ""]
     return "\n".join(lines)
 
 
 def markdown_of(findings: list[AuditFinding]) -> str:
     """Return the findings by kind, as Markdown lists."""
     lines = []
-    for kind, meaning, texts in _by_kind(findings):
-        lines += [f"**{kind}** ({meaning}):", "", *(f"- {markdown_text(text)}" for text in texts), ""]
+    for kind, of in grouped(findings, lambda f: f.kind).items():
+        lines += [f"**{kind}** ({KINDS[kind]}):", "", *(f"- {markdown_text(f.text)}" for f in of), ""]
     return "\n".join(lines)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import read_csv
 
 REQUIRED = ("method", "scene", "metric", "value")
@@ -84,6 +85,11 @@ class PrintedNumber:
     @property
     def text(self) -> str:
         return f"{self.value:.{self.digits}f}"
+
+    @property
+    def family(self) -> str:
+        """The metric without its variant."""
+        return self.metric.partition("_")[0]
 
     @property
     def known(self) -> bool:
@@ -182,13 +188,18 @@ def method_name(number: PrintedNumber) -> str:
 
 Key = tuple[str, ...]
 Line = dict[Key, PrintedNumber]
+Entry = dict[str, PrintedNumber]  # by metric, or by its family
+Pair = tuple[PrintedNumber, PrintedNumber]
 
 
 def repeated(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find scenes and methods whose lines repeat, then entries (all metrics of a method on a scene)."""
     plain = [n for n in numbers if n.known and n.scene != MEAN and "+" not in n.scene and n.metric != SIZE]
-    by_scene = _lines(plain, lambda n: n.place, lambda n: (n.method, n.setting, n.metric))
-    by_method = _lines(plain, lambda n: (n.method, n.setting), lambda n: (*n.place, n.metric))
+    by_scene: dict[Key, Line] = defaultdict(dict)
+    by_method: dict[Key, Line] = defaultdict(dict)
+    for n in plain:
+        by_scene[n.place].setdefault((n.method, n.setting, n.metric), n)
+        by_method[n.method, n.setting].setdefault((*n.place, n.metric), n)
     findings, covered = [], set[frozenset[str]]()
     for lines, kind in ((by_scene, "scenes"), (by_method, "methods")):
         for pairs in _repeating(lines):
@@ -196,30 +207,17 @@ def repeated(numbers: list[PrintedNumber]) -> list[AuditFinding]:
             covered |= {frozenset((a.where, b.where)) for a, b in pairs}
             findings.append(finding("repeated", _words(kind, pairs), involved))
     # a mean is printed in several tables, but its repetition is reported once
-    by_text: dict[str, AuditFinding] = {}
-    for f in _entries(numbers, covered):
-        by_text.setdefault(f.text, f)
-    return findings + list(by_text.values())
+    entries = grouped(_entries(numbers, covered), lambda f: f.text)
+    return findings + [of[0] for of in entries.values()]
 
 
-def _lines(
-    numbers: list[PrintedNumber], line: Callable[[PrintedNumber], Key], cell: Callable[[PrintedNumber], Key]
-) -> dict[Key, Line]:
-    lines: dict[Key, Line] = defaultdict(dict)
-    for n in numbers:
-        lines[line(n)].setdefault(cell(n), n)
-    return lines
-
-
-def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[PrintedNumber, PrintedNumber]]]:
+def _repeating(lines: dict[Key, Line]) -> Iterator[list[Pair]]:
     """Yield pairs of numbers of two lines that share too many, compared metric by metric."""
     from scipy.stats import poisson
 
     trials = []
     for (_, a), (_, b) in combinations(sorted(lines.items()), 2):
-        shared: dict[str, list[tuple[PrintedNumber, PrintedNumber]]] = defaultdict(list)
-        for cell in a.keys() & b.keys():
-            shared[cell[-1]].append((a[cell], b[cell]))
+        shared = grouped(((a[cell], b[cell]) for cell in a.keys() & b.keys()), lambda pair: pair[0].metric)
         trials.append([sorted(pairs, key=lambda p: p[0].where) for _, pairs in sorted(shared.items())])
     tested = sum(map(len, trials))
     for metrics in trials:
@@ -240,7 +238,7 @@ def _repeating(lines: dict[Key, Line]) -> Iterator[list[tuple[PrintedNumber, Pri
             yield equal
 
 
-def _words(kind: str, pairs: list[tuple[PrintedNumber, PrintedNumber]]) -> str:
+def _words(kind: str, pairs: list[Pair]) -> str:
     a, b = pairs[0]
     metrics = ", ".join(dict.fromkeys(p[0].metric for p in pairs))
     if kind == "scenes":
@@ -252,22 +250,22 @@ def _words(kind: str, pairs: list[tuple[PrintedNumber, PrintedNumber]]) -> str:
 
 
 def _entries(numbers: list[PrintedNumber], covered: set[frozenset[str]]) -> Iterator[AuditFinding]:
-    entries: dict[Key, dict[str, PrintedNumber]] = defaultdict(dict)
+    entries: dict[Key, Entry] = defaultdict(dict)
     for n in numbers:
         entries[(n.table, *n.identity)].setdefault(n.metric, n)
     wide = [e for e in entries.values() if len(e) >= 2]
     # related pairs are tested apart, because a coincidence is less likely among fewer pairs
-    families: dict[str, list[tuple[dict[str, PrintedNumber], dict[str, PrintedNumber]]]] = defaultdict(list)
+    families: dict[bool, list[tuple[Entry, Entry]]] = defaultdict(list)
     for i, j in _near_pairs(wide):
         a, b = wide[i], wide[j]
         first, second = next(iter(a.values())), next(iter(b.values()))
         if not _may_be_one(first, second):
             related = first.method == second.method or (first.known and first.place == second.place)
-            families["related" if related else "unrelated"].append((a, b))
+            families[related].append((a, b))
     for pairs in families.values():
-        equal = [(a, b) for a, b in pairs if _all(a, b, lambda x, y: x.value == y.value)]
+        equal = [(a, b) for a, b in pairs if all(a[m].value == b[m].value for m in a.keys() & b.keys())]
         near = len(pairs) - len(equal)
-        close = sum(_all(a, b, lambda x, y: _near(x, y, CLOSE)) for a, b in pairs) - len(equal)
+        close = sum(all(_near(a[m], b[m], CLOSE) for m in a.keys() & b.keys()) for a, b in pairs) - len(equal)
         for a, b in equal:
             shared = sorted(a.keys() & b.keys())
             odds = max((near + 3) / (2 * NEAR + 1) ** len(shared), close / (2 * CLOSE + 1) ** len(shared))
@@ -276,7 +274,7 @@ def _entries(numbers: list[PrintedNumber], covered: set[frozenset[str]]) -> Iter
                 yield _entry(a, b, shared)
 
 
-def _near_pairs(entries: list[dict[str, PrintedNumber]]) -> list[tuple[int, int]]:
+def _near_pairs(entries: list[Entry]) -> list[tuple[int, int]]:
     """Return pairs of entries that share three metrics or more and are near in all of them."""
     metrics = sorted({m for e in entries for m in e})
     value, unit = (np.full((len(entries), len(metrics)), np.nan) for _ in range(2))
@@ -293,7 +291,7 @@ def _near_pairs(entries: list[dict[str, PrintedNumber]]) -> list[tuple[int, int]
     return pairs
 
 
-def _entry(a: dict[str, PrintedNumber], b: dict[str, PrintedNumber], shared: list[str]) -> AuditFinding:
+def _entry(a: Entry, b: Entry, shared: list[str]) -> AuditFinding:
     first, second = a[shared[0]], b[shared[0]]
     values = " / ".join(a[m].text for m in a if m in shared)
     left = f"{method_name(first)} on {place_name(first)}"
@@ -310,19 +308,10 @@ def _may_be_one(a: PrintedNumber, b: PrintedNumber) -> bool:
     return all(x == y or UNKNOWN in (x, y) for x, y in zip(a.place, b.place))
 
 
-def _all(
-    a: dict[str, PrintedNumber],
-    b: dict[str, PrintedNumber],
-    holds: Callable[[PrintedNumber, PrintedNumber], bool],
-) -> bool:
-    return all(holds(a[m], b[m]) for m in a.keys() & b.keys())
-
-
 def _near(a: PrintedNumber, b: PrintedNumber, units: int) -> bool:
     return abs(a.value - b.value) <= units * 10.0 ** -max(a.digits, b.digits) + 1e-12
 
 
-Entry = dict[str, PrintedNumber]  # family -> number
 Scenes = dict[tuple[str, str, str], dict[str, Entry]]  # (table, dataset, scene) -> method -> entry
 
 
@@ -330,7 +319,7 @@ def out_of_place(numbers: list[PrintedNumber]) -> list[AuditFinding]:
     """Find values outside the range of the metric."""
     findings = []
     for n in numbers:
-        low, high = LIMITS.get(_family(n), (-np.inf, np.inf))
+        low, high = LIMITS.get(n.family, (-np.inf, np.inf))
         if not low <= n.value <= high:
             text = f"{n.method} on {place_name(n)}: {n.metric} {n.text} is impossible ({low:g} to {high:g})"
             findings.append(finding("out of place", text, [n]))
@@ -451,13 +440,9 @@ def _scenes(numbers: list[PrintedNumber]) -> Scenes:
     """Return PSNR, SSIM and LPIPS of every method on every scene that has all three."""
     scenes: dict[tuple[str, str, str], dict[str, Entry]] = defaultdict(lambda: defaultdict(dict))
     for n in numbers:
-        if n.known and not n.setting and _family(n) in LIMITS:
-            scenes[n.table, n.dataset, n.scene][n.method].setdefault(_family(n), n)
+        if n.known and not n.setting and n.family in LIMITS:
+            scenes[n.table, n.dataset, n.scene][n.method].setdefault(n.family, n)
     return {k: {m: e for m, e in v.items() if len(e) == len(LIMITS)} for k, v in scenes.items()}
-
-
-def _family(n: PrintedNumber) -> str:
-    return n.metric.partition("_")[0]
 
 
 def _among(value: float, others: np.ndarray) -> bool:

@@ -20,6 +20,7 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.report import plain_formats
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import shortest
 
 FORMULA = ("=", "+", "-", "@")
@@ -194,11 +195,9 @@ def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[CsvValue]]]:
     head = [*FIRST, *quality, *(COST + k for k in cost), *LAST]
     rows: list[list[CsvValue]] = []
     for e in sorted(entries, key=lambda e: e.key):
-        row: list[CsvValue] = [*e.key, e.images]
-        row += [e.quality.get(k) for k in quality]
-        row += [e.cost.get(k) for k in cost]
-        row += [" ".join(e.missing), e.device, e.hardware, e.version, e.source, e.code_hash]
-        rows.append([*row, e.config_hash, e.scene_hash, e.result_hash, e.checked, e.reproduce, e.row_hash])
+        cells = vars(e) | {"missing": " ".join(e.missing), "row_hash": e.row_hash}
+        numbers = [*(e.quality.get(k) for k in quality), *(e.cost.get(k) for k in cost)]
+        rows.append([*(cells[k] for k in FIRST), *numbers, *(cells[k] for k in LAST)])
     return head, rows
 
 
@@ -209,22 +208,18 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
         AwError: a cell has an invalid value.
     """
     text = {k: unguard(row[k]) for k in (*FIRST, *LAST)}
-    numbers = {
-        k: value
-        for k in head
-        if k not in FIRST and k not in LAST and not math.isnan(value := to_number(row[k], f"{where}, {k}"))
-    }
-    counts = {column: to_count(text[column], f"{where}: {column}") for column in ("seed", "images")}
+    numbers = {k: to_number(row[k], f"{where}, {k}") for k in head if k not in text}
+    numbers = {k: value for k, value in numbers.items() if not math.isnan(value)}
+    seed, images = (to_count(text[column], f"{where}: {column}") for column in ("seed", "images"))
     checked = next((c for c in CHECKED if c == text["checked"]), None)
     if checked is None:
         raise AwError(
             f"{where}: checked is {text['checked'][:40]!a}, none of {', '.join(CHECKED)}; restore it"
         )
-    names = {k: text[k] for k in (*FIRST, *LAST) if k not in NO_TEXT}
     return Entry(
-        **names,
-        seed=counts["seed"],
-        images=counts["images"],
+        **{k: cell for k, cell in text.items() if k not in NO_TEXT},
+        seed=seed,
+        images=images,
         quality={k: v for k, v in numbers.items() if not k.startswith(COST)},
         cost={k.removeprefix(COST): v for k, v in numbers.items() if k.startswith(COST)},
         missing=tuple(text["missing"].split()),
@@ -235,11 +230,11 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
 def tidy(entries: Iterable[Entry]) -> Iterator[list[CsvValue]]:
     """Yield rows for `TIDY`, one for each run and metric; a missing metric has a row without a value."""
     for e in sorted(entries, key=lambda e: e.key):
-        last = [e.device, e.version, e.source, e.config_hash, e.scene_hash, e.checked]
         qualities = {**dict.fromkeys(e.missing, math.nan), **e.quality}
         for kind, values in (("quality", qualities), ("cost", e.cost)):
             for metric in in_order(values):
-                yield [*e.key, kind, metric, values[metric], *last]
+                cells = vars(e) | {"kind": kind, "metric": metric, "value": values[metric]}
+                yield [cells[k] for k in TIDY]
 
 
 def measured(board: Path) -> Path:
@@ -299,11 +294,9 @@ def examine(board: Path) -> tuple[list[Entry], list[str]]:
             if row["row_hash"] != e.row_hash
         ]
         entries += in_file
-    seen: set[object] = set()
-    for e in entries:
-        if e.key in seen:
+    for e, *copies in grouped(entries, lambda e: e.key).values():
+        if copies:
             raise AwError(f"{e.name} is twice in {dataset_file(board, e.dataset)}: restore the file")
-        seen.add(e.key)
     entries.sort(key=lambda e: e.key)
     # if a row was changed, all.csv differs too, which is no second problem
     return entries, wrong or _other_files(board, entries)
@@ -326,9 +319,7 @@ def files_of(board: Path, entries: Sequence[Entry]) -> dict[Path, str]:
     Raises:
         AwError: the names of two datasets differ only in case or blanks.
     """
-    by_file: dict[Path, list[Entry]] = {}
-    for e in entries:
-        by_file.setdefault(dataset_file(board, e.dataset), []).append(e)
+    by_file = grouped(entries, lambda e: dataset_file(board, e.dataset))
     for path, rows in by_file.items():
         names = sorted({e.dataset for e in rows})
         if len(names) > 1:

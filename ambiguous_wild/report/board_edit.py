@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from ambiguous_wild.report.board import (
 )
 from ambiguous_wild.report.board_reproduce import Scenes
 from ambiguous_wild.report.board_verify import Unfinished, VerifiedRun, verify
+from ambiguous_wild.report.grouping import grouped
 
 Outcome = Literal["added", "there already", "replaced", "refused", "unfinished"]
 Tick = Callable[[int, int], None]
@@ -143,13 +143,10 @@ def _merge(
 
 
 def _other_numbers(new: VerifiedRun, old: Entry) -> str:
-    differing = [k for k in old.quality if old.quality[k] != new.entry.quality.get(k)]
-    key = differing[0] if differing else None
-    shown = (
-        f"{key} is {new.entry.quality.get(key)}, on the board {old.quality[key]}"
-        if key
-        else "only its cost differs"
-    )
+    key = next((k for k in old.quality if old.quality[k] != new.entry.quality.get(k)), None)
+    shown = "only its cost differs"
+    if key is not None:
+        shown = f"{key} is {new.entry.quality.get(key)}, on the board {old.quality[key]}"
     return (
         f"{new.run}: {old.name} is on the board with another result ({shown}); leave it out, or pass "
         "--overwrite"
@@ -163,20 +160,16 @@ def _conflicts(
 
     `kept` are the cells of the board that the new runs may not replace.
     """
-    cells: dict[Key, list[VerifiedRun]] = defaultdict(list)
-    hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
-    configs: dict[str, list[Entry]] = defaultdict(list)
+    everything = [*on_board, *(v.entry for v in passed)]
     fixed = [e for e in on_board if e.key in kept]
-    for v in passed:
-        cells[v.entry.key].append(v)
-    for e in (*on_board, *(v.entry for v in passed)):
-        hashes[e.dataset, e.scene].add(e.scene_hash)
-        configs[e.config_hash].append(e)
+    cells = grouped(passed, lambda v: v.entry.key)
+    in_scene = grouped(everything, lambda e: (e.dataset, e.scene))
+    configs = grouped(everything, lambda e: e.config_hash)
     board_hashes = {(e.dataset, e.scene): e.scene_hash for e in on_board}
     conflicts: list[tuple[str, VerifiedRun]] = []
     for v in passed:
         e = v.entry
-        scenes = hashes[e.dataset, e.scene]
+        scenes = {o.scene_hash for o in in_scene[e.dataset, e.scene]}
         twins = [o for o in configs[e.config_hash] if o.key != e.key]
         others = [o for o in cells[e.key] if o.entry.result_hash != e.result_hash]
         of_method = [o for o in fixed if o.method == e.method] or [

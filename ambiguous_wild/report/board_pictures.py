@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -48,7 +48,7 @@ Row = dict[str, str]  # by column; method is empty for photos and exact masks
 
 
 @dataclass(frozen=True)
-class _PictureSubject:
+class PictureSubject:
     """What a picture shows; see the kinds above."""
 
     dataset: str
@@ -58,6 +58,11 @@ class _PictureSubject:
     setting: str = ""
     options: str = ""
     kind: str = TEST
+
+    @property
+    def photo(self) -> PictureSubject:
+        """The test or train photo itself."""
+        return PictureSubject(self.dataset, self.scene, self.image, kind=self.kind)
 
     @property
     def file(self) -> str:
@@ -91,7 +96,7 @@ def read_index(board: Path) -> list[Row]:
     for at, row in enumerate(rows, 2):
         if row["kind"] not in KINDS:
             raise AwError(f"{path} row {at}: kind is none of {', '.join(KINDS)}; restore the index")
-        if row["file"] != _place(row).file:
+        if row["file"] != _subject(row).file:
             raise AwError(f"{path} row {at} names the file of another picture: restore the index")
         if row.pop("row_hash") != _row_hash(row, f"{path} row {at}"):
             raise AwError(
@@ -103,27 +108,75 @@ def read_index(board: Path) -> list[Row]:
     return rows
 
 
-def keep(board: Path, runs: Iterable[VerifiedRun], count: int) -> int:
+def keep(board: Path, runs: Iterable[VerifiedRun], count: int) -> None:
     """Keep pictures of runs: for each method and scene those of the lowest seed.
 
     Args:
         board: folder of the board.
         runs: the verified runs.
         count: number of test images, and of train photos with masks, for each scene, evenly spaced by name.
-
-    Returns:
-        The number of pictures written.
     """
-    index = {_place(row): row for row in read_index(board)}
-    before = dict(index)
-    written = 0
+    pictures = BoardPictures(board)
+    before = dict(pictures.rows)
     for run in sorted(runs, key=lambda r: (r.entry.key, str(r.run))) if count else ():
+        pictures.add(run, count)
+    if pictures.rows != before:
+        write_index(board, pictures.rows.values())
+
+
+class BoardPictures:
+    """The pictures of a board, and the rows of their index by what they show."""
+
+    def __init__(self, board: Path) -> None:
+        self.folder = folder_of(board)
+        self.rows = {_subject(row): row for row in read_index(board)}
+
+    def add(self, run: VerifiedRun, count: int) -> None:
+        """Keep renders of a run with their photos; then train photos, its masks, and exact masks if any."""
+        e, scene = run.entry, run.scene
+        own = PictureSubject(e.dataset, e.scene, "", e.method, e.setting, e.options)
         for name in chosen(run.names, count):
-            written += _keep_one(board, run, name, index)
-        written += _keep_masks(board, run, count, index)
-    if index != before:
-        _write_index(board, index.values())
-    return written
+            render = replace(own, image=name)
+            if self._has_lower_seed(render, e.seed):
+                continue
+            if scene is not None:
+                path = next(v.image_path for v in scene.test if v.name == name)
+                self.write(render.photo, _jpeg(path))
+            path = (run.run / RENDERS / name).with_suffix(".png")
+            self.write(render, _jpeg(path), e.seed, run.psnr[name])
+        if scene is None:
+            return
+        views = {v.name: v for v in scene.train}
+        masks = {n: path for n in views if (path := (run.run / MASKS / n).with_suffix(".png")).is_file()}
+        for name in chosen(tuple(sorted(masks)), count):
+            view, mask = views[name], replace(own, image=name, kind=TRAIN)
+            if self._has_lower_seed(mask, e.seed):
+                continue
+            self.write(mask.photo, _jpeg(view.image_path))
+            size = (view.camera.width, view.camera.height)
+            exact = scene.root / "truth" / "distractor" / Path(name).with_suffix(".png")
+            if exact.is_file():
+                drawn = _overlay(read_gray(exact) >= 128, size, EXACT_RGBA)
+                self.write(replace(mask.photo, kind=EXACT), drawn)
+            self.write(mask, _overlay(read_gray(masks[name]) < 128, size, PREDICTED_RGBA), e.seed)
+
+    def _has_lower_seed(self, subject: PictureSubject, seed: int) -> bool:
+        kept = self.rows.get(subject, {}).get("seed", "")
+        return bool(kept) and int(kept) < seed
+
+    def write(
+        self, subject: PictureSubject, data: bytes, seed: int | None = None, psnr: float = math.nan
+    ) -> None:
+        """Write a picture and its row; the index is not written."""
+        path = self.folder / subject.file
+        if not path.is_file() or path.read_bytes() != data:
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(data)
+        numbers = {
+            "seed": "" if seed is None else str(seed),
+            "psnr": "" if math.isnan(psnr) else repr(float(psnr)),
+        }
+        self.rows[subject] = vars(subject) | numbers | {"file": subject.file, "sha256": sha256_file(path)}
 
 
 def drop(board: Path, runs: Iterable[Entry]) -> None:
@@ -136,7 +189,7 @@ def drop(board: Path, runs: Iterable[Entry]) -> None:
     left = [row for row in index if row in renders or (not row["method"] and _view(row) in shown)]
     if left == index:
         return
-    _write_index(board, left)
+    write_index(board, left)
     files = {row["file"] for row in left}
     for row in index:
         if row["file"] not in files:
@@ -148,13 +201,13 @@ def _view(row: Row) -> tuple[str, str, str, bool]:
     return row["dataset"], row["scene"], row["image"], row["kind"] == TEST
 
 
-def _write_index(board: Path, index: Iterable[Row]) -> None:
+def write_index(board: Path, index: Iterable[Row]) -> None:
+    """Write the rows in the order of their files."""
     rows: list[list[CsvValue]] = []
     for row in sorted(index, key=lambda r: r["file"]):
-        seed = int(row["seed"]) if row["seed"] else None
-        psnr = to_number(row["psnr"], "psnr")
-        texts = (*(row[k] for k in COLUMNS[:6]), seed, psnr, row["file"], row["sha256"], row["kind"])
-        rows.append([*texts, _row_hash(row, "psnr")])
+        seed, psnr = int(row["seed"]) if row["seed"] else None, to_number(row["psnr"], "psnr")
+        cells = row | {"seed": seed, "psnr": psnr, "row_hash": _row_hash(row, "psnr")}
+        rows.append([cells[k] for k in COLUMNS])
     write_text(folder_of(board) / INDEX, board_csv(COLUMNS, rows))
 
 
@@ -167,82 +220,13 @@ def _row_hash(row: Row, where: str) -> str:
 
 def chosen(names: tuple[str, ...], count: int) -> list[str]:
     """Return `count` of the names, evenly spaced."""
-    at = (
-        np.linspace(0, len(names) - 1, min(count, len(names)) + 2)[1:-1]
-        if len(names) > count
-        else range(len(names))
-    )
-    return [names[round(float(i))] for i in at]
+    if len(names) <= count:
+        return list(names)
+    return [names[round(float(i))] for i in np.linspace(0, len(names) - 1, count + 2)[1:-1]]
 
 
-def _keep_one(board: Path, run: VerifiedRun, name: str, index: dict[_PictureSubject, Row]) -> int:
-    e = run.entry
-    place = _PictureSubject(e.dataset, e.scene, name, e.method, e.setting, e.options)
-    if _has_lower_seed(index.get(place), e.seed):
-        return 0
-    written = 0
-    if run.scene is not None:
-        photo = _PictureSubject(e.dataset, e.scene, name)
-        path = next(v.image_path for v in run.scene.test if v.name == name)
-        written += _write(board, photo, _jpeg(path), "", math.nan, index)
-    render = (run.run / RENDERS / name).with_suffix(".png")
-    return written + _write(board, place, _jpeg(render), str(e.seed), run.psnr[name], index)
-
-
-def _has_lower_seed(row: Row | None, seed: int) -> bool:
-    return row is not None and bool(row["seed"]) and int(row["seed"]) < seed
-
-
-def _keep_masks(board: Path, run: VerifiedRun, count: int, index: dict[_PictureSubject, Row]) -> int:
-    """Keep train photos, the run's masks of them, and the exact masks if there are any."""
-    e, scene = run.entry, run.scene
-    if scene is None:
-        return 0
-    masks = {v.name: (run.run / MASKS / v.name).with_suffix(".png") for v in scene.train}
-    written = 0
-    for name in chosen(tuple(sorted(n for n, path in masks.items() if path.is_file())), count):
-        view = next(v for v in scene.train if v.name == name)
-        place = _PictureSubject(e.dataset, e.scene, name, e.method, e.setting, e.options, TRAIN)
-        if _has_lower_seed(index.get(place), e.seed):
-            continue
-        photo = _jpeg(view.image_path)
-        written += _write(
-            board, _PictureSubject(e.dataset, e.scene, name, kind=TRAIN), photo, "", math.nan, index
-        )
-        size = (view.camera.width, view.camera.height)
-        exact = scene.root / "truth" / "distractor" / Path(name).with_suffix(".png")
-        if exact.is_file():
-            drawn = _overlay(read_gray(exact) >= 128, size, EXACT_RGBA)
-            written += _write(
-                board, _PictureSubject(e.dataset, e.scene, name, kind=EXACT), drawn, "", math.nan, index
-            )
-        drawn = _overlay(read_gray(masks[name]) < 128, size, PREDICTED_RGBA)
-        written += _write(board, place, drawn, str(e.seed), math.nan, index)
-    return written
-
-
-def _write(
-    board: Path,
-    place: _PictureSubject,
-    data: bytes,
-    seed: str,
-    psnr: float,
-    index: dict[_PictureSubject, Row],
-) -> int:
-    path = folder_of(board) / place.file
-    fresh = not path.is_file() or path.read_bytes() != data
-    if fresh:
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(data)
-    shown = "" if math.isnan(psnr) else repr(float(psnr))
-    texts = (place.dataset, place.scene, place.image, place.method, place.setting, place.options)
-    index[place] = dict(zip(COLUMNS, (*texts, seed, shown, place.file, sha256_file(path), place.kind)))
-    return int(fresh)
-
-
-def _place(row: Row) -> _PictureSubject:
-    dataset, scene, image, method, setting, options = (row[k] for k in COLUMNS[:6])
-    return _PictureSubject(dataset, scene, image, method, setting, options, row["kind"])
+def _subject(row: Row) -> PictureSubject:
+    return PictureSubject(**{k: row[k] for k in vars(PictureSubject("", "", ""))})
 
 
 def _overlay(

@@ -27,11 +27,11 @@ from ambiguous_wild.io.files import (
     check_output,
     folder_lock,
     list_names,
+    refuse_foreign_files,
     sha256_file,
     sweep_siblings,
     write_json,
 )
-from ambiguous_wild.io.files import refuse_foreign_files as refuse_strangers
 from ambiguous_wild.io.page_parts import fill_page
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.report import board_pictures
@@ -39,6 +39,8 @@ from ambiguous_wild.report.audit import audit
 from ambiguous_wild.report.audit_numbers import REPORTED, AuditFinding, PrintedNumber, read_tables
 from ambiguous_wild.report.board import (
     ALONE,
+    FIRST,
+    LAST,
     CsvValue,
     Entry,
     board_csv,
@@ -48,6 +50,7 @@ from ambiguous_wild.report.board import (
     slug,
     to_number,
 )
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.viewing.page_file import page_text
 
 COSTS = ("reference_s", "train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
@@ -58,10 +61,7 @@ LABELS = {
     "train_s": "training s", "reference_s": "reference s", "model_mb": "model MB",
     "peak_rss_mb": "peak memory MB",
 }  # fmt: skip
-COLUMNS = (
-    "dataset", "scene", "method", "setting", "options", "seed", "images", "missing", "device", "hardware",
-    "version", "source", "code_hash", "config_hash", "scene_hash", "result_hash", "checked", "reproduce",
-)  # fmt: skip
+COLUMNS = (*FIRST, *(k for k in LAST if k != "row_hash"))
 # Code of the authors. Papers are linked by the arXiv number in the method's entry, else by PAPERS.
 CODE = {
     "3dgs": "https://github.com/graphdeco-inria/gaussian-splatting",
@@ -165,10 +165,8 @@ def _method(name: str) -> dict[str, str]:
         return {"summary": "", "paper": "", "paper_url": "", "code_url": ""}
     number = re.search(r"arXiv (\d{4}\.\d{4,5})", entry.paper)
     url = f"https://arxiv.org/abs/{number[1]}" if number else PAPERS.get(entry.name, "")
-    return {
-        "summary": entry.summary, "paper": entry.paper, "paper_url": url,
-        "code_url": CODE.get(entry.name, ""),
-    }  # fmt: skip
+    code = CODE.get(entry.name, "")
+    return {"summary": entry.summary, "paper": entry.paper, "paper_url": url, "code_url": code}
 
 
 @dataclass(frozen=True)
@@ -216,16 +214,16 @@ def read_sources(path: Path) -> dict[str, dict[str, str]]:
         return {}
     try:
         sources = json.loads(path.read_text(encoding="utf-8"))
-        papers, tables = sources["papers"], sources["tables"]
-        return {
-            str(name): {
+        read = {}
+        for name, about in sources["tables"].items():
+            paper = sources["papers"][about["paper"]]
+            read[str(name)] = {
                 "caption": str(about.get("caption", "")),
-                "title": str(papers[about["paper"]].get("title", "")),
-                "venue": str(papers[about["paper"]].get("venue", "")),
-                "url": _link(papers[about["paper"]].get("url", "")),
+                "title": str(paper.get("title", "")),
+                "venue": str(paper.get("venue", "")),
+                "url": _link(paper.get("url", "")),
             }
-            for name, about in tables.items()
-        }
+        return read
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise AwError(
             f'{path} is malformed: write {{"papers": {{ID: {{"title", "venue", "url"}}}}, '
@@ -330,30 +328,22 @@ def _restore(out: Path) -> None:
 
 
 def _check_folder(out: Path) -> None:
+    """Check that the folder is absent, empty, or holds nothing but an earlier page."""
     if not out.exists():
         return
     if not out.is_dir():
         raise AwError(f"{out} is a file; choose another -o")
-    names = {p.name for p in out.iterdir()}
-    page_there = out / "index.html"
-    made = (
-        page_there.is_file() and GENERATOR in page_there.read_text(encoding="utf-8", errors="replace")[:2000]
-    )
-    if names and (not made or names - OURS):
+    names, earlier = {p.name for p in out.iterdir()}, out / "index.html"
+    head = earlier.read_text(encoding="utf-8", errors="replace")[:2000] if earlier.is_file() else ""
+    if names and (GENERATOR not in head or names - OURS):
         odd = sorted(names - OURS)[0] if names - OURS else "another page"
         raise AwError(f"{out} holds other files than a published board ({odd}); choose another -o")
-    published = _published(out)
-    if published is not None:
-        refuse_strangers(out, published)
-
-
-def _published(out: Path) -> set[str] | None:
-    """Return the names of files that the last publish wrote; None for a page of an early version."""
     try:
-        names = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+        written = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        return None
-    return {MANIFEST, *map(str, names)} if isinstance(names, list) else None
+        return  # a page of an early version
+    if isinstance(written, list):
+        refuse_foreign_files(out, {MANIFEST, *map(str, written)})
 
 
 def _write_data(
@@ -412,20 +402,17 @@ def write_model_pages(
     for note in notes:
         say(note)
     by_hash = {sha256_file(t.run / RESULT): t for t in trained}
-    scenes: dict[tuple[str, str], dict[str, list[Entry]]] = {}
-    for entry in sorted(entries, key=lambda e: e.key):
-        label = f"{entry.method} ({entry.setting})" + (f" {entry.options}" if entry.options else "")
-        scenes.setdefault((entry.dataset, entry.scene), {}).setdefault(label, []).append(entry)
     links: dict[str, str] = {}
     names: set[str] = set()
-    for (dataset, scene), groups in scenes.items():
+    in_scene = grouped(sorted(entries, key=lambda e: e.key), lambda e: (e.dataset, e.scene))
+    for (dataset, scene), of_scene in in_scene.items():
+        groups = grouped(of_scene, _label)
         shown: list[tuple[str, TrainedModel]] = []
         for label, of_group in groups.items():
-            at_hand = [e for e in of_group if e.result_hash in by_hash]
+            at_hand = [by_hash[e.result_hash] for e in of_group if e.result_hash in by_hash]
+            shown += [(label, at_hand[0])] if at_hand else []
             if not at_hand:
                 say(f"no model of {label} on {scene}: its run is not below the given folders")
-                continue
-            shown.append((label, by_hash[at_hand[0].result_hash]))
         if not shown:
             continue
         if len({f.scene_hash for _, f in shown}) > 1:
@@ -439,6 +426,10 @@ def write_model_pages(
             for entry in groups[label]:
                 links[entry.result_hash] = f"{MODELS}/{name}#left={quote(label, safe='')}"
     return links, len(names)
+
+
+def _label(entry: Entry) -> str:
+    return f"{entry.method} ({entry.setting})" + (f" {entry.options}" if entry.options else "")
 
 
 def _page_name(dataset: str, scene: str, taken: set[str]) -> str:

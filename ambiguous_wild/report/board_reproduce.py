@@ -91,8 +91,7 @@ def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -
         ("--protocol", config.get("protocol", "full"), "full"),
         ("--factor", config["scene"].get("factor"), None),
     ):
-        if value != usual:
-            words += [flag, value]
+        words += [flag, value] if value != usual else []
     words += ["--start", "START.ply"] if config.get("start") else []
     words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
     for key, value in _changed(config).items():
@@ -178,9 +177,9 @@ def hardware(path: Path, result: RunResult) -> str:
             f"{path} is damaged: restore it, or run again with 'aw bench --overwrite always'"
         ) from None
     threads = result["cost"].get("threads")
-    count = (
-        "" if facts.get("gpu") or threads is None else f", {threads:g} thread{'' if threads == 1 else 's'}"
-    )
+    count = ""
+    if threads is not None and not facts.get("gpu"):
+        count = f", {threads:g} thread{'' if threads == 1 else 's'}"
     return " ".join(str(name).split())[:100] + count
 
 
@@ -207,8 +206,9 @@ def _simulate(truth: Facts, name: str) -> list[str]:
     end = [*(["--seed", str(seed)] if seed else []), "-o", f"raw/{name}"]
     preset = PRESETS.get(str(truth.get("preset")))
     if preset is not None:
-        views = spec.get("train_views") if spec.get("train_views") != preset.train_views else None
-        width = spec.get("width") if spec.get("width") != preset.width else None
+        views, width = (
+            spec.get(k) if spec.get(k) != getattr(preset, k) else None for k in ("train_views", "width")
+        )
         try:
             same = json.loads(json.dumps(plain_spec(resized(preset, views, width)))) == spec
         except (AwError, TypeError):

@@ -157,9 +157,8 @@ def _config(run: Path) -> RunConfig:
 def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tuple[str, str]:
     """Return (setting, commands) of a configuration, which a stranger may have written."""
     try:
-        return check_text(f"setting of {run}", setting(config, _planned(run))), command(
-            config, before, recorded
-        )
+        words = check_text(f"setting of {run}", setting(config, _planned(run)))
+        return words, command(config, before, recorded)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:
@@ -272,11 +271,8 @@ def _qualities(run: Path, result: RunResult) -> tuple[dict[str, float], tuple[st
     rows = [metrics_of(row) for row in result["per_image"]]
     names = {metric for row in rows for metric in row} | set(result["missing"])
     for name in sorted(names):
-        if (
-            not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", name)
-            or name in (*FIRST, *LAST)
-            or name.startswith(COST)
-        ):
+        taken = name in (*FIRST, *LAST) or name.startswith(COST)
+        if taken or not re.fullmatch(r"[a-z][a-z0-9_.]{0,60}", name):
             raise AwError(f"{run}: {name[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
     means = {name: mean_of(result, name) for name in names}
     means |= {f"mask_{name}": float(score) for name, score in mask_scores(result).items()}

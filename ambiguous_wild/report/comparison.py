@@ -22,6 +22,7 @@ from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, mea
 from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, read_runs
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.notes import incomparable, notes, untimed
 from ambiguous_wild.report.plain_formats import to_text
 from ambiguous_wild.report.table_layout import Column, Row, State, Table, TableCell, ranks
@@ -125,11 +126,8 @@ def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
     rows = []
     for row in table.rows:
         names = " or ".join(dict.fromkeys(shown[shown["method"] == row.name]["effects"]))
-        rows.append(
-            replace(
-                row, cells=(*row.cells, TableCell(printed=names) if names else TableCell(state="missing"))
-            )
-        )
+        cell = TableCell(printed=names) if names else TableCell(state="missing")
+        rows.append(replace(row, cells=(*row.cells, cell)))
     column = Column("", EFFECTS, table.columns[0].scene, words=True)
     return replace(table, columns=(*table.columns, column), rows=tuple(rows))
 
@@ -148,12 +146,10 @@ def _undefined(
     columns: tuple[Measure, ...], scenes: tuple[str, ...], defined: Mapping[str, Sequence[str]]
 ) -> list[str]:
     """Return lines that name the columns whose mean leaves out scenes."""
-    lines: dict[str, list[str]] = {}
-    for column in columns:
-        out = [s for s in scenes if s not in defined[column.key]]
-        if out and len(out) < len(scenes):
-            lines.setdefault(shortlist(out), []).append(column.label)
-    return [f"undefined on {out}, left out of the mean: {', '.join(c)}" for out, c in lines.items()]
+    left_out = {c.label: [s for s in scenes if s not in defined[c.key]] for c in columns}
+    partly = [label for label, out in left_out.items() if out and len(out) < len(scenes)]
+    by_scenes = grouped(partly, lambda label: shortlist(left_out[label]))
+    return [f"undefined on {out}, left out of the mean: {', '.join(c)}" for out, c in by_scenes.items()]
 
 
 class _Index:
@@ -176,10 +172,8 @@ class _Index:
                 values = values.where(rows["mask_recall"].notna())
             return values.sort_index()
         images = self.images.get((method, scene, column.key))
-        by_seed = (
-            {} if images is None else {seed: g["value"].to_numpy() for seed, g in images.groupby("seed")}
-        )
-        means = {seed: stats.mean(by_seed.get(seed, np.empty(0))) for seed in sorted(rows.index)}
+        by_seed = {} if images is None else dict(iter(images.groupby("seed")["value"]))
+        means = {seed: stats.mean(by_seed.get(seed, ())) for seed in sorted(rows.index)}
         return pd.Series(means, dtype=float)
 
     def can_have(self, scene: str, column: Measure, methods: Sequence[str]) -> bool:

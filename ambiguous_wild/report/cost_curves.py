@@ -1,206 +1,36 @@
-"""Gather runs into curves and points, find the Pareto front, and measure what a single change brings.
+"""Gather runs into curves, and say what each curve reaches: points, the Pareto front, the time to a PSNR.
 
 A curve holds the runs of one method with the same settings, over scenes and seeds. A mean is over seeds, then
 over scenes. A failed cell, or a scene without a run, makes the mean missing, so that no method gains from a
-failure.
-
-A change is one effect or option. Its gain and cost come from pairs of runs that differ in nothing else: the
-method, scene, seed, length, device and code are the same. Where the length is a budget, both trained equally
-long: the gain in dB then includes what the effect costs, and dB per minute have no meaning.
+failure. Times are those of `CostRun.minutes`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_runs import CostRun, Length, why_unranked
+from ambiguous_wild.report.grouping import grouped
 
-SAME_TIME = 0.01  # of the training: a smaller difference of times counts as none
-_ABSENT = "(absent)"
-
-Kind = Literal["effect", "part", "resolution", "gaussians", "interval", "option"]
-KINDS: tuple[Kind, ...] = ("effect", "part", "resolution", "gaussians", "interval", "option")
+BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
+MOST = 0.9  # of the best PSNR
+LAST_DB = 1.0
 
 
 @dataclass(frozen=True)
-class Change:
-    """Gain and cost of a change, over all pairs of runs that differ in it alone."""
+class MeanAndDeviation:
+    """A mean and the sample deviation over seeds; NaN = missing, or one seed."""
 
-    # "interval": an option called *_every, how often something is refreshed; "part": a variant of an ablation
-    kind: Kind
-    name: str
-    method: str
-    before: str  # value of the option; empty for an effect
-    after: str
-    length: str
-    scenes: tuple[str, ...]
-    pairs: int
-    db: MeanAndDeviation  # gain in PSNR, over pairs
-    low: float  # 95 % bootstrap interval of the gain, over the test images of all pairs
-    high: float
-    minutes: MeanAndDeviation  # extra minutes of training, over pairs
-    ms: MeanAndDeviation  # extra ms per iteration
-    share: float  # extra minutes, as a share of the training without the change
-    unranked: str = ""  # why the minutes cannot be trusted; empty if they can
-
-    @property
-    def what(self) -> str:
-        """The change in words."""
-        if self.kind == "effect":
-            return self.name
-        before_after = f"{self.before} → {self.after}"
-        return before_after if self.kind == "part" else f"{self.name} {before_after}"
-
-    @property
-    def per_minute(self) -> float:
-        """Gain in dB per extra minute; NaN if it takes no longer, or a run was not alone."""
-        if not self.minutes.mean > 0.0 or self.same_time or self.unranked:
-            return math.nan
-        return self.db.mean / self.minutes.mean
-
-    @property
-    def same_time(self) -> bool:
-        return abs(self.share) < SAME_TIME
-
-
-def changes(runs: Sequence[CostRun]) -> list[Change]:
-    """Measure every effect and option in which alone some pair of runs differs, by kind, name and method."""
-    usable = [run for run in runs if not run.error]
-    measured = [_change("effect", key, pairs) for key, pairs in sorted(_effect_pairs(usable).items())]
-    measured += [_change("part", key, pairs) for key, pairs in sorted(_part_pairs(usable).items())]
-    for key, pairs in sorted(_option_pairs(usable).items()):
-        measured.append(_change(_kind(key[0]), key, _costlier_second(pairs)))
-    return sorted(measured, key=lambda c: (KINDS.index(c.kind), c.name, c.method))
-
-
-def _kind(option: str) -> Kind:
-    own: dict[str, Kind] = {"resolution": "resolution", "max_gaussians": "gaussians"}
-    return own.get(option, "interval" if option.rpartition(".")[2].endswith("_every") else "option")
-
-
-Key = tuple[str, ...]  # name, method, length, and for options the two values
-Pairs = list[tuple[CostRun, CostRun]]
-
-
-def _groups(runs: Iterable[CostRun], key: Callable[[CostRun], Any]) -> list[list[CostRun]]:
-    groups: dict[Any, list[CostRun]] = {}
-    for run in runs:
-        groups.setdefault(key(run), []).append(run)
-    return list(groups.values())
-
-
-def _effect_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
-    pairs: dict[Key, Pairs] = {}
-    for group in _groups(runs, lambda r: (r.method, r.scene, r.seed, r.length, r.rest, r.options)):
-        for a, b in combinations(sorted(group, key=lambda r: len(r.effects)), 2):
-            if len(b.effects - a.effects) == 1 and a.effects < b.effects:
-                (name,) = b.effects - a.effects
-                pairs.setdefault((name, a.method, a.length.text), []).append((a, b))
-    return pairs
-
-
-def _part_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
-    """Pair each variant of an ablation with the unchanged method or, without a run of it, the first one."""
-    pairs: dict[Key, Pairs] = {}
-    for group in _groups(runs, lambda r: (r.base, r.scene, r.seed, r.length, r.rest, r.effects)):
-        plain = [run for run in group if run.method == run.base]
-        variants = sorted((run for run in group if run.method != run.base and "=" not in run.method),
-                          key=lambda run: run.method)  # fmt: skip
-        if len(plain) > 1:  # with several settings it is unclear which one a variant belongs to
-            continue
-        for of_group in _groups(variants, lambda run: run.method.partition("@")[2].partition("-")[0]):
-            host, *others = [*plain, *of_group]
-            for run in others:
-                name = run.method.partition("@")[2]
-                key = (name, run.base, run.length.text, _part(host), name)
-                pairs.setdefault(key, []).append((host, run))
-    return pairs
-
-
-def _part(run: CostRun) -> str:
-    return run.method.partition("@")[2] or "as it is"
-
-
-def _option_pairs(runs: Sequence[CostRun]) -> dict[Key, Pairs]:
-    pairs: dict[Key, Pairs] = {}
-    for group in _groups(runs, lambda r: (r.base, r.scene, r.seed, r.length, r.rest, r.effects)):
-        for a, b in combinations(group, 2):
-            if a.method != b.method:
-                continue  # a variant of an ablation: see `_part_pairs`
-            one, two = dict(a.options), dict(b.options)
-            keys = [k for k in one.keys() | two.keys() if one.get(k, _ABSENT) != two.get(k, _ABSENT)]
-            if len(keys) != 1:
-                continue
-            values = sorted(((str(o.get(keys[0], _ABSENT)), run) for o, run in ((one, a), (two, b))),
-                            key=lambda item: item[0])  # fmt: skip
-            key = (keys[0], a.base, a.length.text, values[0][0], values[1][0])
-            pairs.setdefault(key, []).append((values[0][1], values[1][1]))
-    return pairs
-
-
-def _costlier_second(pairs: Pairs) -> Pairs:
-    """Return the pairs in the order in which the second runs take longer, on average."""
-    extra = np.mean([_ms(b) - _ms(a) for a, b in pairs])
-    return [(b, a) for a, b in pairs] if extra < 0.0 else pairs
-
-
-def _ms(run: CostRun) -> float:
-    return run.numbers["ms_per_iteration"]
-
-
-def _change(kind: Kind, key: Key, pairs: Pairs) -> Change:
-    name, method, length = key[:3]
-    before, after = ("", "") if kind == "effect" else (_value(pairs[0][0], name), _value(pairs[0][1], name))
-    if kind == "part":
-        before, after = key[3:]
-    without = stats.mean([a.train_s for a, _ in pairs]) / 60.0
-    minutes = _summary([(b.train_s - a.train_s) / 60.0 for a, b in pairs])
-    interval = _interval(pairs)
-    return Change(
-        kind,
-        name,
-        method,
-        before,
-        after,
-        length,
-        tuple(sorted({a.scene for a, _ in pairs})),
-        len(pairs),
-        _summary([b.psnr - a.psnr for a, b in pairs]),
-        interval.low,
-        interval.high,
-        minutes,
-        _summary([_ms(b) - _ms(a) for a, b in pairs]),
-        minutes.mean / without if without > 0.0 else math.nan,
-        why_unranked([run for pair in pairs for run in pair]),
-    )
-
-
-def _interval(pairs: Pairs) -> stats.Interval:
-    """Return the interval of the gain over test images, paired by image, after a mean over seeds."""
-    images: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for a, b in pairs:
-        for name, psnr in a.images.items():
-            images.setdefault((a.scene, name), []).append((b.images[name], psnr))
-    if not images:
-        return stats.Interval(math.nan, math.nan, math.nan, 0)
-    means = np.array([np.mean(both, axis=0) for both in images.values()])
-    return stats.paired_interval(means[:, 0], means[:, 1])
-
-
-def _value(run: CostRun, option: str) -> str:
-    return str(dict(run.options).get(option, _ABSENT))
-
-
-def _summary(values: Sequence[float]) -> MeanAndDeviation:
-    return MeanAndDeviation(stats.mean(values), stats.spread(values))
+    mean: float = math.nan
+    spread: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -224,35 +54,40 @@ class Curve:
     def on(self, scene: str) -> list[CostRun]:
         return sorted((run for run in self.runs if run.scene == scene), key=lambda run: run.seed)
 
-
-@dataclass(frozen=True)
-class MeanAndDeviation:
-    """A mean and the sample deviation over seeds; NaN = missing, or one seed."""
-
-    mean: float = math.nan
-    spread: float = math.nan
+    def end(self, scene: str) -> float:
+        """Return the PSNR in dB at the end of the training on a scene, mean over seeds."""
+        return summary(self, (scene,), lambda run: run.psnr).mean
 
 
 def curves_of(runs: Sequence[CostRun]) -> list[Curve]:
     """Gather runs into curves, sorted by name, then from the shortest training."""
-    names = _names(runs)
-    groups: dict[tuple[str, Length], list[CostRun]] = {}
-    for run, name in zip(runs, names):
-        groups.setdefault((name, run.length), []).append(run)
-    curves = [Curve(name, runs[0].method, length, tuple(runs)) for (name, length), runs in groups.items()]
+    named = grouped(zip(_names(runs), runs), lambda item: (item[0], item[1].length))
+    curves = [
+        Curve(name, items[0][1].method, length, tuple(run for _, run in items))
+        for (name, length), items in named.items()
+    ]
     return sorted(curves, key=lambda curve: (curve.name, curve.trained_s, curve.length))
+
+
+def _names(runs: Sequence[CostRun]) -> list[str]:
+    """Return the name of each run's curve: its method, and the settings that vary among the method's runs."""
+    asked: dict[str, set[str]] = {}
+    values: dict[tuple[str, str], set[Any]] = {}
+    for run in runs:
+        asked.setdefault(run.method, set()).add(run.asked)
+        for key, value in run.options:
+            values.setdefault((run.method, key), set()).add(value)
+    names = []
+    for run in runs:
+        effects = f"+ {run.asked}" if run.asked else "plain"
+        parts = [run.method, effects] if len(asked[run.method]) > 1 else [run.method]
+        varied = (f"{key}={value}" for key, value in run.options if len(values[run.method, key]) > 1)
+        names.append(" ".join([*parts, *varied]))
+    return names
 
 
 def scenes_of(curves: Iterable[Curve]) -> tuple[str, ...]:
     return tuple(sorted({scene for curve in curves for scene in curve.scenes}))
-
-
-def longest(curves: Sequence[Curve]) -> list[Curve]:
-    """Return the curve that trained longest, for each name."""
-    best: dict[str, Curve] = {}
-    for curve in curves:  # sorted by length
-        best[curve.name] = curve
-    return list(best.values())
 
 
 def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], float]) -> MeanAndDeviation:
@@ -275,118 +110,289 @@ def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], floa
     )
 
 
-def psnr_at(run: CostRun, seconds: np.ndarray) -> np.ndarray:
-    """Return the PSNR of a run at times [n] s, interpolated linearly between probes; NaN outside of them."""
-    if not run.points:
-        return np.full(len(seconds), math.nan)
-    at, psnr = np.array(run.points).T
-    return np.interp(seconds, at, psnr, left=math.nan, right=math.nan)
-
-
 def timeline(curve: Curve, scenes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean PSNR over training time, where every run of every scene has one.
+
+    PSNR is interpolated linearly between probes.
 
     Returns:
         (seconds [n], dB [n]); both empty where a run is missing.
     """
-    runs = [run for scene in scenes for run in curve.on(scene)]
-    if not all(curve.on(scene) for scene in scenes) or not all(run.points for run in runs):
+    by_scene = [curve.on(scene) for scene in scenes]
+    points = [run.points for runs in by_scene for run in runs]
+    if not all(by_scene) or not all(points):
         return np.empty(0), np.empty(0)
-    begin = max(run.points[0][0] for run in runs)
-    end = min(run.points[-1][0] for run in runs)
+    begin, end = max(p[0][0] for p in points), min(p[-1][0] for p in points)
     if end < begin:
         return np.empty(0), np.empty(0)
     seconds = np.linspace(begin, end, 120)
-    by_scene = [np.mean([psnr_at(run, seconds) for run in curve.on(scene)], axis=0) for scene in scenes]
-    return seconds, np.mean(by_scene, axis=0)
-
-
-def _names(runs: Sequence[CostRun]) -> list[str]:
-    """Return the name of each run's curve: its method, and the settings that vary among the method's runs."""
-    asked: dict[str, set[str]] = {}
-    values: dict[str, dict[str, set[Any]]] = {}
-    for run in runs:
-        asked.setdefault(run.method, set()).add(run.asked)
-        options = values.setdefault(run.method, {})
-        for key, value in run.options:
-            options.setdefault(key, set()).add(value)
-    return [_name(run, asked[run.method], values[run.method]) for run in runs]
-
-
-def _name(run: CostRun, asked: set[str], values: dict[str, set[Any]]) -> str:
-    parts = [run.method]
-    if len(asked) > 1:
-        parts.append(f"+ {run.asked}" if run.asked else "plain")
-    parts += [f"{key}={value}" for key, value in run.options if len(values[key]) > 1]
-    return " ".join(parts)
+    means = [np.mean([np.interp(seconds, *np.array(r.points).T) for r in runs], axis=0) for runs in by_scene]
+    return seconds, np.mean(means, axis=0)
 
 
 @dataclass(frozen=True)
 class Point:
-    """A curve as one point, over all scenes of the report."""
+    """A curve as one point, over all scenes of the report; a row of cost.csv."""
 
     curve: str
     method: str
     length: str
     runs: int
     psnr: MeanAndDeviation  # dB
-    minutes: MeanAndDeviation  # of training; with the set-up if `setup` was asked for
-    setup_s: MeanAndDeviation
-    numbers: dict[
-        str, MeanAndDeviation
-    ]  # ms per iteration, Gaussians, MB, frames per second, the user's metrics
-    unranked: str = ""  # why its time is not ranked
-    low: float = math.nan  # minutes of the fastest run; shown if the time is not ranked
-    high: float = math.nan  # minutes of the slowest run
-    front: bool = False  # Pareto-optimal: no other curve reaches this PSNR in less time
+    minutes: MeanAndDeviation
+    minutes_low: float = math.nan  # of the fastest run; shown if the time is not ranked
+    minutes_high: float = math.nan  # of the slowest run
+    not_ranked: str = ""  # why its time is not ranked
+    pareto_front: bool = False  # no other curve reaches this PSNR in less time
+    setup_s: MeanAndDeviation = MeanAndDeviation()
+    # ms per iteration, Gaussians, MB, frames per second, the user's metrics
+    numbers: dict[str, MeanAndDeviation] = field(default_factory=dict)
 
 
-def points(curves: Sequence[Curve], scenes: Sequence[str] = (), *, setup: bool = False) -> list[Point]:
+def points(curves: Sequence[Curve]) -> list[Point]:
     """Return one point for each curve, and mark those on the Pareto front of training time and PSNR.
 
     References, and curves with a run that was not alone on its machine, are never on the front.
-
-    Args:
-        curves: from `curves_of`.
-        scenes: scenes of the means; empty = every scene that any curve has.
-        setup: add the set-up before the first step to the time.
     """
-    scenes = tuple(scenes) or scenes_of(curves)
+    scenes = scenes_of(curves)
     names = dict.fromkeys(name for curve in curves for run in curve.runs for name in run.numbers)
-    all_points = [_point(curve, scenes, setup, names) for curve in curves]
-    best = {id(p) for p in pareto([p for p in all_points if not knows_truth(p.method) and not p.unranked])}
-    return [replace(p, front=id(p) in best) for p in all_points]
+    all_points = [_point(curve, scenes, names) for curve in curves]
+    rivals = [p for p in all_points if not knows_truth(p.method) and not p.not_ranked]
+    best = set(map(id, pareto(rivals, [p.minutes.mean for p in rivals])))
+    return [replace(p, pareto_front=id(p) in best) for p in all_points]
 
 
-def pareto(among: Sequence[Point]) -> list[Point]:
-    """Return the Pareto-optimal points in order of time; points with a missing number are left out."""
-    complete = [p for p in among if not math.isnan(p.psnr.mean) and not math.isnan(p.minutes.mean)]
+def _point(curve: Curve, scenes: Sequence[str], names: Iterable[str]) -> Point:
+    def number(name: str) -> MeanAndDeviation:
+        return summary(curve, scenes, lambda run: run.numbers.get(name, math.nan))
+
+    return Point(
+        curve.name,
+        curve.method,
+        curve.length.text,
+        len(curve.runs),
+        summary(curve, scenes, lambda run: run.psnr),
+        summary(curve, scenes, lambda run: run.minutes),
+        *_range(run.minutes for run in curve.runs),
+        why_unranked(curve.runs),
+        setup_s=summary(curve, scenes, lambda run: run.setup_s),
+        numbers={name: number(name) for name in names},
+    )
+
+
+def _range(values: Iterable[float]) -> tuple[float, float]:
+    """Return the least and the greatest finite value; NaN without any."""
+    finite = [value for value in values if math.isfinite(value)]
+    return min(finite, default=math.nan), max(finite, default=math.nan)
+
+
+def pareto(among: Sequence[Point], costs: Sequence[float]) -> list[Point]:
+    """Return the Pareto-optimal points in order of cost; points with a missing number are left out."""
+    known = [(c, p) for c, p in zip(costs, among) if not math.isnan(c) and not math.isnan(p.psnr.mean)]
     front: list[Point] = []
-    for point in sorted(complete, key=lambda p: (p.minutes.mean, -p.psnr.mean)):
+    for _, point in sorted(known, key=lambda item: (item[0], -item[1].psnr.mean)):
         if not front or point.psnr.mean > front[-1].psnr.mean:
             front.append(point)
     return front
 
 
-def _point(curve: Curve, scenes: Sequence[str], setup: bool, names: Iterable[str]) -> Point:
-    def minutes(run: CostRun) -> float:
-        return (run.train_s + (run.setup_s if setup else 0.0)) / 60.0
+@dataclass(frozen=True)
+class PsnrTarget:
+    """A PSNR to reach, relative to the best curve of each scene, or the same everywhere."""
 
-    def number(name: str) -> MeanAndDeviation:
-        return summary(curve, scenes, lambda run: run.numbers.get(name, math.nan))
+    db: float  # below the best, or absolute
+    relative: bool
 
-    runs = [run for run in curve.runs if run.scene in scenes]
-    finite = [m for m in map(minutes, runs) if math.isfinite(m)]
-    return Point(
-        curve.name,
-        curve.method,
-        curve.length.text,
-        len(runs),
-        summary(curve, scenes, lambda run: run.psnr),
-        summary(curve, scenes, minutes),
-        summary(curve, scenes, lambda run: run.setup_s),
-        {name: number(name) for name in names},
-        why_unranked(runs),
-        min(finite, default=math.nan),
-        max(finite, default=math.nan),
+    @property
+    def text(self) -> str:
+        return f"best - {self.db:g} dB" if self.relative else f"{self.db:g} dB"
+
+    def level(self, curves: Sequence[Curve], scene: str) -> float:
+        """Return the PSNR in dB on a scene; NaN without a finished run."""
+        if not self.relative:
+            return self.db
+        # a reference sets no target for the other methods
+        rivals = [curve for curve in curves if not all(knows_truth(run.method) for run in curve.runs)]
+        ends = [curve.end(scene) for curve in rivals or curves]
+        return max((end for end in ends if math.isfinite(end)), default=math.nan) - self.db
+
+
+@dataclass(frozen=True)
+class Reach:
+    """The time at which a curve reaches a target; a row of time-to-psnr.csv."""
+
+    scene: str  # empty: the mean over all scenes
+    curve: str
+    length: str
+    target: str
+    psnr: float  # dB of the target; NaN: it differs between scenes, or there is no best curve
+    minutes: MeanAndDeviation  # missing unless every run reaches the target
+    minutes_low: float  # shown instead where times are not ranked
+    minutes_high: float
+    not_ranked: str  # why these times are not ranked
+    upper_bound: bool  # some runs had reached it by their first probe
+    reached: int  # number of runs that reach it
+    runs: int
+    missing: str  # why there is no mean: a scene without a run, or a run without probes
+
+
+def times_to_reach(curves: Sequence[Curve], targets: Sequence[float] = ()) -> list[Reach]:
+    """Compute the times for every scene, curve and target; first for the mean over several scenes.
+
+    Among curves that differ only in length, the fastest is taken and its length given: a short training often
+    reaches a target before a long one, whose schedule is slower.
+
+    Args:
+        curves: from `curves_of`.
+        targets: in dB; empty = `BELOW_BEST` below the best curve of each scene that is no reference.
+    """
+    wanted = [PsnrTarget(t, False) for t in dict.fromkeys(targets)]
+    wanted = wanted or [PsnrTarget(t, True) for t in BELOW_BEST]
+    scenes = scenes_of(curves)
+    levels = {(t, scene): t.level(curves, scene) for t in wanted for scene in scenes}
+    means = [("", scenes)] if len(scenes) > 1 else []
+    return [
+        _soonest([_reach(c, target, name, {s: levels[target, s] for s in members}) for c in same])
+        for name, members in (*means, *((scene, (scene,)) for scene in scenes))
+        for target in wanted
+        for same in grouped(curves, lambda curve: curve.name).values()
+    ]
+
+
+def _soonest(rows: Sequence[Reach]) -> Reach:
+    """Return the fastest of several lengths; if none always reaches the target, the one most often does."""
+    complete = [row for row in rows if math.isfinite(row.minutes.mean)]
+    if complete:
+        return min(complete, key=lambda row: row.minutes.mean)
+    return max(
+        reversed(rows), key=lambda row: (row.runs > 0, not row.missing, row.reached / max(row.runs, 1))
     )
+
+
+def first_time(run: CostRun, psnr: float) -> tuple[float, bool]:
+    """Return the seconds until the run reaches `psnr` dB, interpolated linearly between two probes.
+
+    Returns:
+        (seconds, whether its first probe had reached it already); NaN if it never does.
+    """
+    if math.isnan(psnr):
+        return math.nan, False
+    before: tuple[float, float] | None = None
+    for at, value in run.points:
+        if value >= psnr:
+            if before is None:
+                return at, True
+            share = (psnr - before[1]) / (value - before[1])
+            return before[0] + (share if math.isfinite(share) else 1.0) * (at - before[0]), False
+        before = (at, value)
+    return math.nan, False
+
+
+def _reach(curve: Curve, target: PsnrTarget, scene: str, level: dict[str, float]) -> Reach:
+    runs = [run for name in level for run in curve.on(name)]
+    times = {id(run): first_time(run, level[run.scene]) for run in runs}
+
+    def minutes(run: CostRun) -> float:
+        return (times[id(run)][0] + run.added_s) / 60.0
+
+    missing, mean = _missing(curve, level, runs), MeanAndDeviation()
+    if not missing:
+        mean = summary(curve, tuple(level), minutes)
+        if any(run.unprobed for run in runs):
+            mean = MeanAndDeviation(mean.mean)  # the spread of upper bounds has no meaning
+    return Reach(
+        scene,
+        curve.name,
+        curve.length.text,
+        target.text,
+        next(iter(level.values())) if len(level) == 1 or not target.relative else math.nan,
+        mean,
+        *_range(map(minutes, runs)),
+        why_unranked(runs),
+        any(early for _, early in times.values()),
+        sum(math.isfinite(at) for at, _ in times.values()),
+        len(runs),
+        missing,
+    )
+
+
+def _missing(curve: Curve, scenes: Iterable[str], runs: Sequence[CostRun]) -> str:
+    """Return why there can be no mean of these runs; empty if there can."""
+    lacking = [scene for scene in scenes if not curve.on(scene)]
+    if lacking:
+        return f"no run on {', '.join(lacking)}"
+    unprobed = [run.unprobed for run in runs if run.unprobed]
+    # an unprobed run gives an upper bound at its end, and bounds and times are not averaged together
+    return shortlist(unprobed, 2) if unprobed and len(unprobed) < len(runs) else ""
+
+
+@dataclass(frozen=True)
+class TargetRow:
+    """What accuracy costs on one scene, in one line.
+
+    It takes the time of the method that is fastest, in the mean over its seeds. It leaves out references, and
+    runs that were not alone if others were.
+    """
+
+    scene: str
+    best: float  # dB, the highest mean over seeds at the end of a training
+    best_curve: str
+    most_s: float  # seconds until 90 % of the best PSNR; NaN if no training has a probe as low
+    most_spread_s: float  # sample deviation over seeds; NaN for one seed
+    most_curve: str
+    bound: bool  # it was reached at the first probe: most_s is an upper bound
+    last_s: float  # seconds from 1 dB below the best to the best
+    ranked: bool  # False: some times are of runs that were not alone
+
+    @property
+    def text(self) -> str:
+        """For example "on yard 90 % of the best PSNR (28.4 dB) takes 41 s (3dgs), the last dB 6 min"."""
+        spread = "" if math.isnan(self.most_spread_s) else f" ± {self.most_spread_s:.1f} s"
+        bound = "at most " if self.bound else ""
+        most = f"takes {bound}{duration(self.most_s)}{spread} ({self.most_curve})"
+        most = "not measured" if math.isnan(self.most_s) else most
+        last = "not measured" if math.isnan(self.last_s) else f"{duration(self.last_s)} ({self.best_curve})"
+        line = f"on {self.scene} 90 % of the best PSNR ({self.best:.1f} dB) {most}, the last dB {last}"
+        return line if self.ranked else f"{line}; not all of these runs were alone on their machine"
+
+
+def duration(seconds: float) -> str:
+    """Return a time as seconds below two minutes, else as minutes."""
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.3g} min"
+
+
+def answers(curves: Sequence[Curve]) -> list[TargetRow]:
+    """Compute the answer for each scene with a finished run."""
+    rivals = [curve for curve in curves if not knows_truth(curve.method)]
+    alone = [curve for curve in rivals if not why_unranked(curve.runs)]
+    by_scene = (_answer(scene, alone or rivals) for scene in scenes_of(rivals))
+    return [answer for answer in by_scene if answer is not None]
+
+
+def _answer(scene: str, curves: Sequence[Curve]) -> TargetRow | None:
+    finished = [replace(c, runs=tuple(c.on(scene))) for c in curves if math.isfinite(c.end(scene))]
+    if not finished:
+        return None
+    best_curve = max(finished, key=lambda c: c.end(scene))
+    best = best_curve.end(scene)
+    # seeds end above or below their mean, so the mean is reached at the end of the training
+    end_s = summary(best_curve, (scene,), lambda run: run.train_s + run.added_s).mean
+    most = _first(finished, MOST * best)
+    before = _first([best_curve], best - LAST_DB)
+    return TargetRow(
+        scene,
+        best,
+        best_curve.name,
+        math.nan if most is None else 60.0 * most.minutes.mean,
+        math.nan if most is None else 60.0 * most.minutes.spread,
+        "" if most is None else most.curve,
+        most is not None and most.upper_bound,
+        math.nan if before is None or before.upper_bound else end_s - 60.0 * before.minutes.mean,
+        not any(why_unranked(c.runs) for c in finished),
+    )
+
+
+def _first(curves: Sequence[Curve], psnr: float) -> Reach | None:
+    """Return the row of the curve that is first to reach `psnr` with all its seeds."""
+    rows = [row for row in times_to_reach(curves, [psnr]) if math.isfinite(row.minutes.mean)]
+    return min(rows, key=lambda row: row.minutes.mean, default=None)

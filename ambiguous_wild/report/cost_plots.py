@@ -13,17 +13,10 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
 from ambiguous_wild.methods.registry import knows_truth
-from ambiguous_wild.report.cost_curves import KINDS as CHANGES
-from ambiguous_wild.report.cost_curves import (
-    Change,
-    Curve,
-    MeanAndDeviation,
-    Point,
-    longest,
-    summary,
-    timeline,
-)
-from ambiguous_wild.report.cost_report import PLOTS, CostReport, TimeUnit, per_minute, time_unit
+from ambiguous_wild.report.cost_changes import KINDS, Change
+from ambiguous_wild.report.cost_curves import Curve, MeanAndDeviation, Point, pareto, summary, timeline
+from ambiguous_wild.report.cost_report import PLOTS, CostReport, TimeUnit, per_minute
+from ambiguous_wild.report.grouping import grouped
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))  # when colours run out
 GREY = "0.45"
@@ -167,10 +160,11 @@ def _panels(report: CostReport) -> list[tuple[str, tuple[str, ...]]]:
 
 def draw_timelines(report: CostReport) -> Any | None:
     """Draw test PSNR over training time: thin lines for seeds, thick for their mean, bars for the spread."""
-    curves = [c for c in longest(report.curves) if any(len(run.points) > 1 for run in c.runs)]
+    longest = {curve.name: curve for curve in report.curves}.values()  # they are sorted by length
+    curves = [c for c in longest if any(len(run.points) > 1 for run in c.runs)]
     if not curves:
         return None
-    panels, styles, unit = _panels(report), line_styles([c.name for c in report.curves]), time_unit(report)
+    panels, styles, unit = _panels(report), line_styles([c.name for c in report.curves]), report.unit
     figure, axes = new_figure(
         len(panels), reading="thick: mean over seeds; thin: each seed; bars: sample deviation over seeds"
     )
@@ -191,8 +185,7 @@ def _timeline(
             at = np.array(run.points).reshape(-1, 2)
             axes.plot(at[:, 0] * scale, at[:, 1], **style, linewidth=0.7, alpha=0.45)
     seconds, psnr = timeline(curve, scenes)
-    x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
-    y = summary(curve, scenes, lambda run: run.psnr)
+    x, y = _end(curve, scenes, unit)
     seconds = seconds * scale
     if finite(x.mean, y.mean) and len(seconds) and x.mean >= seconds[-1]:  # the dot belongs to its curve
         seconds, psnr = np.append(seconds, x.mean), np.append(psnr, y.mean)
@@ -203,6 +196,12 @@ def _timeline(
     return curve.name, x.mean, y.mean, style["color"]
 
 
+def _end(curve: Curve, scenes: tuple[str, ...], unit: TimeUnit) -> tuple[MeanAndDeviation, MeanAndDeviation]:
+    """Return the length of the training, and its PSNR."""
+    minutes = summary(curve, scenes, lambda run: run.train_s / 60.0)
+    return unit.of(minutes), summary(curve, scenes, lambda run: run.psnr)
+
+
 def _dot(axes: Any, x: MeanAndDeviation, y: MeanAndDeviation, colour: Any, *, hollow: bool = False) -> None:
     xerr, yerr = (e if finite(e) else None for e in (x.spread, y.spread))
     axes.errorbar(x.mean, y.mean, xerr=xerr, yerr=yerr, fmt="o", color=colour, markersize=5.5, elinewidth=1.2,
@@ -211,17 +210,17 @@ def _dot(axes: Any, x: MeanAndDeviation, y: MeanAndDeviation, colour: Any, *, ho
 
 def draw_budgets(report: CostReport) -> Any | None:
     """Draw the final PSNR of runs of several lengths; each dot is a separate training."""
-    lengths = {name: [c for c in report.curves if c.name == name] for name in {c.name for c in report.curves}}
+    lengths = grouped(report.curves, lambda curve: curve.name)
     if all(len(curves) < 2 for curves in lengths.values()):
         return None
-    panels, styles, unit = _panels(report), line_styles(list(lengths)), time_unit(report)
+    panels, styles, unit = _panels(report), line_styles(list(lengths)), report.unit
     figure, axes = new_figure(
         len(panels), reading="every dot is a training of that length; bars: sample deviation over seeds"
     )
     for panel, (title, scenes) in zip(axes, panels):
         ends, times = [], []
-        for name in sorted(lengths):
-            ends_of = _joined(panel, lengths[name], scenes, styles[name], unit)
+        for name, curves in lengths.items():
+            ends_of = _joined(panel, curves, scenes, styles[name], unit)
             times += [x for x, _ in ends_of]
             ends += [(name, *ends_of[-1], styles[name]["color"])] if ends_of else []
         _finish(panel, title, f"training time ({unit.name})")
@@ -236,8 +235,7 @@ def _joined(
 ) -> list[tuple[float, float]]:
     ends = []
     for curve in curves:
-        x = unit.of(summary(curve, scenes, lambda run: run.train_s / 60.0))
-        y = summary(curve, scenes, lambda run: run.psnr)
+        x, y = _end(curve, scenes, unit)
         if finite(x.mean, y.mean):
             ends.append((x.mean, y.mean))
             _dot(axes, MeanAndDeviation(x.mean), y, style["color"])
@@ -257,7 +255,7 @@ def _few(times: Sequence[float]) -> list[float]:
 
 def draw_front(report: CostReport) -> Any | None:
     """Draw PSNR against time, megabytes and frames per second; the grey line is the Pareto front."""
-    styles, unit = line_styles([p.curve for p in report.points]), time_unit(report)
+    styles, unit = line_styles([p.curve for p in report.points]), report.unit
     panels = [
         axis for axis in AXES if any(finite(_x(p, axis[0], unit).mean, p.psnr.mean) for p in report.points)
     ]
@@ -268,26 +266,30 @@ def draw_front(report: CostReport) -> Any | None:
         reading="grey: Pareto front; hollow: time not ranked; bars: sample deviation over seeds",
     )
     for panel, (key, label, less_is_better) in zip(axes, panels):
-        known = [p for p in report.points if finite(_x(p, key, unit).mean, p.psnr.mean)]
+        timed = key != "model_mb"
+        known = [(p, _x(p, key, unit).mean) for p in report.points]
+        known = [(p, x) for p, x in known if finite(x, p.psnr.mean)]
+        at = {id(p): x for p, x in known}
         # a time that is not ranked is drawn, and never on the front
-        rivals = [p for p in known if not knows_truth(p.method) and not (p.unranked and key != "model_mb")]
-        _front_line(panel, [(_x(p, key, unit).mean, p.psnr.mean) for p in rivals], less_is_better)
-        for p in known:
-            hollow = bool(p.unranked) and key != "model_mb"
+        rivals = [p for p, _ in known if not knows_truth(p.method) and not (p.not_ranked and timed)]
+        front = pareto(rivals, [at[id(p)] if less_is_better else -at[id(p)] for p in rivals])
+        # the ring shows a front of one point, which has no line
+        panel.step([at[id(p)] for p in front], [p.psnr.mean for p in front], where="post", color="0.82",
+                   linewidth=5.0, solid_capstyle="round", marker="o", markersize=13, zorder=1)  # fmt: skip
+        for p, _ in known:
+            hollow = bool(p.not_ranked) and timed
             _dot(panel, _x(p, key, unit), p.psnr, styles[p.curve]["color"], hollow=hollow)
-        for name in dict.fromkeys(p.curve for p in known):  # trainings of several lengths
-            line = [(_x(p, key, unit).mean, p.psnr.mean) for p in known if p.curve == name]
-            panel.plot([x for x, _ in line], [y for _, y in line], **styles[name], linewidth=1.0, alpha=0.6)
-        last = {p.curve: p for p in known}  # of a curve of several lengths, the longest has the name
-        ends = [
-            (p.curve, _x(p, key, unit).mean, p.psnr.mean, styles[p.curve]["color"]) for p in last.values()
-        ]
+        lines = grouped(known, lambda item: item[0].curve)  # trainings of several lengths
+        for name, line in lines.items():
+            panel.plot([x for _, x in line], [p.psnr.mean for p, _ in line], **styles[name], linewidth=1.0,
+                       alpha=0.6)  # fmt: skip
+        # of a curve of several lengths, the longest has the name
+        ends = [(c, line[-1][1], line[-1][0].psnr.mean, styles[c]["color"]) for c, line in lines.items()]
         if key == "minutes":
             label = f"{label}{' and set-up' if report.setup else ''} ({unit.name})"
-        over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
         panel.margins(x=0.08, y=0.1)
-        _finish(panel, over, f"{label}, {'less' if less_is_better else 'more'} is better")
-        times = [_x(p, key, unit).mean for p in known]
+        _finish(panel, report.over, f"{label}, {'less' if less_is_better else 'more'} is better")
+        times = list(at.values())
         if key == "minutes" and max(times) > 5.0 * min(times) > 0.0:
             ticks_of_time(panel, _few(times))
         label_points(panel, ends)
@@ -298,27 +300,17 @@ def _x(point: Point, key: str, unit: TimeUnit) -> MeanAndDeviation:
     return unit.of(point.minutes) if key == "minutes" else point.numbers[key]
 
 
-def _front_line(axes: Any, at: Sequence[tuple[float, float]], less_is_better: bool) -> None:
-    front: list[tuple[float, float]] = []
-    for x, y in sorted(at, key=lambda p: (p[0] if less_is_better else -p[0], -p[1])):
-        if not front or y > front[-1][1]:
-            front.append((x, y))
-    # the ring shows a front of one point, which has no line
-    axes.step([x for x, _ in front], [y for _, y in front], where="post", color="0.82", linewidth=5.0,
-              solid_capstyle="round", marker="o", markersize=13, zorder=1)  # fmt: skip
-
-
 def draw_changes(report: CostReport) -> Any | None:
     """Draw a row for each change: the gain in dB with its interval, and its cost beside it."""
     rows = [c for c in report.changes if finite(c.db.mean)]
     if not rows:
         return None
-    unit = time_unit(report)
+    unit = report.unit
     figure, (axes,) = new_figure(1, panel=(8.6, 1.1 + 0.36 * len(rows)))
     for height, change in enumerate(reversed(rows)):
-        colour = plot_colour(CATEGORIES[CHANGES.index(change.kind)])
-        if finite(change.low, change.high):
-            axes.plot([change.low, change.high], [height, height], color=colour, linewidth=2.0)
+        colour = plot_colour(CATEGORIES[KINDS.index(change.kind)])
+        if finite(change.db_low, change.db_high):
+            axes.plot([change.db_low, change.db_high], [height, height], color=colour, linewidth=2.0)
         axes.plot([change.db.mean], [height], "o", color=colour, markersize=6)
         axes.annotate(_price(change, unit), (1.02, height), xycoords=("axes fraction", "data"), fontsize=8,
                       va="center", color=GREY, annotation_clip=False)  # fmt: skip

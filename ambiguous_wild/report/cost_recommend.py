@@ -19,9 +19,9 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
-from ambiguous_wild.report.cost_curves import Curve, curves_of, summary
+from ambiguous_wild.report.cost_curves import Curve, curves_of, duration, scenes_of, summary
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
-from ambiguous_wild.report.cost_targets import duration
+from ambiguous_wild.report.grouping import grouped
 
 CLOSE_DB = 0.3  # a setting this near the best is marked as equally good
 _TAKEN = ("--method", "--effects", "--resolution", "--max-gaussians", "--set", "--plugin", "--device")
@@ -100,7 +100,7 @@ def recommend(
         notes.append(f"{scene} was measured with one setting only")
     order = sorted(parts, key=lambda name: -parts[name])
     best = parts[order[0]]
-    curves = _curves_by_name(own or usable)
+    curves = grouped(curves_of(own or usable), lambda curve: curve.name)
     choices = tuple(
         _choice(curves[name], best - parts[name], rest[name], values, reference) for name in order
     )
@@ -113,14 +113,11 @@ def value_at(curves: Sequence[Curve], scene: str, seconds: float) -> float:
     It is interpolated between two lengths, linearly over log time, and constant after the longest.
     """
     ends = sorted(
-        (summary(c, (scene,), lambda run: run.train_s).mean, summary(c, (scene,), lambda run: run.psnr).mean)
-        for c in curves
-        if c.on(scene)
+        (summary(c, (scene,), lambda run: run.train_s).mean, c.end(scene)) for c in curves if c.on(scene)
     )
     ends = [(at, psnr) for at, psnr in ends if math.isfinite(at) and math.isfinite(psnr) and at > 0.0]
     # trainings end up to a step after the budget, and a machine's speed is known to some percent
-    early = [end for end in ends if end[0] <= 1.05 * seconds]
-    if not early:
+    if not any(at <= 1.05 * seconds for at, _ in ends):
         return math.nan
     at, psnr = np.log([end[0] for end in ends]), np.array([end[1] for end in ends])
     return float(np.interp(math.log(seconds), at, psnr))
@@ -148,19 +145,12 @@ def additive(values: dict[tuple[str, str], float]) -> tuple[dict[str, float], di
 def values_within(runs: Sequence[CostRun], seconds: float) -> dict[tuple[str, str], float]:
     """Return the PSNR that is reached within `seconds`, by (name of the setting, scene)."""
     values = {}
-    for name, curves in _curves_by_name(runs).items():
-        for scene in sorted({s for curve in curves for s in curve.scenes}):
+    for name, curves in grouped(curves_of(runs), lambda curve: curve.name).items():
+        for scene in scenes_of(curves):
             value = value_at(curves, scene, seconds)
             if math.isfinite(value):
                 values[name, scene] = value
     return values
-
-
-def _curves_by_name(runs: Sequence[CostRun]) -> dict[str, list[Curve]]:
-    by_name: dict[str, list[Curve]] = {}
-    for curve in curves_of(runs):
-        by_name.setdefault(curve.name, []).append(curve)
-    return by_name
 
 
 def _choice(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
@@ -14,18 +15,20 @@ from ambiguous_wild.harness.result_file import encoded
 from ambiguous_wild.harness.timing import seconds_range
 from ambiguous_wild.io.files import is_record, refuse_files_there, write_json, write_text
 from ambiguous_wild.report import plain_formats
+from ambiguous_wild.report.cost_changes import Change, changes
 from ambiguous_wild.report.cost_curves import (
-    Change,
     Curve,
     MeanAndDeviation,
     Point,
-    changes,
+    Reach,
+    TargetRow,
+    answers,
     curves_of,
     points,
+    times_to_reach,
 )
-from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
-from ambiguous_wild.report.cost_targets import Reach, TargetRow, answers, times_to_reach
-from ambiguous_wild.report.plain_formats import to_csv
+from ambiguous_wild.report.cost_runs import CostRuns, why_unranked
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.table_layout import Table, text_table
 
 PLOTS = ("timelines", "budgets", "front", "changes")
@@ -37,6 +40,26 @@ TIMES = {
     False: "times: wall seconds of the machine; ranked between runs that were alone",
 }
 SHORT_MIN = 3.0  # trainings below this are shown in seconds
+CHANGES = {  # kind of a change -> title of its table
+    "effect": "what each effect brings, on runs that differ in it alone",
+    "part": "what each variant of an ablation changes, against the method as it is",
+    "resolution": "what another resolution of training brings",
+    "gaussians": "what more Gaussians bring",
+    "interval": "what refreshing more often brings, on runs that differ in the interval alone",
+    "option": "what other options bring, on runs that differ in one alone",
+}
+
+
+@dataclass(frozen=True)
+class TimeUnit:
+    """The unit of times that are shown; files hold minutes."""
+
+    name: str
+    per_minute: float
+    digits: int
+
+    def of(self, minutes: MeanAndDeviation) -> MeanAndDeviation:
+        return MeanAndDeviation(minutes.mean * self.per_minute, minutes.spread * self.per_minute)
 
 
 @dataclass(frozen=True)
@@ -54,6 +77,24 @@ class CostReport:
     setup: bool  # times include the set-up before the first step
     made_by: str  # the command
 
+    @property
+    def over(self) -> str:
+        """What the points are means over, as text."""
+        return f"mean over {len(self.scenes)} scenes" if len(self.scenes) > 1 else self.scenes[0]
+
+    @property
+    def kind(self) -> str:
+        """What stands in front of a unit of time."""
+        return "ref " if self.reference else ""
+
+    @property
+    def unit(self) -> TimeUnit:
+        """Seconds if every training is short, else minutes."""
+        minutes = [run.train_s / 60.0 for curve in self.curves for run in curve.runs]
+        if max((m for m in minutes if not math.isnan(m)), default=0.0) < SHORT_MIN:
+            return TimeUnit(f"{self.kind}s", 60.0, 1)
+        return TimeUnit(f"{self.kind}min", 1.0, 2)
+
 
 def cost_report(
     cost_runs: CostRuns, *, targets: Sequence[float] = (), setup: bool = False, made_by: str = ""
@@ -66,44 +107,42 @@ def cost_report(
         setup: add the set-up before the first step to the time.
         made_by: the command that makes it again.
     """
-    curves, scenes = curves_of(cost_runs.runs), tuple(sorted({run.scene for run in cost_runs.runs}))
+    runs = [replace(run, added_s=run.setup_s if setup else 0.0) for run in cost_runs.runs]
+    curves, scenes = curves_of(runs), tuple(sorted({run.scene for run in runs}))
     return CostReport(
         tuple(curves),
         scenes,
-        tuple(points(curves, setup=setup)),
-        tuple(times_to_reach(curves, targets, setup=setup)),
-        tuple(changes(cost_runs.runs)),
-        (*cost_runs.notes, *_gaps(curves, scenes), *_unranked(curves)),
-        tuple(answers(curves, setup=setup)),
+        tuple(points(curves)),
+        tuple(times_to_reach(curves, targets)),
+        tuple(changes(runs)),
+        (*cost_runs.notes, *_gaps(curves, scenes), *_unprobed(curves), *_unranked(curves)),
+        tuple(answers(curves)),
         cost_runs.reference,
         setup,
         made_by,
     )
 
 
-def _unranked(curves: Sequence[Curve]) -> list[str]:
-    """Return a line for each reason why times are not ranked."""
-    reasons: dict[str, list[str]] = {}
-    for curve in curves:
-        if why := why_unranked(curve.runs):
-            reasons.setdefault(why, []).append(f"{curve.name}, {curve.length.text}")
-    return [f"times not ranked: {shortlist(names)} ({why})" for why, names in reasons.items()]
+def _unranked(curves: Sequence[Curve]) -> Iterator[str]:
+    """Yield a line for each reason why times are not ranked."""
+    for why, of in grouped(curves, lambda curve: why_unranked(curve.runs)).items():
+        if why:
+            names = shortlist(f"{curve.name}, {curve.length.text}" for curve in of)
+            yield f"times not ranked: {names} ({why})"
 
 
-def _gaps(curves: Sequence[Curve], scenes: Sequence[str]) -> list[str]:
-    lines = []
+def _gaps(curves: Sequence[Curve], scenes: Sequence[str]) -> Iterator[str]:
     for curve in curves:
-        lacking = [scene for scene in scenes if not curve.on(scene)]
-        if lacking:
-            lines.append(
+        if lacking := [scene for scene in scenes if not curve.on(scene)]:
+            yield (
                 f"no run: {curve.name}, {curve.length.text}, on {', '.join(lacking)}; its means over scenes "
                 "are missing"
             )
-    return lines + _unprobed([run for curve in curves for run in curve.runs if not run.error])
 
 
-def _unprobed(runs: Sequence[CostRun]) -> list[str]:
+def _unprobed(curves: Sequence[Curve]) -> list[str]:
     """Return lines about runs without probes: one for each run, or for all methods without any probes."""
+    runs = [run for curve in curves for run in curve.runs if not run.error]
     probed = {run.method for run in runs if not run.unprobed}
     never = sorted({run.method for run in runs} - probed)
     lines = [
@@ -126,16 +165,16 @@ def write_report(report: CostReport, folder: Path) -> list[Path]:
     """
     _remove_earlier(folder)
     tables = {
-        "cost.csv": [_point_row(p) for p in report.points],
-        "time-to-psnr.csv": [_reach_row(r) for r in report.reach],
-        "changes.csv": [_change_row(c) for c in report.changes],
+        "cost.csv": list(map(_row, report.points)),
+        "time-to-psnr.csv": list(map(_row, report.reach)),
+        "changes.csv": list(map(_row, report.changes)),
         "timelines.csv": list(_timeline_rows(report.curves)),
     }
     written = [folder / "cost.json"]
     write_json(written[0], plain_data(report))
     for name, rows in tables.items():
         if rows:
-            write_text(folder / name, to_csv(list(rows[0]), (row.values() for row in rows)))
+            write_text(folder / name, plain_formats.to_csv(list(rows[0]), (row.values() for row in rows)))
             written.append(folder / name)
     return written
 
@@ -157,49 +196,37 @@ def plain_data(report: CostReport) -> Facts:
         "seconds": "reference" if report.reference else "wall",
         "answers": [asdict(answer) | {"text": answer.text} for answer in report.answers],
         "scenes": list(report.scenes),
-        "curves": [_point_row(p) for p in report.points],
-        "time_to_psnr": [_reach_row(r) for r in report.reach],
-        "changes": [_change_row(c) for c in report.changes],
+        "curves": list(map(_row, report.points)),
+        "time_to_psnr": list(map(_row, report.reach)),
+        "changes": list(map(_row, report.changes)),
         "notes": list(report.notes),
     }
     return dict(encoded(data))
 
 
-def _point_row(p: Point) -> Facts:
-    row: Facts = {"curve": p.curve, "method": p.method, "length": p.length, "runs": p.runs}
-    row |= _both("psnr", p.psnr) | _both("minutes", p.minutes)
-    row |= {"minutes_low": p.low, "minutes_high": p.high, "not_ranked": p.unranked, "pareto_front": p.front}
-    row |= _both("setup_s", p.setup_s)
-    for name, value in p.numbers.items():
-        row |= _both(name, value)
+def _row(record: Point | Reach | Change) -> Facts:
+    """Return a record by the columns of its file; a mean has a second column for its deviation."""
+    return _columns(vars(record))
+
+
+def _columns(values: Mapping[str, Any]) -> Facts:
+    row: Facts = {}
+    for name, value in values.items():
+        if isinstance(value, MeanAndDeviation):
+            row |= {name: value.mean, f"{name}_std": value.spread}
+        elif isinstance(value, dict):
+            row |= _columns(value)
+        else:
+            row[name] = " ".join(value) if isinstance(value, tuple) else value
     return row
 
 
-def _reach_row(r: Reach) -> Facts:
-    row: Facts = {"scene": r.scene or "", "curve": r.curve, "length": r.length, "target": r.target}
-    row |= {"psnr": r.psnr} | _both("minutes", r.minutes)
-    row |= {"minutes_low": r.low, "minutes_high": r.high, "not_ranked": r.unranked}
-    return row | {"upper_bound": r.bound, "reached": r.reached, "runs": r.runs, "missing": r.missing}
-
-
-def _change_row(c: Change) -> Facts:
-    row: Facts = {"kind": c.kind, "name": c.name, "method": c.method, "before": c.before, "after": c.after}
-    row |= {"length": c.length, "scenes": " ".join(c.scenes), "pairs": c.pairs}
-    row |= _both("db", c.db) | {"db_low": c.low, "db_high": c.high}
-    row |= _both("minutes", c.minutes) | _both("ms_per_iteration", c.ms)
-    return row | {"db_per_minute": c.per_minute, "same_time": c.same_time, "not_ranked": c.unranked}
-
-
-def _timeline_rows(curves: Iterable[Curve]) -> Iterable[Facts]:
+def _timeline_rows(curves: Iterable[Curve]) -> Iterator[Facts]:
     for curve in curves:
         for run in curve.runs:
             for at, psnr in run.points:
                 yield {"curve": curve.name, "length": curve.length.text, "scene": run.scene, "seed": run.seed,
                        "train_s": at, "psnr": psnr}  # fmt: skip
-
-
-def _both(name: str, value: MeanAndDeviation) -> dict[str, float]:
-    return {name: value.mean, f"{name}_std": value.spread}
 
 
 def to_text(report: CostReport) -> str:
@@ -214,55 +241,22 @@ def to_text(report: CostReport) -> str:
     return "\n".join(parts) + "\n"
 
 
-@dataclass(frozen=True)
-class TimeUnit:
-    """The unit of times that are shown; files hold minutes."""
-
-    name: str
-    per_minute: float
-    digits: int
-
-    def of(self, minutes: MeanAndDeviation) -> MeanAndDeviation:
-        return MeanAndDeviation(minutes.mean * self.per_minute, minutes.spread * self.per_minute)
-
-
-def time_unit(report: CostReport) -> TimeUnit:
-    """Return seconds if every training is short, else minutes."""
-    minutes = [
-        run.train_s / 60.0 for curve in report.curves for run in curve.runs if not math.isnan(run.train_s)
-    ]
-    kind = "ref " if report.reference else ""
-    if max(minutes, default=0.0) < SHORT_MIN:
-        return TimeUnit(f"{kind}s", 60.0, 1)
-    return TimeUnit(f"{kind}min", 1.0, 2)
-
-
 def tables_of(report: CostReport) -> list[Table]:
     """Return the tables: what each curve reaches, when it reaches a PSNR, and what each change brings."""
-    tables = [_points(report)]
-    scenes: dict[str | None, list[Reach]] = {}
-    for row in report.reach:
-        scenes.setdefault(row.scene, []).append(row)
-    tables += [_reached(scene, rows, report) for scene, rows in scenes.items()]
-    for kind, title in (
-        ("effect", "what each effect brings, on runs that differ in it alone"),
-        ("part", "what each variant of an ablation changes, against the method as it is"),
-        ("resolution", "what another resolution of training brings"),
-        ("gaussians", "what more Gaussians bring"),
-        ("interval", "what refreshing more often brings, on runs that differ in the interval alone"),
-        ("option", "what other options bring, on runs that differ in one alone"),
-    ):
-        rows = [c for c in report.changes if c.kind == kind]
-        tables += [_changed(title, rows, time_unit(report))] if rows else []
-    return tables
+    reached = grouped(report.reach, lambda row: row.scene)
+    changed = grouped(report.changes, lambda change: change.kind)
+    return [
+        _points(report),
+        *(_reached(scene, rows, report) for scene, rows in reached.items()),
+        *(_changed(CHANGES[kind], rows, report) for kind, rows in changed.items()),
+    ]
 
 
 def _points(report: CostReport) -> Table:
-    over = f"mean over {len(report.scenes)} scenes" if len(report.scenes) > 1 else report.scenes[0]
-    unit = time_unit(report)
+    unit, kind = report.unit, report.kind
     rows = []
     for p in report.points:
-        n, front = p.numbers, "not ranked" if p.unranked else "yes" if p.front else ""
+        n, front = p.numbers, "not ranked" if p.not_ranked else "yes" if p.pareto_front else ""
         rows.append((
             p.curve, p.length, str(p.runs), number(p.psnr, 2), _time(p.minutes, p, unit), front,
             number(p.setup_s, 1), number(n["ms_per_iteration"], 1),
@@ -270,14 +264,13 @@ def _points(report: CostReport) -> Table:
             number(n["fps"], 1, spread=False),
         ))  # fmt: skip
     took = f"{unit.name} with set-up" if report.setup else unit.name
-    kind = "ref " if report.reference else ""
     head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", f"{kind}set-up s",
             f"{kind}ms/iter", "Gaussians", "MB", f"{kind}FPS")  # fmt: skip
-    return text_table(f"what each method reaches, and what it costs ({over})", head, rows)
+    return text_table(f"what each method reaches, and what it costs ({report.over})", head, rows)
 
 
-def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Table:
-    unit = time_unit(report)
+def _reached(scene: str, rows: Sequence[Reach], report: CostReport) -> Table:
+    unit = report.unit
     targets = list(dict.fromkeys(row.target for row in rows))
     by_key = {(row.curve, row.target): row for row in rows}
     several = len({curve.length for curve in report.curves}) > 1
@@ -287,11 +280,12 @@ def _reached(scene: str | None, rows: Sequence[Reach], report: CostReport) -> Ta
     ]
     psnr = {row.target: row.psnr for row in rows}
     head = [t if math.isnan(psnr[t]) or t == f"{psnr[t]:g} dB" else f"{t} ({psnr[t]:.2f})" for t in targets]
-    where = "mean over all scenes" if scene is None else scene
     kind = "reference " if report.reference else ""
     counted = kind + ("minutes" if unit.per_minute == 1.0 else "seconds") + " of training"
     counted += " and set-up" if report.setup else ""
-    return text_table(f"{counted} to reach a test PSNR ({where})", ("method", *head), lines)
+    return text_table(
+        f"{counted} to reach a test PSNR ({scene or 'mean over all scenes'})", ("method", *head), lines
+    )
 
 
 def _when(row: Reach, unit: TimeUnit, several: bool) -> str:
@@ -303,26 +297,28 @@ def _when(row: Reach, unit: TimeUnit, several: bool) -> str:
         return "never" if not row.reached else f"{row.reached} of {row.runs} runs"
     if math.isnan(row.minutes.mean):
         return MISSING
-    text = ("≤ " if row.bound else "") + _time(row.minutes, row, unit)
+    text = ("≤ " if row.upper_bound else "") + _time(row.minutes, row, unit)
     return f"{text} (in {row.length})" if several else text
 
 
 def _time(minutes: MeanAndDeviation, row: Point | Reach, unit: TimeUnit) -> str:
     """Return a mean with its deviation or, if it is not ranked, the range over the runs."""
-    if not row.unranked or math.isnan(minutes.mean):
+    if not row.not_ranked or math.isnan(minutes.mean):
         return number(unit.of(minutes), unit.digits)
-    return seconds_range([row.low * unit.per_minute, row.high * unit.per_minute], unit.digits)
+    return seconds_range([m * unit.per_minute for m in (row.minutes_low, row.minutes_high)], unit.digits)
 
 
-def _changed(title: str, rows: Sequence[Change], unit: TimeUnit) -> Table:
+def _changed(title: str, rows: Sequence[Change], report: CostReport) -> Table:
+    unit = report.unit
     head = ("change", "method", "trained for", "pairs", "dB gained", "95 % interval", f"extra {unit.name}",
-            "extra ms/iter", f"dB per extra {'ref ' if unit.name.startswith('ref') else ''}min")  # fmt: skip
+            "extra ms/iter", f"dB per extra {report.kind}min")  # fmt: skip
     lines = []
     for c in rows:
-        interval = MISSING if math.isnan(c.low) else f"{c.low:+.2f} to {c.high:+.2f}"
+        interval = MISSING if math.isnan(c.db_low) else f"{c.db_low:+.2f} to {c.db_high:+.2f}"
         lines.append((
             c.what, c.method, c.length, str(c.pairs), number(c.db, 2, sign=True), interval,
-            number(unit.of(c.minutes), unit.digits, sign=True), number(c.ms, 1, sign=True), per_minute(c),
+            number(unit.of(c.minutes), unit.digits, sign=True), number(c.ms_per_iteration, 1, sign=True),
+            per_minute(c),
         ))  # fmt: skip
     return text_table(title, head, lines)
 
@@ -331,11 +327,11 @@ def per_minute(change: Change) -> str:
     """Return the dB per extra minute, or why there are none."""
     if math.isnan(change.minutes.mean) or math.isnan(change.db.mean):
         return MISSING
-    if change.unranked:
+    if change.not_ranked:
         return "not ranked"
     if change.same_time:
         return "same time"
-    return f"{change.per_minute:+.2f}" if change.minutes.mean > 0.0 else "takes less"
+    return f"{change.db_per_minute:+.2f}" if change.minutes.mean > 0.0 else "takes less"
 
 
 def number(value: MeanAndDeviation, digits: int, *, sign: bool = False, spread: bool = True) -> str:

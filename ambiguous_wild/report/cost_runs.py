@@ -22,6 +22,7 @@ from ambiguous_wild.harness.store import BOOKKEEPING, ReadConfig, check_names, f
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.io.files import own_json
 from ambiguous_wild.metrics import stats
+from ambiguous_wild.report.grouping import grouped
 
 SETTINGS = ("resolution", "max_gaussians")  # settings of training that are compared like options
 NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")
@@ -71,12 +72,23 @@ class CostRun:
     reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
     unprobed: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
+    added_s: float = 0.0  # added to times that are compared: the set-up, if it was asked for
+
+    @property
+    def minutes(self) -> float:
+        """The training time that is compared."""
+        return (self.train_s + self.added_s) / 60.0
 
     @property
     def base(self) -> str:
         """The method's name without the variant of an ablation, method@group-variant."""
         host, at, part = self.method.partition("@")
         return host if at and "=" not in part else self.method
+
+    @property
+    def part(self) -> str:
+        """The variant of an ablation; empty without one."""
+        return self.method.partition("@")[2]
 
 
 @dataclass(frozen=True)
@@ -144,15 +156,13 @@ def _in_reference(run: CostRun) -> CostRun:
     if run.error:
         return run
     total = run.timing.reference_s
-    ratio = total / run.train_s if run.train_s > 0.0 else 1.0
-    early = run.kernel_reference_s / run.samples[0][1] if run.samples else ratio
+    early = late = ratio = total / run.train_s if run.train_s > 0.0 else 1.0
     walls = [at for at, _ in run.points]
+    times = np.array(walls) * ratio
     if run.samples:
+        early, late = (run.kernel_reference_s / run.samples[i][1] for i in (0, -1))
         times = in_reference_seconds(run.samples, run.kernel_reference_s, walls)
-    else:
-        times = np.array(walls) * ratio
     points = tuple((float(at), psnr) for at, (_, psnr) in zip(times, run.points))
-    late = run.kernel_reference_s / run.samples[-1][1] if run.samples else ratio
     per_second = {"ms_per_iteration": ratio, "fps": 1.0 / late if late > 0.0 else math.nan}
     numbers = {name: value * per_second.get(name, 1.0) for name, value in run.numbers.items()}
     return replace(run, train_s=total, setup_s=run.setup_s * early, points=points, numbers=numbers)
@@ -256,15 +266,12 @@ def _points(path: Path, train_s: float, psnr: float) -> tuple[tuple[tuple[float,
 
 
 def _refuse_twice(runs: Iterable[CostRun]) -> None:
-    seen: dict[tuple[Any, ...], Path] = {}
-    for run in runs:
-        key = (run.method, run.scene, run.seed, run.effects, run.options, run.length, run.rest)
-        if key in seen:
-            raise AwError(
-                f"two runs of {run.method} on {run.scene} with seed {run.seed} and the same settings: "
-                f"{seen[key]} and {run.folder}; leave one of them out"
-            )
-        seen[key] = run.folder
+    same = grouped(runs, lambda r: (r.method, r.scene, r.seed, r.effects, r.options, r.length, r.rest))
+    for run, other in (copies[:2] for copies in same.values() if len(copies) > 1):
+        raise AwError(
+            f"two runs of {run.method} on {run.scene} with seed {run.seed} and the same settings: "
+            f"{run.folder} and {other.folder}; leave one of them out"
+        )
 
 
 def _number(value: Any) -> float:

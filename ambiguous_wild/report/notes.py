@@ -16,6 +16,7 @@ from ambiguous_wild.harness.result_file import Options
 from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
+from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
 
 LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps
@@ -98,14 +99,11 @@ def _failed(runs: Runs) -> list[str]:
 
 def _absent(runs: Runs, methods: Sequence[str], scenes: Sequence[str]) -> list[str]:
     done = set(zip(runs.runs["method"], runs.runs["scene"]))
-    # methods that lack the same scenes share a line
-    lacking: dict[tuple[str, ...], list[str]] = {}
-    for method in methods:
-        if absent := tuple(scene for scene in scenes if (method, scene) not in done):
-            lacking.setdefault(absent, []).append(method)
+    lacking = grouped(methods, lambda method: tuple(s for s in scenes if (method, s) not in done))
     return [
         f"no result: {', '.join(names)} on {shortlist(absent)}; no mean over scenes"
         for absent, names in lacking.items()
+        if absent
     ]
 
 
@@ -129,12 +127,12 @@ def _fitted(runs: Runs) -> list[str]:
     ok = runs.runs[runs.runs["status"] == "ok"]
     if not len(ok) or set(ok["fit"]) == {"full"}:
         return []
-    lines = []
-    for kind, text in FITTED.items():
-        names = sorted(set(ok[ok["fit"] == kind]["method"]))
-        if names:
-            lines.append(f"test photos: {shortlist(names, limit=30)}: {text}")
-    return lines
+    by_kind = {kind: sorted(set(of["method"])) for kind, of in ok.groupby("fit")}
+    return [
+        f"test photos: {shortlist(by_kind[kind], limit=30)}: {text}"
+        for kind, text in FITTED.items()
+        if kind in by_kind
+    ]
 
 
 def _unfitted(runs: Runs) -> list[str]:
@@ -284,14 +282,11 @@ def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
     """Return a line for each reason why times are not ranked."""
     if not any(c.timed for c in columns):
         return []
-    reasons: dict[str, list[str]] = {}
-    for (method, scene), reason in untimed(frame).items():
-        reasons.setdefault(reason, []).append(f"{method} on {scene}")
     total = len(frame[frame["status"] == "ok"].groupby(["method", "scene"]))
-    lines = [
-        f"times not ranked: {'all' if len(who) == total else shortlist(who)} ({reason})"
-        for reason, who in reasons.items()
-    ]
+    lines = []
+    for reason, of in grouped(untimed(frame).items(), lambda item: item[1]).items():
+        who = shortlist(f"{method} on {scene}" for (method, scene), _ in of)
+        lines.append(f"times not ranked: {'all' if len(of) == total else who} ({reason})")
     unranked = incomparable(frame, columns)
     if unranked - {REFERENCE}:
         machines = sorted(set(frame[frame["timing"] == "alone"]["hardware"]))

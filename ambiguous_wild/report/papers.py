@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,12 +54,8 @@ def paper(
     Raises:
         AwError: unknown metric, scene, or a scene in two datasets.
     """
-    ties, parts, begin = Ties(runs), [], f"{subject}, " if subject else ""
-    for name, members in divided(runs, scenes, datasets or {}).items():
-        tables = comparison(
-            runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
-        )
-        tables = ties.marked(tables, members)
+    parts, begin = [], f"{subject}, " if subject else ""
+    for name, members, tables in _by_dataset(runs, metrics, scenes, datasets or {}):
         by_scene, mean = (tables[1:], tables[:1]) if len(members) > 1 else (tables, [])
         title = begin + (name or (f"{len(members)} scenes" if mean else tables[0].title))
         chunks = [by_scene[i : i + per_table] for i in range(0, len(by_scene), per_table)]
@@ -71,6 +67,16 @@ def paper(
     return parts
 
 
+def _by_dataset(
+    runs: Runs, metrics: Sequence[str], scenes: Sequence[str], datasets: Mapping[str, Sequence[str]]
+) -> Iterator[tuple[str, tuple[str, ...], list[Table]]]:
+    """Yield each dataset with its scenes and the tables of `comparison`, ties marked; the mean is first."""
+    ties, shown = Ties(runs), metrics or quality_columns(runs)
+    for name, members in divided(runs, scenes, datasets).items():
+        tables = comparison(runs, metrics=shown, scenes=members, drop_empty=not metrics)
+        yield name, members, ties.marked(tables, members)
+
+
 def means(
     runs: Runs,
     *,
@@ -79,20 +85,20 @@ def means(
     datasets: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Table]:
     """Return one table with the means over each dataset's scenes side by side; arguments as for `paper`."""
-    ties = Ties(runs)
     parts: list[Table] = []
     notes: dict[str, None] = {}
-    for name, members in divided(runs, scenes, datasets or {}).items():
-        tables = comparison(
-            runs, metrics=metrics or quality_columns(runs), scenes=members, drop_empty=not metrics
-        )
+    for name, members, tables in _by_dataset(runs, metrics, scenes, datasets or {}):
         heading = f"{name or ('other scenes' if parts else 'all scenes')} ({len(members)})"
-        (mean,) = ties.marked(tables[:1], members)
-        part = side_by_side("", [(heading, mean)], dataset=name)
+        part = side_by_side("", [(heading, tables[0])], dataset=name)
         parts.append(replace(part, columns=tuple(replace(column, scene="") for column in part.columns)))
         notes |= dict.fromkeys(tables[-1].notes)
-    methods = sorted({row.name for part in parts for row in part.rows})
-    rows = [Row(m, tuple(cell for part in parts for cell in _cells(part, m))) for m in methods]
+    rows = []
+    for method in sorted({row.name for part in parts for row in part.rows}):
+        cells: list[TableCell] = []
+        for part in parts:
+            absent = (TableCell(state="absent"),) * len(part.columns)
+            cells += next((row.cells for row in part.rows if row.name == method), absent)
+        rows.append(Row(method, tuple(cells)))
     columns = tuple(column for part in parts for column in part.columns)
     return [Table("means over scenes, by dataset (number of scenes)", columns, tuple(rows), tuple(notes))]
 
@@ -110,13 +116,12 @@ def side_by_side(title: str, tables: Sequence[tuple[str, Table]], *, dataset: st
         # text columns about a row are kept once, in the last table
         own = [i for i, c in enumerate(table.columns) if not c.words or number == len(tables)]
         shown.append((group, table.picked(own)))
-    tables = shown
     columns = [
         replace(c, group="" if c.words else group, dataset=dataset)
-        for group, table in tables
+        for group, table in shown
         for c in table.columns
     ]
-    for same in zip(*(table.rows for _, table in tables)):
+    for same in zip(*(table.rows for _, table in shown)):
         note = next((row.note for row in same if row.note), "")
         rows.append(Row(same[0].name, tuple(cell for row in same for cell in row.cells), note=note))
     return Table(title, tuple(columns), tuple(rows))
@@ -164,11 +169,6 @@ def quality_columns(runs: Runs) -> tuple[str, ...]:
     return ("psnr", "ssim", *([lpips] if lpips else []))
 
 
-def _cells(part: Table, method: str) -> tuple[TableCell, ...]:
-    absent = tuple(TableCell(state="absent") for _ in part.columns)
-    return next((row.cells for row in part.rows if row.name == method), absent)
-
-
 def difference_interval(
     differences: Sequence[np.ndarray],  # of each scene: [n], one method minus another on the same images
 ) -> tuple[float, float]:
@@ -183,10 +183,8 @@ def difference_interval(
     for values in differences:
         total += values[rng.integers(0, len(values), size=(RESAMPLES, len(values)))].mean(axis=1)
     means, tail = np.sort(total / len(differences)), (1.0 - LEVEL) / 2.0
-    return (
-        float(means[math.floor(tail * (RESAMPLES - 1))]),
-        float(means[math.ceil((1.0 - tail) * (RESAMPLES - 1))]),
-    )
+    low, high = math.floor(tail * (RESAMPLES - 1)), math.ceil((1.0 - tail) * (RESAMPLES - 1))
+    return float(means[low]), float(means[high])
 
 
 class Ties:
@@ -246,7 +244,7 @@ class Ties:
                 return False
             a, b = values[best].to_numpy(float), values[other].to_numpy(float)
             finite = ~(np.isinf(a) | np.isinf(b))  # means leave out infinite values, so differences do too
-            differences.append((a - b)[finite])
+            differences.append(a[finite] - b[finite])
         low, high = difference_interval(differences)
         few = sum(map(len, differences)) < LEAST and not math.isnan(low)
         return few or low <= 0.0 <= high

@@ -86,10 +86,9 @@ def _aligned(table: Table, color: bool) -> list[str]:
     for title, count in table.groups:
         room = sum(widths[at : at + count]) + 2 * (count - 1)
         name = plain(title)
-        if display_width(name) > room:  # a long name widens its first column
-            widths[at] += display_width(name) - room
-            room = display_width(name)
-        top.append(name + " " * (room - display_width(name)))
+        missing = max(display_width(name) - room, 0)
+        widths[at] += missing  # a long name widens its first column
+        top.append(name + " " * (room + missing - display_width(name)))
         at += count
     lines = ["  ".join(top).rstrip()] if any(title for title, _ in table.groups) else []
     lines += [_text_row(head, widths), "  ".join("─" * w for w in widths)]

@@ -133,12 +133,8 @@ def suite_tables(prepared: PreparedSuite, runs: Path) -> list[Table]:
 def _without_reported_mean(table: Table) -> Table:
     from ambiguous_wild.report.table_layout import BLANK
 
-    rows = [
-        row
-        if row.kind == "measured"
-        else dataclasses.replace(
-            row, cells=tuple(cell if c.scene else BLANK for c, cell in zip(table.columns, row.cells))
-        )
-        for row in table.rows
-    ]
+    rows = []
+    for row in table.rows:
+        cells = tuple(cell if c.scene else BLANK for c, cell in zip(table.columns, row.cells))
+        rows.append(row if row.kind == "measured" else dataclasses.replace(row, cells=cells))
     return dataclasses.replace(table, rows=tuple(rows))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.chosen_effects import MIXED
@@ -33,27 +34,6 @@ SPECIAL = {
     "–": "--",
     "—": "---",
 }
-STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; margin: 1.5rem auto;
-  max-width: 96rem; padding: 0 1rem; }
-h2 { font-size: 1.05rem; margin: 2rem 0 .5rem; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; border-top: 2px solid #1a1a1a; border-bottom: 2px solid #1a1a1a; }
-th, td { padding: .25rem .6rem; text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
-th { font-weight: 600; }
-thead tr:last-child th { border-bottom: 1px solid #1a1a1a; }
-th.group { text-align: center; border-bottom: 1px solid #bbb; }
-th.name { text-align: left; font-weight: normal; position: sticky; left: 0; background: #fff; }
-.first { background: #ffbfbf; font-weight: 600; }
-.second { background: #ffdeb8; }
-.third { background: #fffab8; }
-.begins { border-left: 1px solid #ddd; }
-.spread { color: #666; font-size: .85em; }
-tr.reported td, tr.reported th { color: #666; font-style: italic; }
-tr.divider th { text-align: left; color: #666; font-size: .85em; border-top: 1px solid #1a1a1a; }
-ul { padding-left: 1.1rem; color: #555; font-size: .85rem; overflow-wrap: anywhere; }
-.key span { padding: 0 .4rem; }
-"""
 RANKS = ("first", "second", "third")
 
 
@@ -96,11 +76,8 @@ def _tabular(table: Table) -> list[str]:
     before = "measured"
     for row in table.rows:
         if row.kind != before:
-            span = len(table.columns) + 1
-            lines += [
-                "\\midrule",
-                f"\\multicolumn{{{span}}}{{l}}{{\\emph{{reported, not measured here}}}} \\\\",
-            ]
+            head = f"\\multicolumn{{{len(table.columns) + 1}}}{{l}}"
+            lines += ["\\midrule", f"{head}{{\\emph{{reported, not measured here}}}} \\\\"]
             before = row.kind
         cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
         lines.append(" & ".join([latex_text(row.name), *cells]) + r" \\")
@@ -109,19 +86,15 @@ def _tabular(table: Table) -> list[str]:
     if not table.title and any(cell.tie for cell in table.cells):  # a bare tabular has no caption
         below.append(f"{TIE}: not significantly different from the best (paired bootstrap, 95 %).")
     width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
-    lines += [
-        "\\bottomrule",
-        *(f"{width}{{\\footnotesize {latex_text(note)}}} \\\\" for note in below),
-    ]
-    return [*lines, "\\end{tabular}}"]
+    printed = [f"{width}{{\\footnotesize {latex_text(note)}}} \\\\" for note in below]
+    return [*lines, "\\bottomrule", *printed, "\\end{tabular}}"]
 
 
 def _caption(table: Table) -> str:
     text = latex_text(table.title) + "."
     if any(cell.rank for cell in table.cells):
-        names = ("first", "second", "third")
-        shown = [f"\\colorbox{{{colour}}}{{{name}}}" for (colour, _), name in zip(COLORS, names)]
-        text += " " + ", ".join(shown[:2]) + " and " + shown[2] + " of each column."
+        first, second, third = (f"\\colorbox{{{c}}}{{{rank}}}" for (c, _), rank in zip(COLORS, RANKS))
+        text += f" {first}, {second} and {third} of each column."
     if any(cell.tie for cell in table.cells):
         text += " $\\approx$: not significantly different from the best (paired bootstrap, 95\\,\\%)."
     if any("\u00b1" in rest for rest in table.legend):
@@ -155,9 +128,10 @@ def _latex_cell(cell: TableCell, measure: Measure) -> str:
 def to_html(tables: Sequence[Table]) -> str:
     """Return the tables as one HTML page; names are escaped."""
     title = escape(plain(tables[0].title)) if len(tables) == 1 else "Results"
+    style = (Path(__file__).parent / "page" / "table.css").read_text(encoding="utf-8")
     head = (
         '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{STYLE}</style>"
+        f"<title>{title}</title>\n<style>\n{style}</style>"
     )
     body = "\n".join(_section(table) for table in tables)
     return f'<!doctype html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n{body}\n</body>\n</html>\n'

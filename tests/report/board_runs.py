@@ -12,7 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from click.testing import CliRunner, Result
 
+from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.harness.cell import config_identity, scene_identity
 from ambiguous_wild.harness.result_file import write_result
@@ -25,9 +27,22 @@ from tests.tiny_scene import write_tiny_scene
 METRICS = ("psnr", "ssim", "ssim_inria")
 
 
-def write_scene(root: Path) -> Path:
-    """A tiny scene whose folder's name is its own."""
-    return write_tiny_scene(root)
+def aw(*words: object) -> Result:
+    """`aw leaderboard WORDS`; an error is raised."""
+    return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False)
+
+
+def add(board: Path, *words: object, dataset: str = "Tiny set") -> Result:
+    return aw("add", *words, "--board", board, "--dataset", dataset)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def one_run(folder: Path) -> Path:
+    """A run of its own, to be spoilt, on the scene `folder`/wall."""
+    return write_run(folder / "runs", write_tiny_scene(folder / "wall"))
 
 
 def write_run(
@@ -117,3 +132,16 @@ def change_result(run: Path, change: Callable[[dict], object]) -> None:
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
+
+
+def change_image(run: Path, at: int = 0, **values: object) -> None:
+    """Replace metrics of a test image; a function gets the value that is there, None removes it."""
+
+    def change(result: dict) -> None:
+        row = result["per_image"][at]
+        for key, value in values.items():
+            row[key] = value(row[key]) if callable(value) else value
+            if value is None:
+                del row[key]
+
+    change_result(run, change)

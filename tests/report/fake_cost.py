@@ -10,8 +10,12 @@ import numpy as np
 import yaml
 
 from ambiguous_wild.harness.result_file import write_result
+from ambiguous_wild.report.cost_curves import Curve, curves_of
+from ambiguous_wild.report.cost_runs import CostRuns, read_cost_runs
 from tests.harness.fake_runs import fake_result
 
+RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]
+BUSY = {"verdict": "contended", "reason": "2 runs shared the machine", "kernel": "cpu-1"}
 ALONE: dict[str, Any] = {"verdict": "alone", "reason": "", "kernel": "cpu-1"}
 
 
@@ -61,3 +65,19 @@ def cost_run(
         writer.writerow(["wall_s", "iteration", "loss", "gaussians", "psnr_probe"])
         writer.writerows([at, 1, 0.1, 10, "" if value is None else value] for at, value in rows)
     return folder
+
+
+def rising(
+    root: Path, method: str, scene: str = "yard", seed: int = 0, *, end: float = 20.0, **more: Any
+) -> Path:
+    """A run of 40 s whose PSNR rises as `RISING`, to `end` dB."""
+    probes = [*RISING[:2], (40.0, end)]
+    return cost_run(root, method, scene, seed, psnr=(end,), train_s=40.0, probes=probes, **more)
+
+
+def read(*folders: Path) -> CostRuns:
+    return read_cost_runs(folders)
+
+
+def curves(folder: Path) -> list[Curve]:
+    return curves_of(read(folder).runs)

@@ -96,11 +96,11 @@ def test_each_distractor_is_told_by_what_tells_it(tmp_path):
                 for k, n in enumerate(TRAIN)
             }
             write_motion_points(root / FILE, pieces)
-        measured, look = ambiguity_measure.measure(scene, masks, background)
-        found = [d for m in measured for d in m.distractors]
+        measured = ambiguity_measure.measure(scene, masks, background)
+        found = [d for m in measured.photos for d in m.distractors]
         assert len(found) == len(TRAIN) and {d.colour for d in found} == {False}
         assert {d.motion for d in found} == {None if motion is None else bool(motion)}
-        told = ambiguity_summary.summarise(scene, measured, look)["told"]
+        told = ambiguity_summary.summarise(measured)["told"]
         assert told["motion"] == (None if motion is None else motion * len(TRAIN))
 
 
@@ -116,8 +116,7 @@ def report(root: Path, objects: Path | None = None) -> dict:
     scene = load_scene(root)
     masks = ambiguity_sources.find_masks(scene, None, None)
     behind = ambiguity_sources.find_background(scene, None, None, masks)
-    measured, look = ambiguity_measure.measure(scene, masks, behind, objects=objects)
-    return ambiguity_summary.summarise(scene, measured, look)
+    return ambiguity_summary.summarise(ambiguity_measure.measure(scene, masks, behind, objects=objects))
 
 
 @pytest.fixture(scope="module")

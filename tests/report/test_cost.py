@@ -7,6 +7,7 @@ import json
 import math
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,108 +15,94 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.report.cost_changes import changes
 from ambiguous_wild.report.cost_curves import (
     Curve,
     MeanAndDeviation,
     Point,
-    changes,
-    curves_of,
+    first_time,
     pareto,
     points,
     summary,
     timeline,
+    times_to_reach,
 )
 from ambiguous_wild.report.cost_plots import draw_all, spread_out
 from ambiguous_wild.report.cost_report import cost_report, to_text, write_report
-from ambiguous_wild.report.cost_runs import CostRun, CostRuns, read_cost_runs
-from ambiguous_wild.report.cost_targets import first_time, times_to_reach
+from ambiguous_wild.report.cost_runs import read_cost_runs
 from tests.harness.fake_runs import failed
-from tests.report.fake_cost import cost_run
+from tests.report.fake_cost import RISING, cost_run, curves, read, rising
 
-RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]
 HOSTILE = "=cmd|$x_1$<script>\x1b[31m"
 
 
-def read(*folders: Path) -> CostRuns:
-    return read_cost_runs(folders)
-
-
-def only(found: CostRuns) -> CostRun:
-    (run,) = found.runs
-    return run
-
-
 def test_time_to_reach_lies_between_two_probes(tmp_path: Path) -> None:
-    cost_run(tmp_path, "a", psnr=(20.0,), train_s=40.0, probes=[*RISING[:2], (25.0, None), RISING[2]])  # type: ignore[list-item]
-    run = only(read(tmp_path))
+    probes = [*RISING[:2], (25.0, None), RISING[2]]
+    cost_run(tmp_path, "a", psnr=(20.0,), train_s=40.0, probes=probes)  # type: ignore[arg-type]
+    (run,) = read(tmp_path).runs
     assert run.points == tuple(RISING)
-    assert first_time(run, 14.0) == (15.0, False)
-    assert first_time(run, 19.0) == (30.0, False)
-    assert first_time(run, 20.0) == (40.0, False)
+    for psnr, seconds in ((14.0, 15.0), (19.0, 30.0), (20.0, 40.0)):
+        assert first_time(run, psnr) == (seconds, False)
     assert first_time(run, 9.0) == (10.0, True)  # reached by the first probe: an upper bound
     assert math.isnan(first_time(run, 20.01)[0])
-
-
-def test_the_first_time_counts_where_psnr_falls_again(tmp_path: Path) -> None:
-    cost_run(tmp_path, "a", psnr=(15.0,), train_s=30.0, probes=[(10.0, 10.0), (20.0, 20.0), (30.0, 15.0)])
-    assert first_time(only(read(tmp_path)), 15.0) == (15.0, False)
+    falling = [(10.0, 10.0), (20.0, 20.0), (30.0, 15.0)]  # the first time counts
+    cost_run(tmp_path / "b", "b", psnr=(15.0,), train_s=30.0, probes=falling)
+    assert first_time(read(tmp_path / "b").runs[0], 15.0) == (15.0, False)
 
 
 def test_who_is_shown_the_truth_sets_no_target(tmp_path: Path) -> None:
-    cost_run(tmp_path, "refinesplat", psnr=(20.0,), train_s=40.0, probes=RISING)
-    cost_run(tmp_path, "3dgs+truth", psnr=(30.0,), train_s=40.0, probes=[(10.0, 29.0), (40.0, 30.0)])
-    rows = times_to_reach(curves_of(read(tmp_path).runs))
-    assert {row.psnr for row in rows} == {17.0, 19.0, 19.5}
-    alone = [run for run in read(tmp_path).runs if run.method == "3dgs+truth"]
-    assert {row.psnr for row in times_to_reach(curves_of(alone))} == {27.0, 29.0, 29.5}
+    rising(tmp_path, "refinesplat")
+    truth = cost_run(tmp_path, "3dgs+truth", psnr=(30.0,), train_s=40.0, probes=[(10.0, 29.0), (40.0, 30.0)])
+    assert {row.psnr for row in times_to_reach(curves(tmp_path))} == {17.0, 19.0, 19.5}
+    assert {row.psnr for row in times_to_reach(curves(truth))} == {27.0, 29.0, 29.5}
 
 
 def test_a_time_is_missing_where_one_run_never_gets_there(tmp_path: Path) -> None:
     for seed, end in ((0, 20.0), (1, 18.5)):
-        cost_run(tmp_path, "a", seed=seed, psnr=(end,), train_s=40.0, probes=[*RISING[:2], (40.0, end)])
-    curves = curves_of(read(tmp_path).runs)
-    (low,) = times_to_reach(curves, [14.0])
+        rising(tmp_path, "a", seed=seed, end=end)
+    low, high = times_to_reach(curves(tmp_path), [14.0, 19.0])
     assert low.minutes == MeanAndDeviation(0.25, 0.0) and (low.reached, low.runs) == (2, 2)
-    (high,) = times_to_reach(curves, [19.0])
     assert math.isnan(high.minutes.mean) and (high.reached, high.runs) == (1, 2)
-    with_setup = times_to_reach(curves, [14.0], setup=True)[0]
+    (with_setup,) = cost_report(read(tmp_path), targets=[14.0], setup=True).reach
     assert with_setup.minutes.mean == pytest.approx(20.0 / 60.0)
 
 
 def test_of_several_lengths_the_one_that_is_there_first_is_told(tmp_path: Path) -> None:
-    short, long = tmp_path / "budget-40s", tmp_path / "budget-80s"
-    cost_run(short, "a", psnr=(20.0,), train_s=40.0, budget_s=40.0, probes=RISING)
-    cost_run(
-        long, "a", psnr=(22.0,), train_s=80.0, budget_s=80.0, probes=[(10.0, 8.0), (40.0, 16.0), (80.0, 22.0)]
-    )
-    curves = curves_of(read(tmp_path).runs)
-    assert [(c.name, c.length.text) for c in curves] == [("a", "40 s"), ("a", "80 s")]
-    by_target = {r.target: r for r in times_to_reach(curves, [18.0, 21.0, 30.0])}
+    rising(tmp_path / "40s", "a", budget_s=40.0)
+    probes = [(10.0, 8.0), (40.0, 16.0), (80.0, 22.0)]
+    cost_run(tmp_path / "80s", "a", psnr=(22.0,), train_s=80.0, budget_s=80.0, probes=probes)
+    found = curves(tmp_path)
+    assert [(c.name, c.length.text) for c in found] == [("a", "40 s"), ("a", "80 s")]
+    by_target = {r.target: r for r in times_to_reach(found, [18.0, 21.0, 30.0])}
     assert by_target["18 dB"].length == "40 s" and by_target["18 dB"].minutes.mean == pytest.approx(20 / 60)
     assert by_target["21 dB"].length == "80 s"
     assert by_target["30 dB"].reached == 0
 
 
 def test_default_targets_hang_on_the_best_of_each_scene(tmp_path: Path) -> None:
-    cost_run(tmp_path, "a", "one", psnr=(20.0,), train_s=40.0, probes=RISING)
+    rising(tmp_path, "a", "one")
     cost_run(tmp_path, "a", "two", psnr=(30.0,), train_s=40.0, probes=[(20.0, 20.0), (40.0, 30.0)])
-    rows = {(r.scene, r.target): r for r in times_to_reach(curves_of(read(tmp_path).runs))}
+    rows = {(r.scene, r.target): r for r in times_to_reach(curves(tmp_path))}
     assert rows["one", "best - 1 dB"].psnr == 19.0 and rows["two", "best - 1 dB"].psnr == 29.0
-    mean = rows[None, "best - 1 dB"]
+    mean = rows["", "best - 1 dB"]
     assert mean.minutes.mean == pytest.approx((30.0 + 38.0) / 2 / 60) and math.isnan(mean.psnr)
 
 
 def test_failed_and_absent_cells_make_means_missing_and_are_named(tmp_path: Path) -> None:
-    for method in ("a", "b", "c"):
-        cost_run(tmp_path, method, "one", psnr=(20.0,), train_s=40.0, probes=RISING)
-    cost_run(tmp_path, "a", "two", psnr=(22.0,), train_s=40.0, probes=RISING)
+    for method, scene, end in (
+        ("a", "one", 20.0),
+        ("b", "one", 20.0),
+        ("c", "one", 20.0),
+        ("a", "two", 22.0),
+    ):
+        rising(tmp_path, method, scene, end=end)
     lost = {k: v for k, v in failed("b", "two").items() if k not in ("method", "scene", "seed", "options")}
     cost_run(tmp_path, "b", "two", psnr=(), **lost)
     report = cost_report(read(tmp_path), targets=[15.0])
     psnr = {p.curve: p.psnr.mean for p in report.points}
     assert psnr["a"] == 21.0 and math.isnan(psnr["b"]) and math.isnan(psnr["c"])
-    assert [p.curve for p in report.points if p.front] == ["a"]
-    minutes = {r.curve: r.minutes.mean for r in report.reach if r.scene is None}
+    assert [p.curve for p in report.points if p.pareto_front] == ["a"]
+    minutes = {r.curve: r.minutes.mean for r in report.reach if not r.scene}
     assert math.isfinite(minutes["a"]) and math.isnan(minutes["b"]) and math.isnan(minutes["c"])
     notes = "\n".join(report.notes)
     assert "failed: b on two" in notes and "no run: c" in notes and "on two" in notes
@@ -145,10 +132,12 @@ def test_an_effect_is_measured_on_pairs_that_differ_in_it_alone(tmp_path: Path) 
     assert found.keys() == {"exposure", "poses"}
     exposure, poses = found["exposure"], found["poses"]
     assert (exposure.pairs, exposure.db.mean, exposure.db.spread) == (2, 1.5, 0.0)
-    assert exposure.minutes.mean == pytest.approx(0.5) and exposure.ms.mean == pytest.approx(30.0)
-    assert exposure.per_minute == pytest.approx(3.0)
-    assert exposure.low == exposure.high == 1.5  # every picture gains the same
-    assert poses.db.mean == -0.5 and poses.per_minute == pytest.approx(-0.5)
+    assert exposure.minutes.mean == pytest.approx(0.5) and exposure.ms_per_iteration.mean == pytest.approx(
+        30.0
+    )
+    assert exposure.db_per_minute == pytest.approx(3.0)
+    assert exposure.db_low == exposure.db_high == 1.5  # every picture gains the same
+    assert poses.db.mean == -0.5 and poses.db_per_minute == pytest.approx(-0.5)
 
 
 def test_a_refresh_interval_is_turned_towards_what_costs_more(tmp_path: Path) -> None:
@@ -159,7 +148,7 @@ def test_a_refresh_interval_is_turned_towards_what_costs_more(tmp_path: Path) ->
     found = {(c.kind, c.name): c for c in changes(read(tmp_path).runs)}
     interval = found["interval", "mask.mask_every"]
     assert (interval.before, interval.after) == ("10", "1")
-    assert interval.per_minute == pytest.approx(0.5)
+    assert interval.db_per_minute == pytest.approx(0.5)
     assert found["option", "other"].pairs == 1  # mask_every 1 in both
     assert len(found) == 2  # nothing of runs that differ in two
 
@@ -167,50 +156,25 @@ def test_a_refresh_interval_is_turned_towards_what_costs_more(tmp_path: Path) ->
 def test_runs_of_an_ablation_are_pairs_of_their_method(tmp_path: Path) -> None:
     cost_run(tmp_path, "a", psnr=(20.0,), options={"merge_every": 0}, ms=1.0)
     cost_run(tmp_path, "a@density-merging", psnr=(21.0,), options={"merge_every": 1}, train_s=90.0, ms=2.0)
-    cost_run(
-        tmp_path, "a@mask=b", psnr=(25.0,), options={"merge_every": 2}, ms=3.0
-    )  # a graft is another method
+    cost_run(tmp_path, "a@mask=b", psnr=(25.0,), options={"merge_every": 2}, ms=3.0)  # is another method
     (change,) = changes(read(tmp_path).runs)
     assert change.method == "a" and change.db.mean == 1.0
 
 
 def test_under_a_budget_both_take_as_long_and_no_rate_is_given(tmp_path: Path) -> None:
-    for name, effects, psnr in (("n", (), 20.0), ("e", ("exposure",), 21.0)):
-        cost_run(
-            tmp_path / name,
-            "a",
-            psnr=(psnr,),
-            effects=effects,
-            train_s=60.01 + len(effects) * 0.02,
-            budget_s=60.0,
-        )
+    for name, effects, psnr, seconds in (("n", (), 20.0, 60.01), ("e", ("exposure",), 21.0, 60.03)):
+        cost_run(tmp_path / name, "a", psnr=(psnr,), effects=effects, train_s=seconds, budget_s=60.0)
     (change,) = changes(read(tmp_path).runs)
-    assert change.db.mean == 1.0 and change.same_time and math.isnan(change.per_minute)
+    assert change.db.mean == 1.0 and change.same_time and math.isnan(change.db_per_minute)
     assert "same time" in to_text(cost_report(read(tmp_path)))
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12))
 def test_the_front_is_what_no_other_dominates(at: list[tuple[int, int]]) -> None:
-    made = [
-        Point(
-            str(i),
-            "m",
-            "",
-            1,
-            MeanAndDeviation(float(psnr)),
-            MeanAndDeviation(float(minutes)),
-            MeanAndDeviation(),
-            {},
-        )
-        for i, (minutes, psnr) in enumerate(at)
-    ]
-    front = {
-        (p.minutes.mean, p.psnr.mean)
-        for p in pareto(
-            [*made, Point("x", "m", "", 0, MeanAndDeviation(), MeanAndDeviation(1.0), MeanAndDeviation(), {})]
-        )
-    }
+    every = [("", math.nan, 1.0), *((str(i), float(psnr), float(m)) for i, (m, psnr) in enumerate(at))]
+    made = [Point(c, "m", "", 1, MeanAndDeviation(psnr), MeanAndDeviation(m)) for c, psnr, m in every]
+    front = {(p.minutes.mean, p.psnr.mean) for p in pareto(made, [p.minutes.mean for p in made])}
     expected = {
         (m, d) for m, d in at
         if not any((m2 <= m and d2 >= d) and (m2, d2) != (m, d) for m2, d2 in at)
@@ -222,15 +186,15 @@ def test_spread_is_of_seeds_over_the_mean_over_scenes(tmp_path: Path) -> None:
     values = {("one", 0): 20.0, ("one", 1): 22.0, ("two", 0): 30.0, ("two", 1): 30.0}
     for (scene, seed), psnr in values.items():
         cost_run(tmp_path, "a", scene, seed, psnr=(psnr,))
-    (point,) = points(curves_of(read(tmp_path).runs))
+    (point,) = points(curves(tmp_path))
     assert point.psnr.mean == 25.5
     assert point.psnr.spread == pytest.approx(np.std([25.0, 26.0], ddof=1))
 
 
 def test_a_mean_timeline_exists_only_where_every_run_has_one(tmp_path: Path) -> None:
-    cost_run(tmp_path, "a", seed=0, psnr=(20.0,), train_s=40.0, probes=RISING)
+    rising(tmp_path, "a")
     cost_run(tmp_path, "a", seed=1, psnr=(24.0,), train_s=36.0, probes=[(12.0, 12.0), (36.0, 24.0)])
-    (curve,) = curves_of(read(tmp_path).runs)
+    (curve,) = curves(tmp_path)
     seconds, psnr = timeline(curve, ("yard",))
     assert (seconds[0], seconds[-1]) == (12.0, 36.0)
     assert psnr[0] == pytest.approx((11.6 + 12.0) / 2) and psnr[-1] == pytest.approx((19.6 + 24.0) / 2)
@@ -250,14 +214,8 @@ def test_labels_keep_their_order_and_distance(heights: list[float], gap: float) 
 
 def test_files_hold_what_is_printed_and_hostile_names_stay_text(tmp_path: Path) -> None:
     for length in (40.0, 80.0):
-        cost_run(
-            tmp_path / f"{length}",
-            HOSTILE,
-            psnr=(20.0,),
-            train_s=length,
-            budget_s=length,
-            probes=[(20.0, 18.0)],
-        )
+        more: dict[str, Any] = {"train_s": length, "budget_s": length, "probes": [(20.0, 18.0)]}
+        cost_run(tmp_path / f"{length}", HOSTILE, psnr=(20.0,), **more)
     out = tmp_path / "out"
     report = cost_report(read(tmp_path), targets=[19.0], made_by="aw cost runs")
     written = [p.name for p in write_report(report, out) + draw_all(report, out)]
@@ -316,7 +274,7 @@ def test_no_mean_of_a_crossing_and_of_the_end_of_a_run(
     tmp_path: Path, timeline: str | None, reason: str
 ) -> None:
     for seed in (0, 1):
-        lost = cost_run(tmp_path, "a", seed=seed, psnr=(20.0,), train_s=40.0, probes=RISING) / "timeline.csv"
+        lost = rising(tmp_path, "a", seed=seed) / "timeline.csv"
     lost.unlink() if timeline is None else lost.write_text(timeline)
     report = cost_report(read(tmp_path), targets=[14.0])
     (row,) = report.reach
@@ -326,25 +284,15 @@ def test_no_mean_of_a_crossing_and_of_the_end_of_a_run(
     assert f"{row.missing} (a on yard, seed 1)" in text and "≤" not in text
     # without the other seed the end is an honest bound
     (alone,) = cost_report(read(lost.parent), targets=[14.0]).reach
-    assert alone.bound and alone.minutes.mean == pytest.approx(40 / 60) and not alone.missing
+    assert alone.upper_bound and alone.minutes.mean == pytest.approx(40 / 60) and not alone.missing
 
 
 def test_where_scenes_are_absent_the_mean_over_all_is_a_dash(tmp_path: Path) -> None:
-    for scene in ("one", "two"):
-        cost_run(tmp_path, "a", scene, psnr=(20.0,), train_s=40.0, probes=RISING)
-    for seed, end in ((0, 20.0), (1, 18.5)):
-        cost_run(
-            tmp_path,
-            "b",
-            "one",
-            seed,
-            psnr=(end,),
-            train_s=40.0,
-            probes=[*RISING[:2], (40.0, end)],
-            options={},
-        )
+    for method, scene, seed, end in (("a", "one", 0, 20.0), ("a", "two", 0, 20.0), ("b", "one", 0, 20.0),
+                                     ("b", "one", 1, 18.5)):  # fmt: skip
+        rising(tmp_path, method, scene, seed, end=end)
     report = cost_report(read(tmp_path), targets=[15.0, 19.0])
-    rows = [r for r in report.reach if r.curve == "b" and r.scene is None]
+    rows = [r for r in report.reach if r.curve == "b" and not r.scene]
     assert [r.missing for r in rows] == ["no run on two"] * 2
     mean = to_text(report).split("(mean over all scenes)")[1].split("(one)")[0]
     (line,) = [line for line in mean.splitlines() if line.startswith("b ")]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,33 +13,18 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.report import cost_recommend as advice
-from ambiguous_wild.report.cost_curves import changes, curves_of
+from ambiguous_wild.report.cost_changes import changes
+from ambiguous_wild.report.cost_curves import answers
 from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, value_at, words_of
 from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text
-from ambiguous_wild.report.cost_runs import CostRuns, read_cost_runs
-from ambiguous_wild.report.cost_targets import answers
-from tests.report.fake_cost import cost_run
+from tests.report.fake_cost import ALONE, BUSY, RISING, cost_run, curves, read, rising
 from tests.tiny_scene import write_tiny_scene
-
-RISING = [(10.0, 10.0), (20.0, 18.0), (40.0, 20.0)]
-BUSY = {"verdict": "contended", "reason": "2 runs shared the machine", "kernel": "cpu-1"}
-
-
-def timed(samples: list[list[float]], kernel_reference_s: float = 0.25) -> dict[str, Any]:
-    record = {"verdict": "alone", "reason": "", "kernel": "cpu-1"}
-    return record | {"samples": samples, "kernel_reference_s": kernel_reference_s}
-
-
-def read(*folders: Path) -> CostRuns:
-    return read_cost_runs(folders)
 
 
 def test_times_are_those_of_the_reference_machine(tmp_path: Path) -> None:
     # twice as slow as the reference machine, then as fast
     samples = [[0.0, 0.5], [20.0, 0.5], [20.0, 0.25], [40.0, 0.25]]
-    cost_run(
-        tmp_path, "a", psnr=(20.0,), train_s=40.0, probes=RISING, timing=timed(samples), reference_s=30.0
-    )
+    rising(tmp_path, "a", timing=ALONE | {"samples": samples, "kernel_reference_s": 0.25}, reference_s=30.0)
     found = read(tmp_path)
     (run,) = found.runs
     assert found.reference and run.train_s == 30.0
@@ -51,13 +35,14 @@ def test_times_are_those_of_the_reference_machine(tmp_path: Path) -> None:
 
 
 def test_runs_without_calibration_keep_the_wall_and_are_not_ranked(tmp_path: Path) -> None:
-    cost_run(tmp_path, "a", psnr=(20.0,), train_s=40.0, probes=RISING)
+    rising(tmp_path, "a")
     cost_run(tmp_path, "b", psnr=(21.0,), train_s=50.0, probes=RISING, timing=None)
     found = read(tmp_path)
     assert not found.reference
     report = cost_report(found)
     points = {p.curve: p for p in report.points}
-    assert points["a"].front and not points["b"].front and "not calibrated" in points["b"].unranked
+    assert points["a"].pareto_front and not points["b"].pareto_front
+    assert "not calibrated" in points["b"].not_ranked
     assert any("wall seconds" in note for note in report.notes)
 
 
@@ -68,17 +53,17 @@ def test_contended_runs_are_a_range_and_never_on_the_front(tmp_path: Path) -> No
     report = cost_report(read(tmp_path))
     points = {p.curve: p for p in report.points}
     busy = points["a + exposure"]
-    assert not busy.front and points["a plain"].front
-    assert (busy.low * 60.0, busy.high * 60.0) == (129.0, 230.0)
-    assert "3 of 3 runs contended: 2 runs shared the machine" in busy.unranked
+    assert not busy.pareto_front and points["a plain"].pareto_front
+    assert (busy.minutes_low * 60.0, busy.minutes_high * 60.0) == (129.0, 230.0)
+    assert "3 of 3 runs contended: 2 runs shared the machine" in busy.not_ranked
     text = to_text(report)
     assert "2.15 to 3.83" in text and "not ranked" in text
     (change,) = report.changes
-    assert change.db.mean == 1.0 and math.isnan(change.per_minute) and change.unranked
+    assert change.db.mean == 1.0 and math.isnan(change.db_per_minute) and change.not_ranked
     data = plain_data(report)
     assert data["curves"][0]["not_ranked"] or data["curves"][1]["not_ranked"]
     reach = next(row for row in report.reach if row.curve == "a + exposure" and row.reached)
-    assert reach.unranked and reach.high * 60.0 == 230.0
+    assert reach.not_ranked and reach.minutes_high * 60.0 == 230.0
 
 
 def test_one_line_says_what_most_of_the_quality_and_the_last_db_take(tmp_path: Path) -> None:
@@ -88,8 +73,7 @@ def test_one_line_says_what_most_of_the_quality_and_the_last_db_take(tmp_path: P
         cost_run(tmp_path, "good", seed=seed, psnr=(30.0,), train_s=600.0,
                  probes=[(200.0, 26.0), (400.0, 28.0), (500.0, 29.0)])  # fmt: skip
     cost_run(tmp_path, "3dgs+truth", psnr=(40.0,), train_s=5.0, probes=[(1.0, 39.0)])
-    curves = curves_of(read(tmp_path).runs)
-    (answer,) = answers(curves)
+    (answer,) = answers(curves(tmp_path))
     assert answer.best == 30.0 and answer.best_curve == "good" and answer.ranked
     assert answer.most_curve == "fast"  # 27 dB: at its end, sooner than the other
     assert answer.most_s == pytest.approx(60.0) and answer.most_spread_s == 0.0
@@ -102,7 +86,7 @@ def test_one_line_says_what_most_of_the_quality_and_the_last_db_take(tmp_path: P
 
 def test_an_answer_says_what_was_not_measured(tmp_path: Path) -> None:
     cost_run(tmp_path, "a", psnr=(30.0,), train_s=600.0, probes=[(100.0, 29.5)], timing=BUSY)
-    (answer,) = answers(curves_of(read(tmp_path).runs))
+    (answer,) = answers(curves(tmp_path))
     assert answer.bound and "takes at most 100 s (a)" in answer.text
     assert "the last dB not measured" in answer.text and "not all of these runs were alone" in answer.text
 
@@ -117,9 +101,9 @@ def test_resolution_gaussians_and_parts_are_changes_of_their_own(tmp_path: Path)
     found = {change.kind: change for change in changes(read(tmp_path).runs)}
     assert found.keys() == {"resolution", "gaussians", "part"}
     assert (found["resolution"].before, found["resolution"].after) == ("coarse-to-fine", "full")
-    assert found["resolution"].per_minute == pytest.approx(2.0)
+    assert found["resolution"].db_per_minute == pytest.approx(2.0)
     assert (found["gaussians"].before, found["gaussians"].after) == ("5000", "20000")
-    assert found["gaussians"].per_minute == pytest.approx(2.0)
+    assert found["gaussians"].db_per_minute == pytest.approx(2.0)
     part = found["part"]
     assert (part.method, part.before, part.after) == ("c", "as it is", "parts-without")
     assert part.db.mean == -1.0 and part.minutes.mean == pytest.approx(-0.5)
@@ -193,11 +177,9 @@ def test_busy_runs_references_and_lengths_above_the_budget_do_not_count(tmp_path
 def test_psnr_between_two_lengths_lies_on_a_line_over_log_time(tmp_path: Path) -> None:
     for seconds, psnr in ((30.0, 20.0), (300.0, 24.0)):
         cost_run(tmp_path / f"{seconds:g}", "a", psnr=(psnr,), train_s=seconds, budget_s=seconds)
-    curves = curves_of(read(tmp_path).runs)
-    assert value_at(curves, "yard", 30.0 * math.sqrt(10.0)) == pytest.approx(22.0)
-    assert value_at(curves, "yard", 3000.0) == 24.0
-    assert math.isnan(value_at(curves, "yard", 10.0)) and math.isnan(value_at(curves, "absent", 100.0))
-    assert value_at(curves, "yard", 29.5) == 20.0  # a budget is met to within a step
+    values = [value_at(curves(tmp_path), "yard", at) for at in (30.0 * math.sqrt(10.0), 3000.0, 10.0, 29.5)]
+    assert values == pytest.approx([22.0, 24.0, math.nan, 20.0], nan_ok=True)  # budgets are met to a step
+    assert math.isnan(value_at(curves(tmp_path), "absent", 100.0))
 
 
 def test_parts_of_settings_and_scenes_are_found_again() -> None:

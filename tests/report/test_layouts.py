@@ -24,12 +24,7 @@ from ambiguous_wild.harness.store import Runs, read_runs
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report import papers, plain_formats
 from ambiguous_wild.report.ablation_report import ablation
-from ambiguous_wild.report.papers import (
-    datasets_of,
-    difference_interval,
-    read_reported,
-    with_reported,
-)
+from ambiguous_wild.report.papers import datasets_of, difference_interval, read_reported, with_reported
 from ambiguous_wild.report.plain_formats import divided
 from ambiguous_wild.report.table_layout import Column, Table, TableCell
 from ambiguous_wild.report.typeset import latex_text, to_html, to_latex
@@ -70,9 +65,8 @@ def test_the_papers_layout_has_scenes_side_by_side_and_the_mean_last(tmp_path: P
     assert layout.groups == [("one", 2), ("two", 2), ("Mean", 2)]  # LPIPS is empty: left out
     assert [c.measure.key for c in layout.columns[:2]] == ["psnr", "ssim"]
     assert entry(layout, "a", "one").value == 21.5 and entry(layout, "a", "one").rank == 2
-    assert entry(layout, "b", "Mean").rank == 1 and entry(layout, "b", "Mean").spread == pytest.approx(
-        math.sqrt(0.5)
-    )
+    mean = entry(layout, "b", "Mean")
+    assert mean.rank == 1 and mean.spread == pytest.approx(math.sqrt(0.5))
     assert any("lpips_alex" in note for note in layout.notes)
 
 
@@ -93,11 +87,8 @@ def test_wide_layouts_become_tables_that_fit(tmp_path: Path) -> None:
 def test_many_scenes_go_into_several_tables_with_one_mean(tmp_path: Path) -> None:
     names = [f"s{i}" for i in range(5)]
     layouts = papers.paper(runs_of(tmp_path, *results(*names)), per_table=2)
-    assert [[g for g, _ in layout.groups] for layout in layouts] == [
-        ["s0", "s1"],
-        ["s2", "s3"],
-        ["s4", "Mean"],
-    ]
+    shown = [[g for g, _ in layout.groups] for layout in layouts]
+    assert shown == [["s0", "s1"], ["s2", "s3"], ["s4", "Mean"]]
     assert "(2 of 3)" in layouts[1].title
 
 
@@ -177,10 +168,8 @@ def test_reported_numbers_stand_beside_and_change_nothing(tmp_path: Path) -> Non
     for text in (to_latex([layout]), to_html([layout]), plain_formats.to_markdown([layout])):
         assert "reported" in text and "99.00" not in text
     (memory,) = papers.paper(runs, metrics=["model_mb"], datasets=datasets)
-    assert (
-        entry(with_reported(memory, numbers), "Famous", "yard_one", "model_mb", "reported").printed
-        == "110.50"
-    )
+    shown = entry(with_reported(memory, numbers), "Famous", "yard_one", "model_mb", "reported")
+    assert shown.printed == "110.50"
     (elsewhere,) = papers.paper(runs, scenes=["two"])
     assert with_reported(elsewhere, numbers).rows == elsewhere.rows
 
@@ -285,10 +274,8 @@ def test_any_name_is_ascii_or_latin_for_latex(name: str) -> None:
 
 
 def test_every_column_is_under_its_heading_in_text(tmp_path: Path) -> None:
-    text = plain_formats.to_text(
-        papers.paper(runs_of(tmp_path, *results("a scene with a very long name", "two")))
-    )
-    lines = text.splitlines()
+    runs = runs_of(tmp_path, *results("a scene with a very long name", "two"))
+    lines = plain_formats.to_text(papers.paper(runs)).splitlines()
     top, head = lines[1], lines[2]
     assert top.index("two") <= head.index("PSNR", top.index("two")) < top.index("Mean")
     assert len({len(line) for line in lines[3:6]}) == 1
@@ -298,18 +285,9 @@ def test_what_does_not_differ_from_the_best_is_marked_in_every_format(tmp_path: 
     close, far = (20.0, 22.0, 24.0, 21.0), (10.0, 12.0, 14.0, 11.0)
     near = tuple(p + d for p, d in zip(close, (0.3, -0.25, 0.2, -0.2)))
     runs = save(tmp_path, *(fake_result(m, psnr=p) for m, p in zip("abc", (close, near, far))))
-    for style, mark in {
-        "text": "≈",
-        "markdown": "≈",
-        "html": "≈",
-        "latex": r"\approx",
-        "csv": ",yes,",
-    }.items():
+    marks = {"text": "≈", "markdown": "≈", "html": "≈", "csv": ",yes,", "latex": r"\approx"}
+    for style, mark in marks.items():
         done = CliRunner().invoke(table_command, [str(runs), "--format", style])
         assert done.exit_code == 0 and done.stdout.count(mark) >= (1 if style == "csv" else 2), style
-    shown = [line for line in done_latex(runs) if not line.startswith("%")]
+    shown = [line for line in done.stdout.splitlines() if not line.startswith("%")]  # of LaTeX
     assert any(r"$\approx$: not significantly different" in line for line in shown)
-
-
-def done_latex(runs: Path) -> list[str]:
-    return CliRunner().invoke(table_command, [str(runs), "--format", "latex"]).stdout.splitlines()

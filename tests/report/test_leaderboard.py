@@ -9,38 +9,18 @@ from pathlib import Path
 
 import pytest
 import yaml
-from click.testing import CliRunner, Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import config_identity
 from ambiguous_wild.io.images import read_png_rgb, write_png
-from ambiguous_wild.report.board import (
-    board_csv,
-    guard,
-    read_board,
-    read_csv,
-    unguard,
-    unique_slug,
-)
+from ambiguous_wild.report.board import board_csv, guard, read_board, read_csv, unguard, unique_slug
 from ambiguous_wild.report.board_edit import check
-from tests.report.board_runs import change_result, write_run, write_scene
+from tests.report.board_runs import add, aw, change_image, change_result, content, one_run, write_run
+from tests.tiny_scene import write_tiny_scene as write_scene
 
 HOSTILE = '=HYPERLINK("x")</script><img src=x onerror=alert(1)>/../../etc'
-
-
-def aw(*words: object) -> Result:
-    return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False)
-
-
-def add(board: Path, *words: object) -> Result:
-    return aw("add", *words, "--board", board, "--dataset", "Tiny set")
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +34,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def one(tmp_path: Path) -> Path:
-    """A run of its own, to be spoilt."""
-    return write_run(tmp_path / "runs", write_scene(tmp_path / "wall"))
+    return one_run(tmp_path)
 
 
 def test_the_same_runs_in_any_order_give_the_same_bytes(runs: Path, tmp_path: Path) -> None:
@@ -106,28 +85,8 @@ def change_config(run: Path, change: Callable[[dict], None], *, hashed: bool) ->
     path.write_text(yaml.safe_dump(data))
 
 
-def better(result: dict) -> None:
-    result["per_image"][1]["psnr"] += 0.01
-
-
-def better_ssim(result: dict) -> None:
-    result["per_image"][0]["ssim"] += 0.001
-
-
-def easy_images(result: dict) -> None:
-    del result["per_image"][1]
-
-
-def value_gone(result: dict) -> None:
-    del result["per_image"][1]["psnr"]
-
-
-def fewer_iterations(config: dict) -> None:
-    config["train"]["iterations"] = 9
-
-
-def outside(result: dict) -> None:
-    result["per_image"][0]["name"] = "../../../../etc/passwd"
+def change_train(run: Path, *, hashed: bool, **values: int) -> None:
+    change_config(run, lambda config: config["train"].update(values), hashed=hashed)
 
 
 def repaint(run: Path) -> None:
@@ -138,7 +97,7 @@ def repaint(run: Path) -> None:
 
 
 def drop_image(run: Path) -> None:
-    change_result(run, easy_images)
+    change_result(run, lambda r: r["per_image"].pop())
     (run / "renders" / "test" / "test_1.png").unlink()
 
 
@@ -147,33 +106,30 @@ def retouch_photo(run: Path) -> None:
     shutil.copyfile(run / "renders" / "test" / "test_0.png", scene / "images" / "test_0.png")
 
 
-def fail(run: Path) -> None:
-    change_result(run, lambda r: r.update(status="failed", error="loss is not finite"))
-
-
 def anonymous(run: Path) -> None:
     change_config(run, lambda c: c.update(method="mine"), hashed=True)
     change_result(run, lambda r: r.update(method="mine"))
 
 
+FAILED = {"status": "failed", "error": "loss is not finite"}
 SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
-    "number": (lambda r: change_result(r, better), "was changed: psnr of test_1.png"),
-    "ssim": (lambda r: change_result(r, better_ssim), "was changed: ssim of test_0.png"),
-    "value gone": (lambda r: change_result(r, value_gone), "no psnr of test_1.png"),
+    "number": (lambda r: change_image(r, 1, psnr=lambda v: v + 0.01), "was changed: psnr of test_1.png"),
+    "ssim": (lambda r: change_image(r, ssim=lambda v: v + 0.001), "was changed: ssim of test_0.png"),
+    "value gone": (lambda r: change_image(r, 1, psnr=None), "no psnr of test_1.png"),
     "render": (repaint, "was changed: psnr of test_0.png"),
     "render gone": (lambda r: (r / "renders/test/test_0.png").unlink(), "is partial, it lacks renders"),
-    "image unlisted": (lambda r: change_result(r, easy_images), "is partial: test_1.png was rendered"),
+    "image unlisted": (lambda r: change_result(r, lambda d: d["per_image"].pop()), "test_1.png was rendered"),
     "image dropped": (drop_image, "is partial: 1 images were measured"),
     "render damaged": (lambda r: (r / "renders/test/test_0.png").write_bytes(b"x"), "test_0.png"),
     "model": (lambda r: (r / "point_cloud.ply").write_bytes(b"p"), "the size of point_cloud.ply differs"),
     "no environment": (lambda r: (r / "env.json").unlink(), "it lacks env.json"),
-    "config": (lambda r: change_config(r, fewer_iterations, hashed=False), "hashes to"),
-    "seed": (lambda r: change_config(r, lambda c: c["train"].update(seed=4), hashed=True), "seed is '4'"),
+    "config": (lambda r: change_train(r, hashed=False, iterations=9), "hashes to"),
+    "seed": (lambda r: change_train(r, hashed=True, seed=4), "seed is '4'"),
     "no config": (lambda r: (r / "config.yaml").unlink(), "config.yaml is absent"),
     "code": (anonymous, "has no hash of it"),
     "photo": (retouch_photo, "name the right one with --scene"),
-    "path": (lambda r: change_result(r, outside), "outside of its folder"),
-    "failed": (fail, "a failed run has no numbers"),
+    "path": (lambda r: change_image(r, name="../../../../etc/passwd"), "outside of its folder"),
+    "failed": (lambda r: change_result(r, lambda d: d.update(FAILED)), "a failed run has no numbers"),
     "unfinished": (lambda r: (r / "metrics.json").unlink(), "has no metrics.json"),
     "not JSON": (lambda r: (r / "metrics.json").write_text("{"), "is damaged"),
 }  # fmt: skip

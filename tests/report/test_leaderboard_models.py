@@ -9,18 +9,14 @@ from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
-from click.testing import CliRunner, Result
 
-from ambiguous_wild.cli.leaderboard import command
+from ambiguous_wild.core import AwError
 from tests.chromium import Browser, needs_chromium
+from tests.report.board_runs import add, aw
 from tests.tiny_scene import write_tiny_scene
 from tests.viewing.wall_runs import write_shown_run
 
 HOSTILE = "</script><img src=x onerror=alert(1)>/.."
-
-
-def aw(*words: object) -> Result:
-    return CliRunner().invoke(command, [str(w) for w in words])
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +27,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for seed in (1, 2):
             write_shown_run(root / "runs", scene, "3dgs", seed, noise=20.0, count=300)
         write_shown_run(root / "runs", scene, HOSTILE, noise=5.0, count=300)
-    done = aw("add", root / "runs", "--board", root / "board", "--dataset", "Tiny")
+    done = add(root / "board", root / "runs", dataset="Tiny")
     assert done.exit_code == 0, done.output
     return root
 
@@ -65,8 +61,9 @@ def test_entries_without_a_model_are_named(root: Path, tmp_path: Path) -> None:
     done = aw("publish", "--board", root / "board", "-o", tmp_path / "site", "--models", tmp_path / "some")
     assert done.exit_code == 0 and "no model of 3dgs" in done.output and "on yard" in done.output
     assert [p.name for p in (tmp_path / "site" / "models").iterdir()] == ["tiny-porch.html"]
-    done = aw("publish", "--board", root / "board", "-o", tmp_path / "other", "--models", tmp_path / "none")
-    assert done.exit_code != 0 and not (tmp_path / "other").exists()
+    with pytest.raises(AwError):
+        aw("publish", "--board", root / "board", "-o", tmp_path / "other", "--models", tmp_path / "none")
+    assert not (tmp_path / "other").exists()
 
 
 @needs_chromium

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
 
-from ambiguous_wild.cli.leaderboard import command
+from ambiguous_wild.core import AwError
 from ambiguous_wild.report import board_publish as publishing
 from ambiguous_wild.report.board import read_board
 from ambiguous_wild.report.board_publish import Reported, facts
 from tests.chromium import Browser, needs_chromium
 from tests.report.board_page import choose, column, heads, names, ranks, said, tick, type_in
-from tests.report.board_runs import write_run, write_scene
+from tests.report.board_runs import aw, content, write_run
+from tests.tiny_scene import write_tiny_scene as write_scene
 
 HOSTILE = '=1+1</script><img src=x onerror="alert(1)">/../../etc'
 REPORTED = (
@@ -27,10 +27,6 @@ REPORTED = (
     "tab:one,3DGS,,Tiny,porch,psnr,unknown,11.10,,11.10\n"
     "tab:one,3DGS,,Elsewhere,hall,psnr,unknown,12.00,,12.00\n"
 )
-
-
-def aw(*words: object) -> Result:
-    return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False)
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +51,6 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tables = '{"tab:one": {"paper": "p", "caption": "Main"}}'
     (root / "board" / "reported" / "sources.json").write_text(f'{{"papers": {papers}, "tables": {tables}}}')
     return root / "board"
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_the_same_board_gives_the_same_bytes_and_copies_of_its_csvs(board: Path, tmp_path: Path) -> None:
@@ -100,7 +92,7 @@ def test_an_interrupted_publish_leaves_the_old_page(
 
 def test_what_is_not_a_page_of_ours_is_not_replaced(board: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(publishing.AwError, match=r"thesis\.txt.*choose another -o"):
+    with pytest.raises(AwError, match=r"thesis\.txt.*choose another -o"):
         publishing.publish(board, tmp_path)
     assert content(tmp_path) == {"thesis.txt": b"mine"}
 
@@ -108,21 +100,21 @@ def test_what_is_not_a_page_of_ours_is_not_replaced(board: Path, tmp_path: Path)
 def test_files_that_no_publish_wrote_are_not_removed(board: Path, tmp_path: Path) -> None:
     publishing.publish(board, tmp_path / "site")
     (tmp_path / "site/data/mine.csv").write_text("mine")
-    with pytest.raises(publishing.AwError, match=r"also holds data/mine\.csv"):
+    with pytest.raises(AwError, match=r"also holds data/mine\.csv"):
         publishing.publish(board, tmp_path / "site")
     (tmp_path / "site/data/mine.csv").unlink()
     (tmp_path / "link").symlink_to(tmp_path / "site")
     publishing.publish(board, tmp_path / "link", title="by a link")
     assert (tmp_path / "link").is_symlink() and b"by a link" in content(tmp_path / "site")["index.html"]
     (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
-    with pytest.raises(publishing.AwError, match="link to nowhere"):
+    with pytest.raises(AwError, match="link to nowhere"):
         publishing.publish(board, tmp_path / "nowhere")
 
 
 def test_a_changed_picture_is_not_published(board: Path, tmp_path: Path) -> None:
     shutil.copytree(board, tmp_path / "board")
     next((tmp_path / "board").rglob("*.jpg")).write_bytes(b"x")
-    with pytest.raises(publishing.AwError, match="missing or changed"):
+    with pytest.raises(AwError, match="missing or changed"):
         publishing.publish(tmp_path / "board", tmp_path / "site")
     assert not (tmp_path / "site").exists()
 

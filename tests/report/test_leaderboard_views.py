@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from ambiguous_wild.cli.leaderboard import command
+from ambiguous_wild.core import AwError
 from ambiguous_wild.report.board_edit import check, remove
-from ambiguous_wild.report.board_publish import publish
+from ambiguous_wild.report.board_publish import publish, read_sources
 from tests.chromium import Browser, needs_chromium
 from tests.report.board_page import choose, column, heads, names, said, type_in
-from tests.report.board_runs import write_run
+from tests.report.board_runs import add, write_run
 from tests.tiny_scene import write_tiny_scene
 
 GOOD = {"iou": 0.8, "precision": 0.9, "recall": 0.85, "images": 6}
@@ -41,8 +41,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for seed in (0, 1):
             write_run(root / "runs", scene, "3dgs", seed, noise=20.0 if name == "yard" else 9.0)
             write_run(root / "runs", scene, "refinesplat", seed, noise=5.0, masks=masks)
-    words = ["add", root / "runs", "--board", root / "board", "--dataset", "Tiny", "--images", 2]
-    done = CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False)
+    done = add(root / "board", root / "runs", "--images", 2, dataset="Tiny")
     assert done.exit_code == 0, done.output
     (root / "board" / "reported").mkdir()
     (root / "board" / "reported" / "paper.csv").write_text(REPORTED)
@@ -85,8 +84,6 @@ def test_an_index_of_before_masks_is_still_read(board: Path, tmp_path: Path) -> 
 
 
 def test_removing_a_method_removes_its_masks(board: Path, tmp_path: Path) -> None:
-    import shutil
-
     shutil.copytree(board, tmp_path / "board")
     remove(tmp_path / "board", method="refinesplat")
     assert not list((tmp_path / "board").rglob("*.png")) and check(tmp_path / "board").problems == ()
@@ -248,9 +245,6 @@ def downloads(page: Browser, files: Path) -> None:
 
 
 def test_sources_that_are_no_such_file_are_refused(board: Path, tmp_path: Path) -> None:
-    from ambiguous_wild.core import AwError
-    from ambiguous_wild.report.board_publish import read_sources
-
     path = tmp_path / "sources.json"
     assert read_sources(path) == {}
     path.write_text(json.dumps({"papers": {}, "tables": {"t": {"paper": "gone"}}}))

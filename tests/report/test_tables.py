@@ -15,17 +15,10 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES, measure
 from ambiguous_wild.harness.store import read_runs
-from ambiguous_wild.report import papers
+from ambiguous_wild.report import papers, plain_formats
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.report.papers import cost_at_the_end
-from ambiguous_wild.report.plain_formats import (
-    display_width,
-    fitted,
-    to_long_csv,
-    to_markdown,
-    to_text,
-    to_wide_csv,
-)
+from ambiguous_wild.report.plain_formats import fitted, to_long_csv, to_markdown, to_text, to_wide_csv
 from ambiguous_wild.report.table_layout import Table, TableCell
 from ambiguous_wild.report.typeset import to_html as html_of
 from ambiguous_wild.report.typeset import to_latex as latex_of
@@ -95,15 +88,13 @@ def test_first_second_third_follow_the_direction_of_merit(key: str, order: str, 
     psnr = {"a": 20.0, "b": 21.0, "c": 22.0, "d": 19.0}
     results = []
     for i, (method, value) in enumerate(psnr.items()):
-        timing = {"verdict": "alone", "reason": "", "kernel": "cpu-1"}
-        cost = {
+        results.append(fake_result(method, psnr=(value,)))
+        results[-1]["cost"] |= {
             "train_s": 10.0 + i,
             "iterations": 100 + i,
             "fps": 5.0 + i,
             "reference_s": 1.0,
-            "timing": timing,
         }
-        results.append(fake_result(method, psnr=(value,), cost=cost))
     table = table_of(tmp_path, *results, metrics=[key])
     ranks = {m: cell(table, m, key).rank for m in psnr}
     assert ranks == {m: (order.index(m) + 1 if m in order[:3] else None) for m in psnr}
@@ -191,26 +182,19 @@ def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_pat
 
 
 def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:
-    table = table_of(
-        tmp_path,
-        fake_result("a", psnr=(20.001,)),
-        fake_result("b", psnr=(20.002,)),
-        fake_result("c", psnr=(19.0,)),
-        metrics=["psnr", "gaussians"],
-    )
+    runs = [fake_result(m, psnr=(p,)) for m, p in (("a", 20.001), ("b", 20.002), ("c", 19.0))]
+    table = table_of(tmp_path, *runs, metrics=["psnr", "gaussians"])
     assert [cell(table, m, "psnr").rank for m in "abc"] == [1, 1, 3]
     # All alike: there is no first.
     assert [cell(table, m, "gaussians").rank for m in "abc"] == [None] * 3
 
 
 def test_an_infinite_psnr_enters_no_mean_and_no_rank(tmp_path: Path) -> None:
-    table = table_of(
-        tmp_path,
-        fake_result("a", "one", psnr=(math.inf, 20.0)),
-        fake_result("b", "one", psnr=(30.0, 20.0)),
-        fake_result("a", "two", psnr=(20.0,)),
-        fake_result("b", "two", psnr=(20.0,)),
-    )
+    first = (("a", (math.inf, 20.0)), ("b", (30.0, 20.0)))
+    runs = [fake_result(m, "one", psnr=p) for m, p in first] + [
+        fake_result(m, "two", psnr=(20.0,)) for m in "ab"
+    ]
+    table = table_of(tmp_path, *runs)
     assert cell(table, "a", "psnr").value == 20.0 and cell(table, "a", "psnr").rank == 2
     assert cell(table, "b", "psnr").value == 22.5 and cell(table, "b", "psnr").rank == 1
     assert "psnr of a on one: mean of 1 of 2 values; the others are not finite" in to_text(table)
@@ -219,13 +203,8 @@ def test_an_infinite_psnr_enters_no_mean_and_no_rank(tmp_path: Path) -> None:
 
 
 def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None:
-    table = table_of(
-        tmp_path,
-        fake_result("a", "one"),
-        fake_result("a", "two"),
-        fake_result("b", "one", psnr=(40.0,)),
-        fake_result("c", "one"),
-    )
+    runs = [fake_result(m, s) for m, s in (("a", "one"), ("a", "two"), ("c", "one"))]
+    table = table_of(tmp_path, *runs, fake_result("b", "one", psnr=(40.0,)))
     assert cell(table, "b", "psnr").state == "missing"
     assert cell(table, "a", "psnr").rank is None  # alone: nothing to be first of
     assert cell(table, "b", "psnr", 2).state == "absent"
@@ -234,14 +213,8 @@ def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None
 
 
 def test_a_failed_seed_fails_its_cell(tmp_path: Path) -> None:
-    table = table_of(
-        tmp_path,
-        fake_result("a", "one", 0, (50.0,)),
-        failed("a", "one", 1),
-        fake_result("a", "two"),
-        fake_result("b", "one"),
-        fake_result("b", "two"),
-    )
+    runs = [fake_result(m, s) for m, s in (("a", "two"), ("b", "one"), ("b", "two"))]
+    table = table_of(tmp_path, fake_result("a", "one", 0, (50.0,)), failed("a", "one", 1), *runs)
     assert cell(table, "a", "psnr").state == "failed" and cell(table, "a", "psnr", 1).state == "failed"
     assert cell(table, "a", "psnr", 2).state == "ok"
     assert cell(table, "b", "psnr", 1).rank is None
@@ -258,11 +231,9 @@ def test_where_every_run_failed_the_table_says_so(tmp_path: Path) -> None:
 
 def test_a_method_with_an_unfinished_seed_shows_its_mean_but_no_rank(tmp_path: Path) -> None:
     start(tmp_path, "a", "one", 1)
+    methods = {"a": 50.0, "b": 20.0, "c": 10.0}
     table = table_of(
-        tmp_path,
-        *(fake_result("a", s, psnr=(50.0,)) for s in ("one", "two")),
-        *(fake_result("b", s, psnr=(20.0,)) for s in ("one", "two")),
-        *(fake_result("c", s, psnr=(10.0,)) for s in ("one", "two")),
+        tmp_path, *(fake_result(m, s, psnr=(p,)) for m, p in methods.items() for s in ("one", "two"))
     )
     assert cell(table, "a", "psnr", 1).value == 50.0
     ranks = [[cell(table, m, "psnr", block).rank for m in "abc"] for block in range(3)]
@@ -295,15 +266,13 @@ def test_a_column_that_was_asked_for_stays_though_it_is_empty(tmp_path: Path) ->
 def test_scenes_where_a_measure_is_undefined_are_left_out_of_its_mean(tmp_path: Path) -> None:
     masked = {"iou": 0.8, "precision": 0.9, "recall": 0.85, "images": 2}
     nothing = {"iou": 0.0, "precision": 0.0, "recall": None, "images": 2}  # a pixel masked, no distractor
-    table = table_of(
-        tmp_path,
-        fake_result("a", "one", masks=masked),
-        fake_result("a", "clean", masks=nothing),
-        fake_result("b", "one", masks={**masked, "iou": 0.6}),
-        fake_result("b", "clean", masks=nothing),
-        fake_result("c", "one"),
-        fake_result("c", "clean"),
-    )
+    scores = {"a": (masked, nothing), "b": ({**masked, "iou": 0.6}, nothing), "c": (None, None)}
+    runs = [
+        fake_result(m, scene, masks=of)
+        for m, both in scores.items()
+        for scene, of in zip(("one", "clean"), both)
+    ]
+    table = table_of(tmp_path, *runs)
     assert cell(table, "a", "mask_iou").value == 0.8 and cell(table, "b", "mask_iou").value == 0.6
     assert cell(table, "c", "mask_iou").state == "missing"  # it has no masks at all
     assert table[1].title == "clean"
@@ -329,7 +298,7 @@ def test_text_fits_the_width_and_names_what_it_leaves_out(width: int, tmp_path: 
     shown = fitted(table, width)
     lines = to_text(shown).splitlines()
     aligned = [line for line in lines if line.startswith(("a ", "longer", "method", "─"))]
-    assert len(aligned) == 4 and max(map(display_width, aligned)) <= width
+    assert len(aligned) == 4 and max(map(plain_formats.display_width, aligned)) <= width
     left = keys(shown)
     assert left[0] == "psnr" and "lpips_alex" in left and len(left) < len(table[0].columns)
     (note,) = [n for n in shown[-1].notes if n.startswith("not shown")]

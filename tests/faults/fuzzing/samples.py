@@ -230,10 +230,11 @@ def boards() -> list[bytes]:
 
 @functools.cache
 def board_images() -> list[bytes]:
-    place = board_pictures._PictureSubject("tiny", "a, b", "1.png", "=m", "2000 iterations")
+    pictures = board_pictures.BoardPictures(workshop() / "board")
+    subject = board_pictures.PictureSubject("tiny", "a, b", "1.png", "=m", "2000 iterations")
+    pictures.write(subject, encoded(".png", picture()), 0, 20.5)
+    board_pictures.write_index(workshop() / "board", pictures.rows.values())
     kept = board_pictures.folder_of(workshop() / "board")
-    board_pictures._write(workshop() / "board", place, encoded(".png", picture()), "0", 20.5, index := {})
-    board_pictures._write_index(workshop() / "board", index.values())
     return [(kept / board_pictures.INDEX).read_bytes()]
 
 

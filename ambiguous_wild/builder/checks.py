@@ -16,11 +16,10 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.capture_map import CaptureMap, joins, map_of_photos
+from ambiguous_wild.builder.capture_map import CaptureMap, component_gaps, map_of_photos
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.fixed_to_camera import words_of
-from ambiguous_wild.builder.growth import GrowthForecast, predict_growth
-from ambiguous_wild.builder.overlap_graph import Link
+from ambiguous_wild.builder.overlap_graph import GrowthForecast, Link, predict_growth
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
     compare_photos,
@@ -67,7 +66,7 @@ def run_checks(
     thumbnails: np.ndarray,  # [N, 1024], see `screen.thumbnail`
     compared: PhotoComparison,
     growth: GrowthForecast,
-    gaps: Sequence[tuple[int, int]],  # of `joins`
+    gaps: Sequence[tuple[int, int]],  # of `component_gaps`
 ) -> list[CaptureCheck]:
     """Run all checks, in the order of the table."""
     return [
@@ -224,22 +223,22 @@ def overlap(
     facts: Sequence[CheckedPhoto],
     compared: PhotoComparison,
     growth: GrowthForecast,
-    gaps: Sequence[tuple[int, int]],  # of `joins`
+    gaps: Sequence[tuple[int, int]],  # of `component_gaps`
 ) -> CaptureCheck:
     """Predict how many photos will be placed, and name those that share too little with the others."""
     names, count = [f["source"] for f in facts], len(facts)
-    if not growth.parts:
+    if not growth.components:
         finding = "no three photos share enough features: none will be placed"
         advice = "take more photos, each sharing two thirds of the picture with the next"
         return CaptureCheck("overlap", "warning", "pixels", finding, advice, tuple(names))
-    main = growth.parts[0]
+    main = growth.components[0]
     if len(main) == count:
-        median = float(np.median(compared.partners))
+        median = float(np.median(compared.covisible))
         finding = f"each overlaps with {median:.0f} others (median); all {count} photos will be placed"
         return CaptureCheck("overlap", "ok", "pixels", finding)
     finding = f"about {len(main)} of {count} photos will be placed"
-    if len(growth.parts) > 1:
-        finding += f"; parts: {', '.join(str(len(part)) for part in growth.parts)}"
+    if len(growth.components) > 1:
+        finding += f"; parts: {', '.join(str(len(component)) for component in growth.components)}"
     if growth.others:
         finding += "; the others share too few features with two photos at once: "
         finding += shortlist([names[k] for k in growth.others], 3)
@@ -345,7 +344,7 @@ def check_capture(
     features = [found for _, found in read.more]
     compared = compare_photos(features, bar, jobs)
     growth = predict_growth(len(facts), compared.matches)
-    gaps = joins(growth, compared.links)
+    gaps = component_gaps(growth, compared.links)
     checks = run_checks(facts, read.thumbnails, compared, growth, gaps)
     if read.skipped:
         checks.insert(0, _files_check(read.skipped, len(capture.sources)))

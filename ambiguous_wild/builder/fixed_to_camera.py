@@ -20,7 +20,7 @@ import numpy as np
 from ambiguous_wild.builder.records import FixedMask
 
 if TYPE_CHECKING:
-    from ambiguous_wild.builder.motions import Pair
+    from ambiguous_wild.builder.relative_poses import Pair
 
 FIXED = "fixed.json"  # file of the stage `matches`: a list of `FixedMask`
 CELLS = 64  # cells along the longer side

@@ -45,7 +45,7 @@ WEAK_COLOUR, STAR_COLOUR, LINK_COLOUR = (200, 20, 110), CATEGORIES[4], (120, 130
 COLOURS: dict[Kind, tuple[int, int, int]] = {
     "train": CATEGORIES[0],
     "test": CATEGORIES[1],
-    "part": CATEGORIES[2],
+    "component": CATEGORIES[2],
     "left out": NEUTRAL,
 }
 
@@ -347,8 +347,8 @@ def _legend(drawn: CaptureMap) -> Iterator[tuple[str, str]]:
         yield "test", "test photo"
     if any(photo.heading for photo in drawn.photos):
         yield "wedge", "viewing direction"
-    if "part" in kinds:
-        yield "part", "another part"
+    if "component" in kinds:
+        yield "component", "another part"
     if any(photo.provisional for photo in drawn.photos):
         yield "provisional", "placed with little evidence"
     if any(photo.kind == "left out" and not photo.unsure for photo in drawn.photos):

@@ -53,8 +53,8 @@ class PhotoFeatures:
 class PhotoComparison:
     """Result of the comparison, over all pairs."""
 
-    offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
-    partners: np.ndarray  # [N] int, number of photos that overlap with it
+    offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a covisible one
+    covisible: np.ndarray  # [N] int, photos that overlap with it
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
     fixed: list[FixedArea]  # fixed to the camera; its features are not compared
     matches: Matches
@@ -168,19 +168,21 @@ def compare_photos(
 
 def confirmed(matches: Matches) -> Matches:
     """Leave out pairs with fewer than `MIN_INLIERS` matches of which no third photo confirms `CONFIRMED`."""
-    partner: dict[int, dict[int, dict[int, int]]] = {}  # photo -> other photo -> feature -> its feature
+    matched_features: dict[
+        int, dict[int, dict[int, int]]
+    ] = {}  # photo -> other photo -> feature -> its feature
     for (a, b), (one, two) in matches.items():
-        partner.setdefault(a, {})[b] = dict(zip(one.tolist(), two.tolist()))
-        partner.setdefault(b, {})[a] = dict(zip(two.tolist(), one.tolist()))
+        matched_features.setdefault(a, {})[b] = dict(zip(one.tolist(), two.tolist()))
+        matched_features.setdefault(b, {})[a] = dict(zip(two.tolist(), one.tolist()))
 
     def confirms(third: int, a: int, b: int) -> bool:
-        first, second = partner[a][third], partner[b][third]
-        both = ((first.get(f), second.get(g)) for f, g in partner[a][b].items())
+        first, second = matched_features[a][third], matched_features[b][third]
+        both = ((first.get(f), second.get(g)) for f, g in matched_features[a][b].items())
         return sum(f is not None and f == g for f, g in both) >= CONFIRMED
 
     sure: Matches = {}
     for (a, b), ends in matches.items():
-        third = partner[a].keys() & partner[b].keys()
+        third = matched_features[a].keys() & matched_features[b].keys()
         if len(ends[0]) >= MIN_INLIERS or any(confirms(c, a, b) for c in third):
             sure[a, b] = ends
     return sure

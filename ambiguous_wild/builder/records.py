@@ -109,9 +109,9 @@ class MatchResult(TypedDict):
 
     matcher: str  # "exhaustive", "sequential" or "retrieval"
     pairs: int  # pairs tried
-    verified: int  # pairs with a motion that other pairs confirm
+    verified: int  # pairs with a relative pose that other pairs confirm
     planar: int  # verified pairs whose matches lie on one plane
-    connected: int  # photos that verified pairs connect, so that no more can be placed
+    connected: int  # photos that verified pairs connect, so that no more can be registered
     fixed: list[FixedMask]  # fixed to the camera; none of its features is matched
 
 
@@ -136,23 +136,25 @@ class MappingResult(TypedDict):
     """Result of the stage `mapping`."""
 
     model: ModelSummary | None
-    left_out: dict[str, str]  # work name of a photo that is not placed -> reason
-    partners: dict[str, int]  # work name -> photos that agree with its place
-    provisional: list[str]  # work names of photos placed with little evidence
+    left_out: dict[str, str]  # work name of a photo that is not registered -> reason
+    partners: dict[str, int]  # work name -> covisible photos that support its pose
+    provisional: list[str]  # work names of photos registered with little evidence
     hypotheses: dict[str, list[float]]  # work name of a photo that is left out -> likely position
-    links: list[tuple[str, str, int]]  # pairs of placed photos that agree, with their matches that fit
-    unplaced_links: list[tuple[str, str, int]]  # other pairs, with the matches of their main motion
-    parts: list[list[str]]  # work names of parts that no photo joins, the largest first
-    firm: int  # photos of the largest part that are not provisional
+    links: list[tuple[str, str, int]]  # pairs of registered photos that agree, with their inliers
+    unregistered_links: list[
+        tuple[str, str, int]
+    ]  # other pairs, with the inliers of their main relative pose
+    components: list[list[str]]  # work names of components that no photo joins, the largest first
+    reliable: int  # photos of the largest component that are not provisional
     cameras: list[CameraFact]
     plan: str  # "fast", "wider", "thorough" or "covariant"
 
 
 def no_model() -> MappingResult:
-    """Return the result of a mapping that placed no photo."""
+    """Return the result of a mapping that registered no photo."""
     return {
         "model": None, "left_out": {}, "partners": {}, "provisional": [], "hypotheses": {}, "links": [],
-        "unplaced_links": [], "parts": [], "firm": 0, "cameras": [], "plan": "",
+        "unregistered_links": [], "components": [], "reliable": 0, "cameras": [], "plan": "",
     }  # fmt: skip
 
 
@@ -234,8 +236,8 @@ class ScenePhoto(TypedDict):
     blur: float
     mean_luma: float
     features: int
-    partners: int  # photos that agree with its place; 0: not in the scene
-    provisional: bool  # placed with little evidence
+    partners: int  # covisible photos that support its pose; 0: not in the scene
+    provisional: bool  # registered with little evidence
     notes: list[str]
     exif: ExifRecord  # without GPS
 

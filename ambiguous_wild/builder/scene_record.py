@@ -110,7 +110,7 @@ def scene_record(
             *screened["warnings"],
             *_focal_warnings(cameras, facts),
             *_parallax_warnings(model),
-            *part_lines(mapping["parts"], sources, settings.part),
+            *part_lines(mapping["components"], sources, settings.part),
             *_provisional_warnings([sources[name] for name in mapping["provisional"]]),
             *warnings,
         ],
@@ -268,24 +268,24 @@ def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> li
     return [f"focal length of {len(odd)} of {len(cameras)} cameras contradicts EXIF: {shortlist(odd, 2)}"]
 
 
-def part_lines(parts: Sequence[Sequence[str]], sources: Mapping[str, str], built: int) -> list[str]:
-    """Return one line if the photos fall into parts (work names each) that no photo joins, else none.
+def part_lines(components: Sequence[Sequence[str]], sources: Mapping[str, str], built: int) -> list[str]:
+    """Return one line if the pose graph has several components, the user's parts, else none.
 
     Args:
-        parts: work names of each part, the largest part first.
+        components: work names of each, the largest first.
         sources: work name -> path in the capture.
         built: number of the part that is built, from 1.
     """
-    if len(parts) < 2:
+    if len(components) < 2:
         return []
     named = [
-        f"part {number} of {len(part)} ({shortlist([sources[name] for name in part], 2)})"
-        for number, part in enumerate(parts, 1)
+        f"part {number} of {len(photos)} ({shortlist([sources[name] for name in photos], 2)})"
+        for number, photos in enumerate(components, 1)
     ]
     other = 1 if built > 1 else 2
     return [
-        f"the photos fall into {len(parts)} parts that no photo joins: {', '.join(named)}; take photos that "
-        f"show two of them at once; --part {other} builds part {other}"
+        f"the photos fall into {len(components)} parts that no photo joins: {', '.join(named)}; take photos "
+        f"that show two of them at once; --part {other} builds part {other}"
     ]
 
 

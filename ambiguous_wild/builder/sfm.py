@@ -28,7 +28,7 @@ from ambiguous_wild.builder.records import (
     ScreenedPhoto,
     no_model,
 )
-from ambiguous_wild.builder.retrieval import MOTIONS, PAIRS
+from ambiguous_wild.builder.retrieval import PAIRS, RELATIVE_POSES
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.processes import python_command
@@ -69,7 +69,7 @@ class MatchJob(TypedDict):
     ratio: float
     similar: int
     neighbours: int
-    only: list[str] | None  # names that look for partners; None: all
+    only: list[str] | None  # names that look for pairs; None: all
     focals: dict[str, float] | None  # name -> EXIF focal length over the longer side; None: poses are known
     earlier: str | None  # file of the pairs that are matched already
     photos: str | None  # folder; None: what is fixed to the camera stays matched
@@ -83,12 +83,12 @@ class MappingJob(TypedDict):
 
     task: Literal["mapping"]
     database: str
-    motions: str  # file that the stage `matches` wrote
+    relative_poses: str  # file that the stage `matches` wrote
     photos: str  # folder
     output: str  # folder
-    progress: str  # file that holds the number of placed photos
+    progress: str  # file that holds the number of registered photos
     mapper: str
-    part: int  # of the capture, from 1
+    part: int  # component, from 1, the largest
     growth: float  # of `SfmPlan`, as the four below
     refinements: int
     tolerance: float
@@ -111,10 +111,10 @@ class TriangulationJob(TypedDict):
     parent: NotRequired[int]
 
 
-class MotionJob(TypedDict):
-    """Job: find the motions of matched pairs whose cameras are known."""
+class RelativePoseJob(TypedDict):
+    """Job: find the relative poses of matched pairs whose cameras are known."""
 
-    task: Literal["motions"]
+    task: Literal["relative_poses"]
     database: str
     model: str  # folder; cameras, numbered as in the database
     output: str  # file
@@ -123,7 +123,7 @@ class MotionJob(TypedDict):
     parent: NotRequired[int]
 
 
-SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob | MotionJob
+SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob | RelativePoseJob
 
 
 class SfmCrash(AwError):
@@ -246,18 +246,18 @@ def match(
     posed: bool = False,
     photos: Path | None = None,
 ) -> MatchResult:
-    """Match pairs, and find the motions that they show.
+    """Match pairs, and find their relative poses.
 
     Args:
         folder: gets the database and the list of pairs.
         features: folder of the database with features.
         facts: screened photos.
         settings: settings of the build.
-        plan: gives the matcher and the number of partners a photo.
+        plan: gives the matcher and the number of pairs a photo.
         jobs: threads.
         bar: progress.
         earlier: folder of an earlier result whose pairs are kept.
-        left_out: work names of the photos that look for partners; None: all.
+        left_out: work names of the photos that look for pairs; None: all.
         posed: the poses are known, so pairs are matched only.
         photos: folder of the photos, to take out what is fixed to the camera; None: it stays matched.
     """
@@ -319,7 +319,7 @@ def map_scene(
     job: MappingJob = {
         "task": "mapping",
         "database": str(database),
-        "motions": str(matches / MOTIONS),
+        "relative_poses": str(matches / RELATIVE_POSES),
         "photos": str(photos),
         "output": str(folder),
         "progress": str(progress),

@@ -39,7 +39,7 @@ from ambiguous_wild.builder.records import (
     ScreenResult,
     UndistortResult,
 )
-from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.retrieval import RELATIVE_POSES
 from ambiguous_wild.builder.scene_package import SceneParts, package
 from ambiguous_wild.builder.screen import panorama_warnings, screen, without_copies
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan, plans
@@ -69,9 +69,9 @@ class SfmStages:
     mapping: StageResult[MappingResult]
 
     @property
-    def placed(self) -> int:
-        """Number of photos in the largest part."""
-        return max(map(len, self.mapping.facts["parts"]), default=0)
+    def registered(self) -> int:
+        """Number of photos in the largest component."""
+        return max(map(len, self.mapping.facts["components"]), default=0)
 
 
 @dataclass
@@ -126,7 +126,7 @@ class Stages:
         )
         facts = screened.facts["photos"]
         sides = sorted((min(f["width"], f["height"]), f["work_name"]) for f in facts)
-        # Before the slow part the larger half of the photos; after it those that are placed.
+        # Before the slow part the larger half of the photos; after it those that are registered.
         check_factor(settings.factor or 1, sides[len(sides) // 2 :])
         tests = read_test_list(self.test_list, facts) if self.test_list else None
         mask_stage = self._masks(work, screened)
@@ -145,7 +145,7 @@ class Stages:
             lambda f: write_motion(
                 f,
                 matches.folder / DATABASE,
-                mapping.folder / MOTIONS,
+                mapping.folder / RELATIVE_POSES,
                 mapping.folder / "0",
                 flat.folder / "sparse" / "0",
                 {work_name: f"{stem}.png" for work_name, stem in stems.items() if f"{stem}.png" in train},
@@ -266,17 +266,17 @@ class Stages:
         facts = screened.facts["photos"]
         attempts: list[SfmStages] = []
         for plan in plans(facts, self.settings):
-            placed = max((attempt.placed for attempt in attempts), default=0)
-            if placed >= plan.below * len(facts):
+            registered = max((attempt.registered for attempt in attempts), default=0)
+            if registered >= plan.below * len(facts):
                 break
             if attempts:
-                self.bar.say(f"{placed} of {len(facts)} photos placed: trying harder")
+                self.bar.say(f"{registered} of {len(facts)} photos placed: trying harder")
             attempts.append(self._attempt(work, screened, masks, plan, attempts[-1] if attempts else None))
-        # Of attempts that place equally many photos the last is taken, which is the most precise.
-        best = max(reversed(attempts), key=lambda a: (a.mapping.facts["firm"], a.placed))
+        # Of attempts that register equally many photos the last is taken, which is the most precise.
+        best = max(reversed(attempts), key=lambda a: (a.mapping.facts["reliable"], a.registered))
         sources, wanted = {f["work_name"]: f["source"] for f in facts}, self.settings.part
-        parts = scene_record.part_lines(best.mapping.facts["parts"], sources, wanted)
-        if wanted > len(best.mapping.facts["parts"]) > 0:
+        parts = scene_record.part_lines(best.mapping.facts["components"], sources, wanted)
+        if wanted > len(best.mapping.facts["components"]) > 0:
             raise AwError(f"no part {wanted}: {'; '.join(parts) or 'the photos form one part'}; omit --part")
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
         used = mask_warnings(masks.facts if masks else None) or used

@@ -16,9 +16,16 @@ import numpy as np
 from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import MotionResult, ScreenedPhoto
-from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.retrieval import RELATIVE_POSES
 from ambiguous_wild.builder.settings import BuildSettings, Effort, plans
-from ambiguous_wild.builder.sfm import DATABASE, MotionJob, TriangulationJob, extract_features, match, run_job
+from ambiguous_wild.builder.sfm import (
+    DATABASE,
+    RelativePoseJob,
+    TriangulationJob,
+    extract_features,
+    match,
+    run_job,
+)
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split, near_others
 from ambiguous_wild.io.colmap_model import read_model, write_model
@@ -154,11 +161,11 @@ def find_motion(
     model = read_model(scene / "sparse" / "0")
     split: dict[str, Split] = dict.fromkeys(train, "train")
     database = _match_posed(scratch, model, scene / "images", split, "auto", seed, jobs, bar)
-    job: MotionJob = {
-        "task": "motions",
+    job: RelativePoseJob = {
+        "task": "relative_poses",
         "database": str(database),
         "model": str(scratch / "known"),
-        "output": str(scratch / MOTIONS),
+        "output": str(scratch / RELATIVE_POSES),
         "seed": seed,
         "jobs": jobs,
     }
@@ -166,7 +173,9 @@ def find_motion(
     run_job(job, scratch, lambda: None)
     bar.finish()
     names = {name: name for name in train}
-    stats = write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
+    stats = write_motion(
+        scene, database, scratch / RELATIVE_POSES, scratch / "known", scene / "sparse" / "0", names
+    )
     if 2 * stats["silent"] > len(names):
         raise AwError(
             f"in {stats['silent']} of {len(names)} train photos no matches fit the given poses, so it is "

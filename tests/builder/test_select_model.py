@@ -21,10 +21,10 @@ def summary(images, points=None):
 def test_each_lost_photo_gets_its_reason():
     facts = [{"work_name": f"{n}.jpg", "source": f"{n}.JPG"} for n in "abc"]
     features = {"a.jpg": 900, "b.jpg": 12, "c.jpg": 900}
-    left_out = {"b.jpg": "no placed photo agrees", "c.jpg": "two places"}
+    left_out = {"b.jpg": "no placed photo agrees", "c.jpg": "two poses"}
     assert _lost_photos(facts, left_out, features) == [
         {"source": "b.JPG", "reason": "only 12 features"},
-        {"source": "c.JPG", "reason": "two places"},
+        {"source": "c.JPG", "reason": "two poses"},
     ]
 
 

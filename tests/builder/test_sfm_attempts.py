@@ -18,7 +18,10 @@ from tests.builder.capture_maker import write_capture
 
 
 def attempts(
-    monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: int, firm: dict[str, int] | None = None
+    monkeypatch: pytest.MonkeyPatch,
+    registered: dict[str, int],
+    photos: int,
+    reliable: dict[str, int] | None = None,
 ) -> tuple[list[str], Any]:
     """The plans that were tried, and what was chosen, where each places so many photos."""
     tried: list[str] = []
@@ -26,11 +29,16 @@ def attempts(
     def attempt(self: Stages, work: Any, screened: Any, masks: Any, plan: Any, before: Any) -> SfmStages:
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
-        if plan.name not in placed:  # it places nothing
-            placed[plan.name] = 0
-        model = {"images": placed[plan.name], "points": 9999} if placed[plan.name] else None
-        facts = {"model": model, "plan": plan.name, "fixed": [], "firm": (firm or placed)[plan.name]}
-        facts["parts"] = [["p.jpg"] * placed[plan.name]]
+        if plan.name not in registered:  # it places nothing
+            registered[plan.name] = 0
+        model = {"images": registered[plan.name], "points": 9999} if registered[plan.name] else None
+        facts = {
+            "model": model,
+            "plan": plan.name,
+            "fixed": [],
+            "reliable": (reliable or registered)[plan.name],
+        }
+        facts["components"] = [["p.jpg"] * registered[plan.name]]
         part = SimpleNamespace(folder=Path("nowhere"), facts=facts)
         return SfmStages(part, part, part)
 
@@ -63,23 +71,23 @@ def test_the_attempt_that_places_more_is_kept(monkeypatch, fast, wider, thorough
 
 
 def test_photos_placed_without_doubt_count_first(monkeypatch):
-    placed, firm = {"fast": 20, "thorough": 23}, {"fast": 20, "thorough": 3}
-    assert attempts(monkeypatch, placed, 25, firm) == (["fast", "thorough"], "fast")
+    registered, reliable = {"fast": 20, "thorough": 23}, {"fast": 20, "thorough": 3}
+    assert attempts(monkeypatch, registered, 25, reliable) == (["fast", "thorough"], "fast")
 
 
 def test_nothing_is_mapped_where_pairs_connect_too_few_photos(tmp_path):
     plan = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4, worth=0.5)
     settings, bar = BuildSettings(), Bar(enabled=False)
     result = sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 4, settings, plan, 1, bar)
-    assert result["model"] is None and result["parts"] == [] and result["plan"] == "fast"
+    assert result["model"] is None and result["components"] == [] and result["plan"] == "fast"
     with pytest.raises(FileNotFoundError):  # five are enough to try, and there is no database here
         sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 5, settings, plan, 1, bar)
 
 
 def test_all_pairs_of_many_photos_are_matched_only_if_less_than_half_is_placed(monkeypatch):
     assert attempts(monkeypatch, {"fast": 70, "wider": 70}, 120) == (["fast", "wider"], "wider")
-    placed = {"fast": 50, "wider": 50, "thorough": 90}
-    assert attempts(monkeypatch, placed, 120) == (["fast", "wider", "thorough"], "thorough")
+    registered = {"fast": 50, "wider": 50, "thorough": 90}
+    assert attempts(monkeypatch, registered, 120) == (["fast", "wider", "thorough"], "thorough")
 
 
 def test_few_photos_are_matched_thoroughly_at_once(monkeypatch):
@@ -87,8 +95,8 @@ def test_few_photos_are_matched_thoroughly_at_once(monkeypatch):
 
 
 def test_other_features_are_tried_where_the_careful_ones_leave_over_a_tenth_out(monkeypatch):
-    placed = {"fast": 8, "thorough": 13, "covariant": 16}
-    assert attempts(monkeypatch, placed, 16) == (["fast", "thorough", "covariant"], "covariant")
+    registered = {"fast": 8, "thorough": 13, "covariant": 16}
+    assert attempts(monkeypatch, registered, 16) == (["fast", "thorough", "covariant"], "covariant")
 
 
 def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):

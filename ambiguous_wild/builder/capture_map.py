@@ -87,10 +87,10 @@ class CaptureMap:
 
 
 def map_of_model(
-    model: ColmapModel,  # named by work names
+    model: ColmapModel,
     mapping: Mapping[str, Any],  # `MappingResult`; what it lacks is not drawn
-    sources: Mapping[str, str],  # work name -> path in the capture, in the order of capture
-    tests: Collection[str],  # work names
+    sources: Mapping[str, str],  # name -> path in the capture, in the order of capture
+    tests: Collection[str],  # names
 ) -> CaptureMap:
     """Return the map of a built scene."""
     registered = {image.name: image.cam_from_world() for image in model.images.values()}
@@ -360,10 +360,10 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
 
 def _with_left_out(
     drawn: CaptureMap,
-    left_out: Mapping[str, str],  # work name -> reason
+    left_out: Mapping[str, str],  # name -> reason
     mapping: Mapping[str, Any],
-    shown: Mapping[str, str],  # work name -> name on the map
-    at: Mapping[str, int],  # work name of a registered photo -> its index
+    shown: Mapping[str, str],  # name -> name on the map
+    at: Mapping[str, int],  # name of a registered photo -> its index
     plane: np.ndarray,  # [2, 3]
     size: float,
 ) -> CaptureMap:

@@ -95,7 +95,7 @@ class FixedArea:
         """Return the record of the area.
 
         Args:
-            names: work names of all photos.
+            names: names of all photos.
             mask: file name of its keep mask.
         """
         width, height = self.size

@@ -26,8 +26,8 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import atomic_path, check_output
 from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
+from ambiguous_wild.io.scene_folder import MAP
 
-FILE = "map.png"  # in the scene's folder
 SOFTWARE = "ambiguous_wild"  # text chunk `Software` of the file, followed by the version
 SIZE_PX, PANEL_PX, TITLE_PX = (1300, 860), 380, 40  # of the picture, its side panel and its title
 DPI = 100
@@ -59,7 +59,7 @@ def draw_built(
 ) -> MapResult:
     """Write the map of a built scene into a folder; arguments as in `map_of_model`."""
     drawn = map_of_model(model, cast(Mapping[str, Any], mapping), sources, tests)
-    write_map(drawn, folder / FILE)
+    write_map(drawn, folder / MAP)
     return {"advice": drawn.advice}
 
 

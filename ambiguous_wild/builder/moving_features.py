@@ -126,22 +126,22 @@ def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> d
 def motion_points(
     matched: Matched,
     poses: Mapping[int, np.ndarray],
-    names: Mapping[str, str],
+    train: Collection[str],
     pinholes: Mapping[str, ModelCamera],
     through: Mapping[int, np.ndarray],
 ) -> dict[str, MotionPoints]:
-    """Return the static and moving points of the train photos, by their names in the scene.
+    """Return the static and moving points of the train photos, by name.
 
     A photo whose pose is consistent with few covisible ones gets no points, as all of it would seem to move.
 
     Args:
         matched: photos with the relative poses of their pairs and the model's cameras.
         poses: photo -> [3, 4] camera from world.
-        names: work name -> name in the scene, of the train photos.
-        pinholes: name in the scene -> camera of the undistorted photo.
+        train: names of the train photos.
+        pinholes: name -> camera of the undistorted photo.
         through: photo -> result of `seen_through`.
     """
-    voters = {k: names[name] for k, name in enumerate(matched.names) if name in names}
+    voters = {k: name for k, name in enumerate(matched.names) if name in train}
     normalised, points = matched.normalised(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
         reach = NEIGHBOURS * max(matched.cameras[photo].width, matched.cameras[photo].height)
@@ -183,7 +183,7 @@ def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> 
 
 
 def write_motion(
-    folder: Path, database: Path, relative_poses: Path, model: Path, flat: Path, names: Mapping[str, str]
+    folder: Path, database: Path, relative_poses: Path, model: Path, flat: Path, train: Collection[str]
 ) -> MotionResult:
     """Write the motion points of a scene into the folder of their stage.
 
@@ -193,7 +193,7 @@ def write_motion(
         relative_poses: file of the relative poses of pairs.
         model: folder of COLMAP's model, whose cameras have distortion.
         flat: folder of the model of the undistorted photos.
-        names: work name -> name in the scene, of the train photos.
+        train: names of the train photos.
     """
     matched, colmap_model = Matched.read(database), pycolmap.Reconstruction(str(model))
     matched.take_cameras(colmap_model)
@@ -204,12 +204,12 @@ def write_motion(
     photos = {
         number: k
         for k, number in enumerate(matched.ids)
-        if matched.names[k] in names
+        if matched.names[k] in train
         and number in colmap_model.images
         and colmap_model.images[number].num_points2D() == len(matched.features[k])
     }
     through = seen_through(colmap_model, photos)
-    points = motion_points(matched, matched.poses(colmap_model), names, pinholes, through)
+    points = motion_points(matched, matched.poses(colmap_model), train, pinholes, through)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from ambiguous_wild.builder.records import PhotoRecord
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, FEW, NEIGHBOURS
 from ambiguous_wild.core.errors import AwError
 
@@ -80,7 +80,7 @@ class SfmPlan:
     below: float = 1.0  # the plan runs only if a smaller share of the photos is registered so far
 
 
-def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPlan]:
+def plans(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> list[SfmPlan]:
     """Return the attempts in order; each next one runs if the one before leaves photos out."""
     thorough = _thorough(len(photos), settings)
     # Other features find other pairs: a capture that one kind leaves in parts may be whole by the other.
@@ -99,7 +99,7 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
     return [fast, wider, replace(thorough, below=below), *careful[1:]]
 
 
-def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
+def _fast(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> SfmPlan:
     matcher = _matcher(len(photos), settings, FAST_EXHAUSTIVE_LIMIT)
     many = len(photos) > EXHAUSTIVE_LIMIT
     return SfmPlan(

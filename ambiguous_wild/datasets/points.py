@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -21,9 +20,8 @@ from ambiguous_wild.builder.settings import BuildSettings, Effort, plans
 from ambiguous_wild.builder.sfm import (
     DATABASE,
     RelativePoseJob,
+    StructureFromMotion,
     TriangulationJob,
-    extract_features,
-    match,
     run_job,
 )
 from ambiguous_wild.core.errors import AwError
@@ -172,13 +170,11 @@ def find_motion(
     bar.start("motions", None)
     run_job(job, scratch, lambda: None)
     bar.finish()
-    names = {name: name for name in train}
-    stats = write_motion(
-        scene, database, scratch / RELATIVE_POSES, scratch / "known", scene / "sparse" / "0", names
-    )
-    if 2 * stats["silent"] > len(names):
+    known = scratch / "known"
+    stats = write_motion(scene, database, scratch / RELATIVE_POSES, known, scene / "sparse" / "0", train)
+    if 2 * stats["silent"] > len(train):
         raise AwError(
-            f"in {stats['silent']} of {len(names)} train photos no matches fit the given poses, so it is "
+            f"in {stats['silent']} of {len(train)} train photos no matches fit the given poses, so it is "
             "unknown what moves; import without --motion, or place the photos anew with 'aw build-scene'"
         )
     return stats
@@ -196,17 +192,16 @@ def _match_posed(
 ) -> Path:
     """Make COLMAP's database of the matched photos in `split` with known cameras; write poses to known/."""
     used = {i.name: i for i in model.images.values() if i.name in split}
-    facts = [
-        cast(ScreenedPhoto, {"work_name": name, "source": name, "side": split[name]}) for name in sorted(used)
-    ]
+    used_photos = [ScreenedPhoto(source=name, name=name, side=split[name]) for name in sorted(used)]
     settings = BuildSettings(seed=seed, sfm=sfm)
     camera = "single" if len(model.cameras) == 1 else "per-image"
     for part in ("features", "matches", "known"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    plan = replace(plans(facts, settings)[0], max_features=settings.max_features)
-    extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
+    plan = replace(plans(used_photos, settings)[0], max_features=settings.max_features)
+    attempt = StructureFromMotion(used_photos, photos, settings, plan, jobs, bar)
+    attempt.extract_features(folder / "features", camera)
     _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
-    match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)
+    attempt.match(folder / "matches", folder / "features", posed=True)
     return folder / "matches" / DATABASE
 
 

@@ -163,7 +163,7 @@ def test_other_settings_are_refused_by_name_until_overwrite(built, raw, tmp_path
     other = replace(SETTINGS, factor=4)
     result = build_scene(raw, out, other, overwrite=True, keep_work=True)
     # Only what depends on the factor ran again.
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion", "map"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "motion", "map"}
     assert (out / "images_4").is_dir()
     assert not (out / "images_2").exists()
     # The scene deleted, the work kept: packaging runs again, nothing else.
@@ -255,21 +255,21 @@ def test_identical_photos_fail_cleanly(tmp_path):
 
 
 def test_a_full_disk_keeps_what_is_done_and_goes_on(built, raw, scene, tmp_path, monkeypatch):
-    from ambiguous_wild.builder import downsample
+    from ambiguous_wild.builder import resample
 
     def full(*args):
         raise OSError(errno.ENOSPC, "No space left on device", "/disk/p02.png")
 
     shutil.rmtree(copy_of(built, tmp_path / "scene"))  # its last stage went with it
-    (unfinished,) = (tmp_path / ".scene.build").glob("downsample-*")
+    (unfinished,) = (tmp_path / ".scene.build").glob("undistort-*")
     shutil.rmtree(unfinished)
     with monkeypatch.context() as patch:
-        patch.setattr(downsample, "write_png", full)
+        patch.setattr(resample, "write_png", full)
         with pytest.raises(AwError, match=r"No space left on device \(/disk/p02\.png\).*goes on"):
             build_scene(raw, tmp_path / "scene", SETTINGS)
     assert not (tmp_path / "scene").exists()
     result = build_scene(raw, tmp_path / "scene", SETTINGS)
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion", "map"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "motion", "map"}
     assert hashes(result.scene) == hashes(scene)
 
 

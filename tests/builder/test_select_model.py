@@ -5,6 +5,7 @@ import pytest
 
 from ambiguous_wild.builder import diagnosis
 from ambiguous_wild.builder.diagnosis import PairFacts, check_registered
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.scene_record import _lost_photos, _parallax_warnings, parallax_deg, part_lines
 from ambiguous_wild.core import AwError
 from tests.io.model_maker import make_model
@@ -19,10 +20,10 @@ def summary(images, points=None):
 
 
 def test_each_lost_photo_gets_its_reason():
-    facts = [{"work_name": f"{n}.jpg", "source": f"{n}.JPG"} for n in "abc"]
+    photos = [ScreenedPhoto(f"{n}.JPG", f"{n}.jpg") for n in "abc"]
     features = {"a.jpg": 900, "b.jpg": 12, "c.jpg": 900}
     left_out = {"b.jpg": "no placed photo agrees", "c.jpg": "two poses"}
-    assert _lost_photos(facts, left_out, features) == [
+    assert _lost_photos(photos, left_out, features) == [
         {"source": "b.JPG", "reason": "only 12 features"},
         {"source": "c.JPG", "reason": "two poses"},
     ]

@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 
-from ambiguous_wild.builder import sfm, stages
+from ambiguous_wild.builder import stages
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
+from ambiguous_wild.builder.sfm import StructureFromMotion
 from ambiguous_wild.builder.stages import SfmStages, Stages
 from tests.builder.capture_maker import write_capture
 
@@ -26,7 +28,9 @@ def attempts(
     """The plans that were tried, and what was chosen, where each places so many photos."""
     tried: list[str] = []
 
-    def attempt(self: Stages, work: Any, screened: Any, masks: Any, plan: Any, before: Any) -> SfmStages:
+    def attempt(
+        self: Stages, work: Any, screened: Any, photos: Any, masks: Any, plan: Any, before: Any
+    ) -> SfmStages:
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
         if plan.name not in registered:  # it places nothing
@@ -43,10 +47,10 @@ def attempts(
         return SfmStages(part, part, part)
 
     monkeypatch.setattr(Stages, "_attempt", attempt)
-    one = {"width": 1000, "height": 800, "work_name": "p.jpg", "source": "p.jpg"}
-    facts = {"photos": [one] * photos, "skipped": []}
+    screened = SimpleNamespace(facts={"skipped": []})
     self = Stages(SimpleNamespace(), BuildSettings(), None, None, 1, Bar(enabled=False), False)
-    return tried, self._sfm(SimpleNamespace(), SimpleNamespace(facts=facts), None).mapping.facts["plan"]
+    one = ScreenedPhoto("p.jpg", "p.jpg", width=1000, height=800)
+    return tried, self._sfm(SimpleNamespace(), screened, [one] * photos, None).mapping.facts["plan"]
 
 
 def test_fast_is_enough_where_it_places_everything(monkeypatch):
@@ -77,11 +81,12 @@ def test_photos_placed_without_doubt_count_first(monkeypatch):
 
 def test_nothing_is_mapped_where_pairs_connect_too_few_photos(tmp_path):
     plan = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4, worth=0.5)
-    settings, bar = BuildSettings(), Bar(enabled=False)
-    result = sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 4, settings, plan, 1, bar)
+    photos = [ScreenedPhoto(f"{k}.jpg", f"{k}.png") for k in range(9)]
+    attempt = StructureFromMotion(photos, tmp_path, BuildSettings(), plan, 1, Bar(enabled=False))
+    result = attempt.map(tmp_path, tmp_path, 4)
     assert result["model"] is None and result["components"] == [] and result["plan"] == "fast"
     with pytest.raises(FileNotFoundError):  # five are enough to try, and there is no database here
-        sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 5, settings, plan, 1, bar)
+        attempt.map(tmp_path, tmp_path, 5)
 
 
 def test_all_pairs_of_many_photos_are_matched_only_if_less_than_half_is_placed(monkeypatch):
@@ -102,14 +107,13 @@ def test_other_features_are_tried_where_the_careful_ones_leave_over_a_tenth_out(
 def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):
     """COLMAP itself; fast looks at tiny photos here, and finds next to nothing."""
     write_capture(tmp_path / "raw", 8)
-    real = stages.extract_features
+    real = StructureFromMotion.extract_features
 
-    def blinded(folder: Path, photos: Path, facts: Any, settings: Any, plan: Any, *rest: Any) -> Any:
-        if plan.sift == "opencv":
-            settings = dataclasses.replace(settings, max_side=40)
-        return real(folder, photos, facts, settings, plan, *rest)
+    def blinded(self: StructureFromMotion, *words: Any) -> Any:
+        tiny = dataclasses.replace(self.settings, max_side=40)
+        return real(dataclasses.replace(self, settings=tiny) if self.plan.sift == "opencv" else self, *words)
 
-    monkeypatch.setattr(stages, "extract_features", blinded)
+    monkeypatch.setattr(StructureFromMotion, "extract_features", blinded)
     settings = BuildSettings(factor=2, max_features=800)
     info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
     assert info["counts"]["registered"] == 8 and info["chosen"]["sfm"] == "thorough"

@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from ambiguous_wild.builder.overlap_graph import (
     lay_out,
     weakly_connected,
 )
+from ambiguous_wild.builder.records import MappingResult
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import ColmapModel
 
@@ -88,7 +89,7 @@ class CaptureMap:
 
 def map_of_model(
     model: ColmapModel,
-    mapping: Mapping[str, Any],  # `MappingResult`; what it lacks is not drawn
+    mapping: MappingResult,
     sources: Mapping[str, str],  # name -> path in the capture, in the order of capture
     tests: Collection[str],  # names
 ) -> CaptureMap:
@@ -101,7 +102,7 @@ def map_of_model(
     flat = centres @ plane.T
     size = longer_side(flat)
     shown = {name: printable(source) for name, source in sources.items()}
-    provisional = set(mapping.get("provisional", ()))
+    provisional = set(mapping["provisional"])
     photos = [
         MapPhoto(
             shown[name],
@@ -113,10 +114,8 @@ def map_of_model(
         for k, name in enumerate(names)
     ]
     at = {name: k for k, name in enumerate(names)}
-    links = _links(mapping.get("links", ()), at)
-    other_components = [
-        component for component in mapping.get("components", ()) if not at.keys() & set(component)
-    ]
+    links = _links(mapping["links"], at)
+    other_components = [component for component in mapping["components"] if not at.keys() & set(component)]
     elsewhere = {name for component in other_components for name in component}
     left_out = {name: why for name, why in mapping["left_out"].items() if name in sources.keys() - elsewhere}
     order = {name: k for k, name in enumerate(sources)}
@@ -130,7 +129,7 @@ def map_of_model(
         if not members:
             continue
         every = list(sources)
-        loose = _links(mapping.get("unregistered_links", ()), order)
+        loose = _links(mapping["unregistered_links"], order)
         inside, outside = best_link_between([order[name] for name in names], members, loose)
         pair = (shown[every[inside]], shown[every[outside]])
         named = shortlist([shown[every[k]] for k in members], 3)
@@ -322,7 +321,7 @@ def _thin_axis(
     return np.asarray(axes[:, 0]) if sizes[0] < THIN * sizes[1] and sizes[1] > WIDE * sizes[2] else None
 
 
-def _links(rows: Sequence[Sequence[Any]], at: Mapping[str, int]) -> list[Link]:
+def _links(rows: Iterable[tuple[str, str, int]], at: Mapping[str, int]) -> list[Link]:
     """Return links between known photos by index."""
     known = [(at[a], at[b], int(m)) for a, b, m in rows if a in at and b in at]
     return [(*_sorted((a, b)), m) for a, b, m in known]
@@ -361,7 +360,7 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
 def _with_left_out(
     drawn: CaptureMap,
     left_out: Mapping[str, str],  # name -> reason
-    mapping: Mapping[str, Any],
+    mapping: MappingResult,
     shown: Mapping[str, str],  # name -> name on the map
     at: Mapping[str, int],  # name of a registered photo -> its index
     plane: np.ndarray,  # [2, 3]
@@ -372,14 +371,13 @@ def _with_left_out(
     wanted: dict[str, list[str]] = {}  # registered photo -> photos left out that match it most
     reasons: dict[str, list[str]] = {}
     best: dict[str, tuple[int, str]] = {}
-    for a, b, matches in mapping.get("unregistered_links", ()):
+    for a, b, matches in mapping["unregistered_links"]:
         for lost, covisible in ((a, b), (b, a)):
             if lost in left_out and covisible in at and matches > best.get(lost, (0, ""))[0]:
                 best[lost] = int(matches), covisible
-    hypotheses = mapping.get("hypotheses", {})
-    middle = np.median([photo.xy for photo in drawn.photos], axis=0)
+        middle = np.median([photo.xy for photo in drawn.photos], axis=0)
     low, high = frame_limits(np.array([photo.xy for photo in drawn.photos]))
-    likely = {name: plane @ np.array(xyz, float) for name, xyz in hypotheses.items()}
+    likely = {name: plane @ np.array(xyz, float) for name, xyz in mapping["hypotheses"].items()}
     # A hypothesis far from all registered photos is wrong more often than not.
     likely = {name: xy for name, xy in likely.items() if (low <= xy).all() and (xy <= high).all()}
     for name, reason in left_out.items():

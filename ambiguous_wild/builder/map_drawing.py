@@ -58,7 +58,7 @@ def draw_built(
     tests: Collection[str],
 ) -> MapResult:
     """Write the map of a built scene into a folder; arguments as in `map_of_model`."""
-    drawn = map_of_model(model, cast(Mapping[str, Any], mapping), sources, tests)
+    drawn = map_of_model(model, mapping, sources, tests)
     write_map(drawn, folder / MAP)
     return {"advice": drawn.advice}
 

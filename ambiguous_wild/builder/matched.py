@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from ambiguous_wild.builder.overlap_graph import component_labels
 from ambiguous_wild.builder.relative_poses import (
     LEAST,
     Pair,
@@ -285,10 +284,7 @@ def largest_component(pairs: Collection[Pair]) -> int:
     """Return the largest number of photos that pairs connect."""
     if not pairs:
         return 0
-    ends = np.array(list(pairs)).T
-    size = int(ends.max()) + 1
-    label = connected_components(coo_array((np.ones(ends.shape[1]), tuple(ends)), (size, size)), False)[1]
-    return int(np.bincount(label).max())
+    return int(np.bincount(component_labels(1 + max(map(max, pairs)), pairs)).max())
 
 
 def connected_photos(database: Path) -> int:
@@ -324,9 +320,7 @@ def _well_connected(pairs: Collection[Pair]) -> set[int]:
         for other in covisible[photo]:
             wanted[other] = max(wanted[other] - 1, 0)
     rows = [(a, b) for a, b in pairs if a in chosen and b in chosen]
-    size = max(covisible, default=-1) + 1
-    ends = np.array(rows, int).reshape(-1, 2).T
-    component = connected_components(coo_array((np.ones(len(rows)), tuple(ends)), (size, size)), False)[1]
+    component = component_labels(max(covisible, default=-1) + 1, rows)
     near = {photo: {component[k] for k in (others | {photo}) & chosen} for photo, others in covisible.items()}
     return chosen.union(*(pair for pair in pairs if len(near[pair[0]] | near[pair[1]]) > 1))
 

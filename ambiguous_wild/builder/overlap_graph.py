@@ -166,6 +166,18 @@ def _grow(
     return registered
 
 
+def component_labels(count: int, pairs: Iterable[Sequence[int]]) -> np.ndarray:
+    """Number the components of `count` photos that pairs connect, [count] int, 0 the largest."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.array([tuple(pair) for pair in pairs], int).reshape(-1, 2).T
+    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), (count, count))
+    label = connected_components(graph, directed=False)[1]
+    order = np.argsort(-np.bincount(label), kind="stable")
+    return np.argsort(order)[label]
+
+
 def lay_out(
     count: int,  # photos, in the order of capture
     links: Sequence[Link],

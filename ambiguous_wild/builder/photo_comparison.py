@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
+from ambiguous_wild.builder.overlap_graph import component_labels
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.core.srgb import srgb_to_linear
 
@@ -157,8 +158,8 @@ def compare_photos(
 
     enter_all(ordered, raw)
     # A photo that overlaps with few others is tried against more candidates before it counts as isolated.
-    groups = _groups(graph)
-    lonely = np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist()
+    labels = component_labels(count, np.argwhere(graph))
+    lonely = np.flatnonzero((labels != 0) | (graph.sum(axis=1) < 2)).tolist()
     more = [(min(i, j), max(i, j)) for i in lonely for j in most_similar(features, i, EXTRA_CANDIDATES)]
     more = [pair for pair in dict.fromkeys(more) if pair not in raw]
     enter_all(more, _all_raw_matches(features, more, "comparing photos that overlap with few", bar, jobs))
@@ -320,12 +321,3 @@ def _solve(count: int, rows: list[tuple[int, int, np.ndarray, float]]) -> np.nda
         solved = lsqr(matrix, weight * np.array([r[2][q] for r in rows]))[0]
         offsets[seen, q] = solved[seen] - np.median(solved[seen])
     return offsets
-
-
-def _groups(graph: np.ndarray) -> np.ndarray:
-    """Number the connected groups of photos by size, 0 the largest."""
-    from scipy.sparse.csgraph import connected_components
-
-    _, label = connected_components(graph, directed=False)
-    order = np.argsort(-np.bincount(label), kind="stable")
-    return np.argsort(order)[label]

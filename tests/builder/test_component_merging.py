@@ -1,5 +1,6 @@
 """Components that were registered alone are merged where several pairs agree, and only there."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -81,6 +82,10 @@ def components_of(
     return found[0], found[1]
 
 
+def connected(component: Registration, without: Sequence[int] = ()) -> list[set[int]]:
+    return component.components(component.find_links(), without)
+
+
 def errors(component: Registration) -> tuple[float, float]:
     """Largest angle in degrees, and largest distance of a position."""
     turned, moved = [], []
@@ -148,23 +153,18 @@ def observed(component: Registration) -> dict[int, SimpleNamespace]:
     return found
 
 
-def test_a_straight_path_leaves_the_scale_open():
-    first, second = components_of({(2, 3): None, (1, 4): None}, bend=0.0)
-    assert not merge(first, second)
-
-
 @pytest.mark.parametrize(
-    "across",
+    ("across", "bend"),
     [
-        {(2, 3): None},  # a single pair gives no scale, and may show a distractor
-        {(2, 3): None, (1, 4): cv2.Rodrigues(np.radians([0.0, 50.0, 0.0]))[0]},
-        {},
+        ({(2, 3): None}, 1.0),  # a single pair gives no scale, and may show a distractor
+        ({(2, 3): None, (1, 4): cv2.Rodrigues(np.radians([0.0, 50.0, 0.0]))[0]}, 1.0),  # a contradiction
+        ({(2, 3): None, (1, 4): None}, 0.0),  # along a straight path every scale is possible
+        ({}, 1.0),
     ],
 )
-def test_one_pair_does_not_merge_components_nor_do_two_that_contradict_each_other(across):
-    first, second = components_of(across)
-    assert not merge(first, second)
-    assert first.poses.keys() == set(HERE)
+def test_too_little_evidence_merges_nothing(across, bend):
+    first, second = components_of(across, bend)
+    assert not merge(first, second) and first.poses.keys() == set(HERE)
 
 
 def test_pairs_that_agree_on_something_else_prevent_a_merge():
@@ -181,27 +181,25 @@ def test_pairs_that_agree_on_something_else_prevent_a_merge():
 def test_only_the_largest_component_is_kept():
     component, _ = components_of({})
     component.poses = {k: pose(k) for k in range(6)}
-    assert component.components(component.find_links()) == [{0, 1, 2}, {3, 4, 5}]
-    assert component.components(component.find_links(), without=[1, 4, 5]) == [{0, 2}, {3}]
+    assert connected(component) == [{0, 1, 2}, {3, 4, 5}]
+    assert connected(component, without=[1, 4, 5]) == [{0, 2}, {3}]
     others = component._keep_largest()
     assert [sorted(other) for other in others] == [[3, 4, 5]] and component.poses.keys() == {0, 1, 2}
 
 
-def test_a_single_link_does_not_connect_two_groups_but_a_photo_with_one():
-    component, _ = components_of({(2, 3): None})
-    component.poses = {k: pose(k) for k in range(6)}
-    assert (2, 3) in component.find_links()
-    assert component.components(component.find_links()) == [{0, 1, 2}, {3, 4, 5}]
-    del component.poses[5]
-    assert component.components(component.find_links()) == [
-        {0, 1, 2, 3, 4}
-    ]  # two photos at the end of a chain
-    component, _ = components_of({(2, 3): None, (1, 4): None})
-    component.poses = {k: pose(k) for k in range(6)}
-    assert component.components(component.find_links()) == [set(range(6))]
-    component, _ = components_of({(2, 3): None})
-    component.poses, component.merged = {k: pose(k) for k in range(6)}, [frozenset(THERE)]
-    assert component.components(component.find_links()) == [set(range(6))]
+@pytest.mark.parametrize(
+    ("across", "photos", "merged", "expected"),
+    [
+        ({(2, 3): None}, 6, [], [{0, 1, 2}, {3, 4, 5}]),
+        ({(2, 3): None}, 5, [], [{0, 1, 2, 3, 4}]),  # two photos at the end of a chain
+        ({(2, 3): None, (1, 4): None}, 6, [], [{*range(6)}]),
+        ({(2, 3): None}, 6, [frozenset(THERE)], [{*range(6)}]),
+    ],
+)
+def test_a_single_link_does_not_connect_two_groups_but_a_photo_with_one(across, photos, merged, expected):
+    component, _ = components_of(across)
+    component.poses, component.merged = {k: pose(k) for k in range(photos)}, merged
+    assert (2, 3) in component.find_links() and connected(component) == expected
 
 
 @pytest.mark.parametrize(("most", "whole"), [(None, True), (2, False)])
@@ -214,9 +212,7 @@ def test_a_photo_connects_two_groups_only_if_its_inliers_are_not_clustered(most,
         rows = np.argsort(pixels.sum(axis=1))[:most]
         relative_pose = component.matched.relative_poses[2, other][0]
         component.matched.relative_poses[2, other] = [replace(relative_pose, matches=rows)]
-    assert component.components(component.find_links()) == (
-        [set(range(6))] if whole else [{0, 1, 2}, {3, 4, 5}]
-    )
+    assert connected(component) == ([set(range(6))] if whole else [{0, 1, 2}, {3, 4, 5}])
 
 
 def test_pairs_whose_inliers_are_clustered_merge_no_components():

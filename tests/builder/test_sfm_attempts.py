@@ -16,6 +16,7 @@ from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.builder.sfm import StructureFromMotion
 from ambiguous_wild.builder.stages import SfmStages, Stages
+from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import write_capture
 
 
@@ -24,8 +25,9 @@ def attempts(
     registered: dict[str, int],
     photos: int,
     reliable: dict[str, int] | None = None,
+    part: int = 1,
 ) -> tuple[list[str], Any]:
-    """The plans that were tried, and what was chosen, where each places so many photos."""
+    """The plans that were tried, and what was chosen, where each registers so many photos."""
     tried: list[str] = []
 
     def attempt(
@@ -33,28 +35,29 @@ def attempts(
     ) -> SfmStages:
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
-        if plan.name not in registered:  # it places nothing
+        if plan.name not in registered:  # it registers nothing
             registered[plan.name] = 0
         model = {"images": registered[plan.name], "points": 9999} if registered[plan.name] else None
-        facts = {
-            "model": model,
-            "plan": plan.name,
-            "fixed": [],
-            "reliable": (reliable or registered)[plan.name],
-        }
-        facts["components"] = [["p.jpg"] * registered[plan.name]]
+        components = [["p.jpg"] * registered[plan.name]]
+        facts = {"model": model, "plan": plan.name, "fixed": [], "components": components}
+        facts["reliable"] = (reliable or registered)[plan.name]
         part = SimpleNamespace(folder=Path("nowhere"), facts=facts)
         return SfmStages(part, part, part)
 
     monkeypatch.setattr(Stages, "_attempt", attempt)
     screened = SimpleNamespace(facts={"skipped": []})
-    self = Stages(SimpleNamespace(), BuildSettings(), None, None, 1, Bar(enabled=False), False)
+    self = Stages(SimpleNamespace(), BuildSettings(part=part), None, None, 1, Bar(enabled=False), False)
     one = ScreenedPhoto("p.jpg", "p.jpg", width=1000, height=800)
     return tried, self._sfm(SimpleNamespace(), screened, [one] * photos, None).mapping.facts["plan"]
 
 
 def test_fast_is_enough_where_it_places_everything(monkeypatch):
     assert attempts(monkeypatch, {"fast": 30, "wider": 30}, 30) == (["fast"], "fast")
+
+
+def test_a_part_that_does_not_exist_is_refused(monkeypatch):
+    with pytest.raises(AwError, match=r"no part 2: the photos form one part; omit --part"):
+        attempts(monkeypatch, {"fast": 30}, 30, part=2)
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,7 @@ from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_poi
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 CLEARLY = 2.0  # a match moves if its epipolar error is this many times the largest of an inlier
-LEAST_CONSISTENT = (
-    0.25  # share of a photo's covisible ones of which a relative pose must be consistent with its pose
-)
+LEAST_CONSISTENT = 0.25  # share of the covisible photos that must be consistent with the pose of a photo
 # A point is seen through by comparing it with at most this many points around it, no farther away than this
 # share of the photo's longer side, which must be deeper by this factor.
 AROUND, THROUGH, BEHIND = 12, 0.02, 1.2

@@ -28,9 +28,8 @@ class PoseHypothesis:
     support: frozenset[int]  # registered photos with enough inliers under it
     area: float  # share of the grid cells with features that hold inliers
     coverage: float = 1.0  # cells with inliers, over those of as many features drawn at random
-    evidence: Mapping[tuple[Pair, int], np.ndarray] = field(
-        default_factory=dict
-    )  # relative pose -> its inliers
+    # Relative pose -> its inliers.
+    evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)
 
     @property
     def weight(self) -> float:

@@ -152,10 +152,8 @@ class MappingResult(TypedDict):
     provisional: list[str]  # names of photos registered with little evidence
     hypotheses: dict[str, list[float]]  # name of a photo that is left out -> likely position
     links: list[tuple[str, str, int]]  # pairs of registered photos that agree, with their inliers
-    unregistered_links: list[
-        tuple[str, str, int]
-    ]  # other pairs, with the inliers of their main relative pose
-    components: list[list[str]]  # names of components that no photo joins, the largest first
+    unregistered_links: list[tuple[str, str, int]]  # other pairs, with the inliers of the first relative pose
+    components: list[list[str]]  # names of the photos of each, the largest first
     reliable: int  # photos of the largest component that are not provisional
     cameras: list[CameraFact]
     plan: str  # "fast", "wider", "thorough" or "covariant"

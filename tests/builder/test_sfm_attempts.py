@@ -126,7 +126,7 @@ def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):
 def test_photos_that_are_left_out_look_for_more_partners(monkeypatch, tmp_path):
     """Pairs that are matched already stay, and are not matched again."""
     write_capture(tmp_path / "raw", 8)
-    # a partner each: the photos do not chain
+    # a pair each: the photos do not chain
     fast = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4)
     wider = dataclasses.replace(fast, name="wider", similar=7, continues=True)
     monkeypatch.setattr(stages, "plans", lambda photos, settings: [fast, wider])

@@ -37,8 +37,8 @@ RESULTS = Path(__file__).parent / "results" / "poses"
 BASES = ("monstree", "sceaux", "seneca", "skull")
 WAYS = ("auto", "thorough", "colmap", "colmap-global")
 KINDS = ("cutouts", "patches")
-TURNED_DEG, MOVED_PERCENT = 1.0, 5.0  # a photo is placed rightly below both
-MOVED_M = 20.0  # the same by GPS, whose own error is several metres in a street
+ROTATION_DEG, POSITION_PERCENT = 1.0, 5.0  # a pose is right if both errors are below
+POSITION_M = 20.0  # the same by GPS, whose own error is several metres in a street
 LEAST_COMPOSITE = 6  # photos: `aw composite` refuses fewer
 COLMAP = """
 import os, sys, zlib, pycolmap
@@ -65,99 +65,104 @@ Poses = dict[str, tuple[np.ndarray, np.ndarray, float]]  # rotation [3, 3] from 
 
 def model_poses(folder: Path) -> Poses:
     """Of a COLMAP model, by the name of the photo without its ending."""
-    model, found = read_model(folder), {}
+    model, estimated = read_model(folder), {}
     for image in model.images.values():
         pose = image.cam_from_world()
         centre = -pose[:3, :3].T @ pose[:3, 3]
         focal_px = float(model.cameras[image.camera_id].params[0])
-        found[Path(image.name).stem] = pose[:3, :3], centre, focal_px
-    return found
+        estimated[Path(image.name).stem] = pose[:3, :3], centre, focal_px
+    return estimated
 
 
 def exact_poses(cameras: Path) -> Poses:
     """Of a simulated capture."""
-    found = {}
+    estimated = {}
     for name, camera in json.loads(cameras.read_text(encoding="utf-8")).items():
         pose = np.array(camera["cam_from_world"])
-        found[Path(name).stem] = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3], float(camera["fx"])
-    return found
+        estimated[Path(name).stem] = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3], float(camera["fx"])
+    return estimated
 
 
-def compare(found: Poses, truth: Poses) -> dict[str, Any]:
-    """How many photos stand rightly, and which do not.
+def compare(estimated: Poses, truth: Poses) -> dict[str, Any]:
+    """How many poses are right, and which are not.
 
     The similarity between the two paths is fitted to the photos whose rotation is right. A photo that the
     truth lacks is not judged.
     """
-    names = sorted(set(found) & set(truth))
+    names = sorted(set(estimated) & set(truth))
     if len(names) < 3:
         return {"known": len(truth), "judged": len(names), "right": 0, "wrong": {}}
-    turns = np.array(
-        [truth[n][0].T @ found[n][0] for n in names]
-    )  # world of the truth from that of the model
-    off = _angles_deg(np.einsum("aij,bkj->abik", turns, turns))
-    turned = {n: float(np.median(np.delete(off[k], k))) for k, n in enumerate(names)}
-    fixed = [n for n in names if turned[n] <= TURNED_DEG]
-    fixed = fixed if len(fixed) >= 3 else list(names)
-    for _ in range(len(fixed) - 2):  # without those that would drag the others
-        moved = _moved_percent(names, fixed, found, truth)
-        worst = max(fixed, key=lambda n: moved[n])
-        if moved[worst] <= max(MOVED_PERCENT, 3 * float(np.median([moved[n] for n in fixed]))):
+    # World of the truth from that of the model.
+    world_rotations = np.array([truth[n][0].T @ estimated[n][0] for n in names])
+    angles_deg = _angles_deg(np.einsum("aij,bkj->abik", world_rotations, world_rotations))
+    rotation_deg = {n: float(np.median(np.delete(angles_deg[k], k))) for k, n in enumerate(names)}
+    inliers = [n for n in names if rotation_deg[n] <= ROTATION_DEG]
+    inliers = inliers if len(inliers) >= 3 else list(names)
+    for _ in range(len(inliers) - 2):  # without those that would drag the others
+        position_percent = _position_errors_percent(names, inliers, estimated, truth)
+        worst = max(inliers, key=lambda n: position_percent[n])
+        if position_percent[worst] <= max(
+            POSITION_PERCENT, 3 * float(np.median([position_percent[n] for n in inliers]))
+        ):
             break
-        fixed.remove(worst)
+        inliers.remove(worst)
     wrong = {
-        n: [round(turned[n], 2), round(moved[n], 2)]
+        n: [round(rotation_deg[n], 2), round(position_percent[n], 2)]
         for n in names
-        if turned[n] > TURNED_DEG or moved[n] > MOVED_PERCENT
+        if rotation_deg[n] > ROTATION_DEG or position_percent[n] > POSITION_PERCENT
     }
-    focal = [100 * (found[n][2] / truth[n][2] - 1) for n in names]
+    focal = [100 * (estimated[n][2] / truth[n][2] - 1) for n in names]
     return {
         "known": len(truth),  # photos
         "judged": len(names),
         "right": len(names) - len(wrong),
         "wrong": wrong,  # degrees, percent of the path's radius
-        "position_percent": round(float(np.median(list(moved.values()))), 3),
+        "position_percent": round(float(np.median(list(position_percent.values()))), 3),
         "focal_percent": round(float(np.median(focal)), 3),
     }
 
 
-def _moved_percent(
-    names: Sequence[str], fixed: Sequence[str], found: Poses, truth: Poses
+def _position_errors_percent(
+    names: Sequence[str], inliers: Sequence[str], estimated: Poses, truth: Poses
 ) -> dict[str, float]:
-    source, target = (np.array([poses[n][1] for n in fixed]) for poses in (found, truth))
+    source, target = (np.array([poses[n][1] for n in inliers]) for poses in (estimated, truth))
     path = np.array([truth[n][1] for n in names])
     radius = np.linalg.norm(path - path.mean(0), axis=1).max()
-    apart = _moved(source, target, np.array([found[n][1] for n in names]), path)
-    return dict(zip(names, (100 * apart / radius).tolist()))
+    distances = _aligned_distances(source, target, np.array([estimated[n][1] for n in names]), path)
+    return dict(zip(names, (100 * distances / radius).tolist()))
 
 
-def _moved(source: np.ndarray, target: np.ndarray, points: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Distances [N] of `points` from `goals` [N, D] after the similarity that fits `source` to `target`."""
-    mean, goal = source.mean(0), target.mean(0)
-    left, values, right = np.linalg.svd((target - goal).T @ (source - mean))
+def _aligned_distances(
+    source: np.ndarray, target: np.ndarray, points: np.ndarray, targets: np.ndarray
+) -> np.ndarray:
+    """Distances [N] of `points` from `targets` [N, D] after the similarity that fits `source` to `target`."""
+    mean, target_mean = source.mean(0), target.mean(0)
+    left, values, right = np.linalg.svd((target - target_mean).T @ (source - mean))
     signs = np.ones(len(values))
     signs[-1] = np.sign(np.linalg.det(left @ right))
     rotation = left @ np.diag(signs) @ right
     scale = (values * signs).sum() / max(float(((source - mean) ** 2).sum()), 1e-30)
-    return np.linalg.norm(scale * (points - mean) @ rotation.T + goal - goals, axis=1)
+    return np.linalg.norm(scale * (points - mean) @ rotation.T + target_mean - targets, axis=1)
 
 
-def compare_gps(found: Poses, truth: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """How far the cameras are from their GPS positions, in the plane of the cameras."""
-    names = sorted(set(found) & set(truth))
+def compare_gps(estimated: Poses, truth: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    """Distances of the cameras from their GPS positions, in the plane of the cameras."""
+    names = sorted(set(estimated) & set(truth))
     if len(names) < 3:
         return {"known": len(truth), "judged": len(names), "right": 0, "wrong": {}}
-    centres, goals = np.array([found[n][1] for n in names]), np.array([truth[n] for n in names])
+    centres, targets = np.array([estimated[n][1] for n in names]), np.array([truth[n] for n in names])
     axes = np.linalg.svd(centres - centres.mean(0), full_matrices=False)[2]
     plane = (centres - centres.mean(0)) @ axes[:2].T
-    apart = min((_moved(p, goals, p, goals) for p in (plane, plane * [1, -1])), key=np.median)
-    wrong = {n: [0.0, round(float(m), 2)] for n, m in zip(names, apart) if m > MOVED_M}
+    distances = min(
+        (_aligned_distances(p, targets, p, targets) for p in (plane, plane * [1, -1])), key=np.median
+    )
+    wrong = {n: [0.0, round(float(m), 2)] for n, m in zip(names, distances) if m > POSITION_M}
     return {
         "known": len(truth),
         "judged": len(names),
         "right": len(names) - len(wrong),
         "wrong": wrong,  # 0, metres
-        "position_m": round(float(np.median(apart)), 2),
+        "position_m": round(float(np.median(distances)), 2),
     }
 
 
@@ -204,7 +209,7 @@ def capture_of(
         if not raw.is_dir():
             for side in ("train", "test"):
                 _copy_every(whole / side, raw / side, every)
-        return raw, _judge(raw, exact_poses(whole / "truth" / "cameras.json"))
+        return raw, _comparison(raw, exact_poses(whole / "truth" / "cameras.json"))
     source = args.data / name
     source = source / "images" if (source / "images").is_dir() else source
     photos = args.out / "photos" / f"{name}{thin}"
@@ -222,13 +227,13 @@ def capture_of(
     if gps.is_file():
         stems = {photo.stem for photo in _photos(raw)}
         known = {k: v for k, v in json.loads(gps.read_text(encoding="utf-8")).items() if k in stems}
-        return raw, lambda found: compare_gps(found, known)
+        return raw, lambda estimated: compare_gps(estimated, known)
     truth = args.out / "truth" / name
     careful = ("--sfm", "thorough", "--max-features", 8000, "--factor", 4)
     problem = "" if truth.is_dir() else aw("build-scene", source, "-o", truth, *careful)
     if problem:
         raise AwError(problem)
-    return raw, _judge(raw, model_poses(truth / "sparse" / "0"))
+    return raw, _comparison(raw, model_poses(truth / "sparse" / "0"))
 
 
 def _photos(raw: Path) -> list[Path]:
@@ -243,9 +248,9 @@ def _copy_every(source: Path, target: Path, every: int) -> None:
         shutil.copyfile(photo, target / photo.name)
 
 
-def _judge(raw: Path, truth: Poses) -> Callable[[Poses], dict[str, Any]]:
+def _comparison(raw: Path, truth: Poses) -> Callable[[Poses], dict[str, Any]]:
     stems = {photo.stem for photo in _photos(raw)}
-    return lambda found: compare(found, {k: v for k, v in truth.items() if k in stems})
+    return lambda estimated: compare(estimated, {k: v for k, v in truth.items() if k in stems})
 
 
 def build(raw: Path, way: str, seed: int, args: argparse.Namespace) -> dict[str, Any]:
@@ -297,7 +302,7 @@ def _build_with_colmap(raw: Path, way: str, seed: int, out: Path) -> dict[str, A
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """A row a capture; of every way: placed rightly / placed, worst wrong angle, position, focal length."""
+    """A row a capture; of every way: right / registered poses, worst wrong angle, position, focal length."""
     ways = list(dict.fromkeys(row["way"] for row in rows))
     captures = list(dict.fromkeys(row["capture"] for row in rows))
     known = {(row["capture"], row["way"]): row for row in rows}
@@ -332,7 +337,7 @@ def _cell(row: dict[str, Any] | None) -> str:
         return "refused"
     text = f"{row['right']} of {row['judged']}"
     if row["wrong"]:
-        text += f"; {len(row['wrong'])} wrong, {max(turned for turned, _ in row['wrong'].values()):.1f}"
+        text += f"; {len(row['wrong'])} wrong, {max(angle for angle, _ in row['wrong'].values()):.1f}"
     if "position_m" in row:
         return f"{text}; {row['position_m']:.1f} m"
     if "position_percent" not in row:
@@ -373,10 +378,10 @@ def main(words: Sequence[str] | None = None) -> None:
                 if made is None:
                     print(f"{capture}: too few photos to paste on, left out")
                     break
-                raw, judge = made
+                raw, comparison = made
                 row = build(raw, way, seed, args)
                 model = row.pop("model", None)
-                row |= judge(model_poses(model) if model else {})
+                row |= comparison(model_poses(model) if model else {})
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 write_json(kept, {"capture": capture, "way": way, **row})
             if kept.is_file():

@@ -6,16 +6,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from ambiguous_wild.builder.growth import GrowthForecast
-from ambiguous_wild.builder.overlap_graph import Link, best_join, bridges, graph_of, lay_out, weakly_held
+from ambiguous_wild.builder.overlap_graph import (
+    GrowthForecast,
+    Link,
+    best_link_between,
+    bridges,
+    graph_of,
+    lay_out,
+    weakly_connected,
+)
+from ambiguous_wild.builder.records import MappingResult
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import ColmapModel
 
@@ -31,14 +39,14 @@ AGREE = 0.9  # length of the mean viewing direction from which on all cameras lo
 # Length of the mean up direction from which on up is determined. It is 0.34 to 0.67 for nadir strips flown
 # back and forth (seneca), 0.96 or more for photos taken by hand (monstree, sceaux, statue, reichstag).
 UPRIGHT = 0.7
-TALL = 0.3  # of the cameras' spread sideways: spread along up of a path that a view from above would hide
+TALL = 0.3  # of the cameras' extent sideways: extent along up of a path that a view from above would hide
 LEVEL = 0.3  # length of the mean up direction below which up is unknown; shorter headings are not drawn
-WIDEST = 1.5  # size of the map in sizes of the placed cameras' box: what is farther away is cut off
+WIDEST = 1.5  # size of the map in sizes of the registered cameras' box: what is farther away is cut off
 COMMON = 0.4  # length of the mean heading from which on it is up on the map
-ASIDE = 0.12  # of the map's size: distance of a photo without a position from its best partner
+ASIDE = 0.12  # of the map's size: distance of a photo without a position from the one that it matches most
 ROOM = 0.4  # of this distance: free room around such a photo
 
-Kind = Literal["train", "test", "part", "left out"]
+Kind = Literal["train", "test", "component", "left out"]
 
 
 @dataclass(frozen=True)
@@ -49,8 +57,8 @@ class MapPhoto:
     xy: tuple[float, float]  # x right, y up
     kind: Kind = "train"
     heading: tuple[float, float] | None = None  # viewing direction, at most unit length; None: unknown
-    provisional: bool = False  # placed with little evidence
-    weak: bool = False  # few partners
+    provisional: bool = False  # registered with little evidence
+    weak: bool = False  # few covisible photos
     unsure: bool = False  # the position is a guess
 
 
@@ -80,21 +88,21 @@ class CaptureMap:
 
 
 def map_of_model(
-    model: ColmapModel,  # named by work names
-    mapping: Mapping[str, Any],  # `MappingResult`; what it lacks is not drawn
-    sources: Mapping[str, str],  # work name -> path in the capture, in the order of capture
-    tests: Collection[str],  # work names
+    model: ColmapModel,
+    mapping: MappingResult,
+    sources: Mapping[str, str],  # name -> path in the capture, in the order of capture
+    tests: Collection[str],  # names
 ) -> CaptureMap:
     """Return the map of a built scene."""
-    placed = {image.name: image.cam_from_world() for image in model.images.values()}
-    names = [name for name in sources if name in placed]
-    poses = np.array([placed[name] for name in names]).reshape(-1, 4, 4)
+    registered = {image.name: image.cam_from_world() for image in model.images.values()}
+    names = [name for name in sources if name in registered]
+    poses = np.array([registered[name] for name in names]).reshape(-1, 4, 4)
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     plane = top_view(poses[:, :3, :3], centres, model.points.xyz)
     flat = centres @ plane.T
     size = longer_side(flat)
     shown = {name: printable(source) for name, source in sources.items()}
-    provisional = set(mapping.get("provisional", ()))
+    provisional = set(mapping["provisional"])
     photos = [
         MapPhoto(
             shown[name],
@@ -106,9 +114,9 @@ def map_of_model(
         for k, name in enumerate(names)
     ]
     at = {name: k for k, name in enumerate(names)}
-    links = _links(mapping.get("links", ()), at)
-    other_parts = [part for part in mapping.get("parts", ()) if not at.keys() & set(part)]
-    elsewhere = {name for part in other_parts for name in part}
+    links = _links(mapping["links"], at)
+    other_components = [component for component in mapping["components"] if not at.keys() & set(component)]
+    elsewhere = {name for component in other_components for name in component}
     left_out = {name: why for name, why in mapping["left_out"].items() if name in sources.keys() - elsewhere}
     order = {name: k for k, name in enumerate(sources)}
     up = -poses[:, 1, :3].mean(axis=0)
@@ -116,13 +124,13 @@ def map_of_model(
     direction = "seen in the viewing direction" if hidden else "seen from above"
     result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, {direction}", photos, [], [], [])
     result = _with_links(result, links)
-    for part in other_parts:
-        members = sorted(order[name] for name in part if name in order)
+    for component in other_components:
+        members = sorted(order[name] for name in component if name in order)
         if not members:
             continue
         every = list(sources)
-        loose = _links(mapping.get("unplaced_links", ()), order)
-        inside, outside = best_join([order[name] for name in names], members, loose)
+        loose = _links(mapping["unregistered_links"], order)
+        inside, outside = best_link_between([order[name] for name in names], members, loose)
         pair = (shown[every[inside]], shown[every[outside]])
         named = shortlist([shown[every[k]] for k in members], 3)
         result.listed.append(f"another part, {len(members)} photos: {named}")
@@ -139,17 +147,17 @@ def map_of_photos(
     sources: Sequence[str],  # in the order of capture
     links: Sequence[Link],
     growth: GrowthForecast,
-    gaps: Sequence[tuple[int, int]],  # of `joins`
+    gaps: Sequence[tuple[int, int]],  # of `component_gaps`
 ) -> CaptureMap:
     """Return the map of photos without poses: near each other if they overlap much."""
-    main = set(growth.parts[0]) if growth.parts else set()
-    in_part = {photo for part in growth.parts[1:] for photo in part}
+    main = set(growth.components[0]) if growth.components else set()
+    in_component = {photo for component in growth.components[1:] for photo in component}
     xy = lay_out(len(sources), links)
     photos = [
         MapPhoto(
             printable(source),
             as_pair(xy[k]),
-            "train" if k in main else "part" if k in in_part else "left out",
+            "train" if k in main else "component" if k in in_component else "left out",
         )
         for k, source in enumerate(sources)
     ]
@@ -169,26 +177,27 @@ def map_of_photos(
         stars=list(dict.fromkeys([*(_middle(photos[a], photos[b]) for a, b in gaps), *result.stars])),
         advice=list(dict.fromkeys([*(_between(photos[a], photos[b]) for a, b in gaps), *result.advice])),
         listed=[
-            f"another part, {len(part)} photos: {shortlist([photos[k].name for k in part], 3)}"
-            for part in growth.parts[1:]
+            f"another part, {len(component)} photos: {shortlist([photos[k].name for k in component], 3)}"
+            for component in growth.components[1:]
         ]
         + ([f"of no part: {shortlist([photos[k].name for k in growth.others])}"] if growth.others else []),
         labels=short_labels([photo.name for photo in photos]),
     )
 
 
-def joins(growth: GrowthForecast, links: Sequence[Link]) -> list[tuple[int, int]]:
-    """Return pairs of photos between which more photos are needed, so that all parts join the first."""
-    if not growth.parts:
+def component_gaps(growth: GrowthForecast, links: Sequence[Link]) -> list[tuple[int, int]]:
+    """Return pairs of photos between which more photos are needed, so that all components become one."""
+    if not growth.components:
         return []
-    inside, pairs = set(growth.parts[0]), []
-    part_of = {photo: part for part in (*growth.parts[1:], *([k] for k in growth.others)) for photo in part}
-    while part_of:
-        pair = best_join(inside, part_of.keys(), links)
+    inside, pairs = set(growth.components[0]), []
+    others = (*growth.components[1:], *([k] for k in growth.others))
+    component_of = {photo: component for component in others for photo in component}
+    while component_of:
+        pair = best_link_between(inside, component_of.keys(), links)
         pairs.append(pair)
-        for photo in part_of[pair[1]].copy():
+        for photo in component_of[pair[1]].copy():
             inside.add(photo)
-            del part_of[photo]
+            del component_of[photo]
     return pairs
 
 
@@ -245,12 +254,12 @@ def top_view(
     cameras (`_nadir_axis`). Up on the map is where most photos look, else up in the photos; if both are
     unknown, the longest axis of the path is horizontal and the first photo on the left.
     """
-    spread = centres - centres.mean(axis=0)
-    axes = np.linalg.svd(spread, full_matrices=False)[2] if len(centres) > 2 else np.eye(3)
-    sizes = np.sqrt(((spread @ axes.T) ** 2).mean(axis=0))
+    centred = centres - centres.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2] if len(centres) > 2 else np.eye(3)
+    sizes = np.sqrt(((centred @ axes.T) ** 2).mean(axis=0))
     view, up = rotations[:, 2].mean(axis=0), -rotations[:, 1].mean(axis=0)
     flat = bool(sizes[1] > WIDE * sizes[0] and sizes[2] < THIN * sizes[1])
-    nadir = _nadir_axis(spread, view, up, axes[2] if flat else None, points)
+    nadir = _nadir_axis(centred, view, up, axes[2] if flat else None, points)
     if nadir is not None:
         normal = -nadir * np.sign(view @ nadir)
     elif np.linalg.norm(up) > LEVEL:
@@ -263,14 +272,14 @@ def top_view(
     if np.linalg.norm(ahead) > COMMON:
         ahead /= np.linalg.norm(ahead)
         return np.stack([np.cross(ahead, normal), ahead])
-    longest = np.linalg.svd(spread - np.outer(spread @ normal, normal), full_matrices=False)[2][0]
+    longest = np.linalg.svd(centred - np.outer(centred @ normal, normal), full_matrices=False)[2][0]
     right = longest - (longest @ normal) * normal
     right /= max(float(np.linalg.norm(right)), 1e-12)
-    return np.stack([right, np.cross(normal, right)]) * (-1 if spread[0] @ right > 0 else 1)
+    return np.stack([right, np.cross(normal, right)]) * (-1 if centred[0] @ right > 0 else 1)
 
 
 def _nadir_axis(
-    spread: np.ndarray,  # [N, 3] centres less their mean
+    centred: np.ndarray,  # [N, 3] centres less their mean
     view: np.ndarray,  # [3] mean viewing direction
     up: np.ndarray,  # [3] mean up direction
     cameras_axis: np.ndarray | None,  # [3] normal of the plane in which the cameras lie
@@ -295,7 +304,7 @@ def _nadir_axis(
     upwards = up - (up @ axis) * axis
     upwards /= max(float(np.linalg.norm(upwards)), 1e-12)
     directions = np.array([upwards, np.cross(axis, upwards), axis])
-    tall, wide, deep = np.sqrt(((spread @ directions.T) ** 2).mean(axis=0))
+    tall, wide, deep = np.sqrt(((centred @ directions.T) ** 2).mean(axis=0))
     return axis if tall > TALL * wide and deep < THIN * tall else None
 
 
@@ -312,7 +321,7 @@ def _thin_axis(
     return np.asarray(axes[:, 0]) if sizes[0] < THIN * sizes[1] and sizes[1] > WIDE * sizes[2] else None
 
 
-def _links(rows: Sequence[Sequence[Any]], at: Mapping[str, int]) -> list[Link]:
+def _links(rows: Iterable[tuple[str, str, int]], at: Mapping[str, int]) -> list[Link]:
     """Return links between known photos by index."""
     known = [(at[a], at[b], int(m)) for a, b, m in rows if a in at and b in at]
     return [(*_sorted((a, b)), m) for a, b, m in known]
@@ -322,7 +331,7 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
     """Add the strongest links of each photo and all weak ones, with advice for these."""
     photos = drawn.photos
     kept = [k for k, photo in enumerate(photos) if photo.kind in ("train", "test")]
-    weak_photos = set(weakly_held(kept, links)) if links else set()
+    weak_photos = set(weakly_connected(kept, links)) if links else set()
     weak = bridges(graph_of(len(photos), links))
     strongest: set[tuple[int, int]] = set()
     of: list[list[Link]] = [[] for _ in photos]
@@ -331,7 +340,7 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
             if len(of[end]) < STRONGEST:
                 strongest.add(link[:2])
             of[end].append(link)
-    # A photo with few partners needs one of its links strengthened: the strongest, where overlap is proven.
+    # A photo with few covisible ones needs a stronger link: the strongest, where overlap is proven.
     wanted = weak | {of[k][0][:2] for k in weak_photos if of[k]}
     shown = [
         MapLink((a, b), matches, "weak" if (a, b) in wanted else "strong")
@@ -350,42 +359,41 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
 
 def _with_left_out(
     drawn: CaptureMap,
-    left_out: Mapping[str, str],  # work name -> reason
-    mapping: Mapping[str, Any],
-    shown: Mapping[str, str],  # work name -> name on the map
-    at: Mapping[str, int],  # work name of a placed photo -> its index
+    left_out: Mapping[str, str],  # name -> reason
+    mapping: MappingResult,
+    shown: Mapping[str, str],  # name -> name on the map
+    at: Mapping[str, int],  # name of a registered photo -> its index
     plane: np.ndarray,  # [2, 3]
     size: float,
 ) -> CaptureMap:
-    """Add the photos left out: at their hypothesis, else beside the placed photo that they match most."""
+    """Add the photos left out: at their hypothesis, else beside the registered photo that they match most."""
     photos, links, stars = list(drawn.photos), list(drawn.links), list(drawn.stars)
-    wanted: dict[str, list[str]] = {}  # placed photo -> photos left out that match it most
+    wanted: dict[str, list[str]] = {}  # registered photo -> photos left out that match it most
     reasons: dict[str, list[str]] = {}
     best: dict[str, tuple[int, str]] = {}
-    for a, b, matches in mapping.get("unplaced_links", ()):
-        for lost, partner in ((a, b), (b, a)):
-            if lost in left_out and partner in at and matches > best.get(lost, (0, ""))[0]:
-                best[lost] = int(matches), partner
-    hypotheses = mapping.get("hypotheses", {})
-    middle = np.median([photo.xy for photo in drawn.photos], axis=0)
+    for a, b, matches in mapping["unregistered_links"]:
+        for lost, covisible in ((a, b), (b, a)):
+            if lost in left_out and covisible in at and matches > best.get(lost, (0, ""))[0]:
+                best[lost] = int(matches), covisible
+        middle = np.median([photo.xy for photo in drawn.photos], axis=0)
     low, high = frame_limits(np.array([photo.xy for photo in drawn.photos]))
-    likely = {name: plane @ np.array(xyz, float) for name, xyz in hypotheses.items()}
-    # A hypothesis far from all placed photos is wrong more often than not.
+    likely = {name: plane @ np.array(xyz, float) for name, xyz in mapping["hypotheses"].items()}
+    # A hypothesis far from all registered photos is wrong more often than not.
     likely = {name: xy for name, xy in likely.items() if (low <= xy).all() and (xy <= high).all()}
     for name, reason in left_out.items():
-        matches, partner = best.get(name, (0, ""))
+        matches, covisible = best.get(name, (0, ""))
         if name in likely:
             xy = likely[name]
-        elif partner:
-            xy = _beside(np.array(drawn.photos[at[partner]].xy), middle, ASIDE * size, photos)
+        elif covisible:
+            xy = _beside(np.array(drawn.photos[at[covisible]].xy), middle, ASIDE * size, photos)
         reasons.setdefault(reason, []).append(shown[name])
-        if name not in likely and not partner:
+        if name not in likely and not covisible:
             continue
         photos.append(MapPhoto(shown[name], as_pair(xy), "left out", unsure=name not in likely))
-        if partner:
-            links.append(MapLink((at[partner], len(photos) - 1), matches, "left out"))
-            stars.append(_middle(photos[at[partner]], photos[-1]))
-            wanted.setdefault(shown[partner], []).append(shown[name])
+        if covisible:
+            links.append(MapLink((at[covisible], len(photos) - 1), matches, "left out"))
+            stars.append(_middle(photos[at[covisible]], photos[-1]))
+            wanted.setdefault(shown[covisible], []).append(shown[name])
     return replace(
         drawn,
         photos=photos,
@@ -397,7 +405,7 @@ def _with_left_out(
 
 
 def frame_limits(
-    xy: np.ndarray,  # [N, 2] positions of the placed cameras
+    xy: np.ndarray,  # [N, 2] positions of the registered cameras
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower left and the upper right corner of what the map may show."""
     reach = (WIDEST - 1) / 2 * longer_side(xy)
@@ -405,16 +413,16 @@ def frame_limits(
 
 
 def _beside(
-    partner: np.ndarray,  # [2]
+    covisible: np.ndarray,  # [2]
     middle: np.ndarray,  # [2] of the map
     distance: float,
     photos: Sequence[MapPhoto],
 ) -> np.ndarray:
     """Return a free position at a distance from a photo, away from the middle of the map if possible."""
-    away = partner - middle
+    away = covisible - middle
     turns = np.array([0.5 * (k // 2) * (-1) ** k for k in range(1, 12)])
     angles = np.arctan2(away[1], away[0]) + turns
-    places = partner + distance * np.column_stack([np.cos(angles), np.sin(angles)])
+    places = covisible + distance * np.column_stack([np.cos(angles), np.sin(angles)])
     taken = np.array([photo.xy for photo in photos])
     room = np.linalg.norm(places[:, None] - taken[None], axis=2).min(axis=1)
     free = np.flatnonzero(room > ROOM * distance)

@@ -85,7 +85,7 @@ def photos_from(
     several = len(groups) + len(videos) > 1
     taken_names = {"images", "train", "test", *NO_PHOTOS}  # `collect` gives these names a meaning
 
-    def place(name: str) -> str:
+    def folder_name(name: str) -> str:
         """Return an unused name of a folder for a source; "" for a single source."""
         number, free = 2, clean_stem(name)
         while free.casefold() in taken_names:
@@ -93,14 +93,14 @@ def photos_from(
         taken_names.add(free.casefold())
         return free if several else ""
 
-    places = {k: place(k or folders[0].resolve().name) for k in groups}
+    folder_names = {k: folder_name(k or folders[0].resolve().name) for k in groups}
     photos: list[CapturedPhoto] = []
     left: list[LeftOut] = []
     records: list[FrameCounts] = []
     with atomic_dir(out, replace=False) as folder:
         if capture is not None:
-            photos, left = _copy(capture, places, folder, bar)
-            stems = {PurePosixPath(s.relative).stem.casefold() for s in capture.sources}
+            photos, left = _copy(capture, folder_names, folder, bar)
+            stems = {PurePosixPath(s.source).stem.casefold() for s in capture.sources}
             left += [
                 {"source": str(name), "why": "a video beside photos: give it as a source"}
                 for name in map(PurePosixPath, capture.ignored)
@@ -108,7 +108,7 @@ def photos_from(
             ]
         side = "train" if capture and capture.has_sides else ""
         for video in videos:
-            prefix = "".join(f"{part}/" for part in (side, place(video.stem)) if part and several)
+            prefix = "".join(f"{part}/" for part in (side, folder_name(video.stem)) if part and several)
             taken, counts = _frames_of(video, folder / prefix, frames, bar)
             for photo in taken if several else ():
                 photo["photo"], photo["source"] = prefix + photo["photo"], video.name
@@ -123,32 +123,31 @@ def photos_from(
 
 
 def _copy(
-    capture: Capture, places: dict[str, str], folder: Path, bar: Bar
+    capture: Capture, folder_names: dict[str, str], folder: Path, bar: Bar
 ) -> tuple[list[CapturedPhoto], list[LeftOut]]:
     """Copy each photo byte for byte, once, to the target of its folder."""
     sources, copies = without_copies(capture)
     left: list[LeftOut] = [{"source": c, "why": f"the same file as {kept}"} for c, kept in copies.items()]
     photos: list[CapturedPhoto] = []
     bar.start("photos", len(sources))
-    for source in sources:
+    for listed in sources:
         bar.step()
         try:
-            _, pixels = read_photo(source.path)
+            _, pixels = read_photo(listed.path)
         except UnreadablePhoto as error:
-            left.append({"source": source.relative, "why": error.reason})
+            left.append({"source": listed.source, "why": error.reason})
             continue
-        side = source.side or ("train" if capture.has_sides else "")
+        side = listed.side or ("train" if capture.has_sides else "")
         # The stem need not start with the folder's name, as the copy lies in a folder of that name.
-        name = source.work_name.removeprefix(f"{source.folder}_" if source.folder else "")
-        target = folder / side / places[source.folder] / name
+        full_name = listed.stem + listed.path.suffix.lower()
+        name = full_name.removeprefix(f"{listed.folder}_" if listed.folder else "")
+        target = folder / side / folder_names[listed.folder] / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():  # `train_a.jpg` beside train/a.jpg, for example
-            target = target.with_name(source.work_name)
-        shutil.copyfile(source.path, target)
+            target = target.with_name(full_name)
+        shutil.copyfile(listed.path, target)
         relative = target.relative_to(folder).as_posix()
-        photos.append(
-            {"photo": relative, "source": source.relative, "sharpness": round(sharpness(pixels), 1)}
-        )
+        photos.append({"photo": relative, "source": listed.source, "sharpness": round(sharpness(pixels), 1)})
     bar.finish()
     return photos, left
 
@@ -163,11 +162,11 @@ def _frames_of(video: Path, folder: Path, frames: int, bar: Bar) -> tuple[list[C
         )
     times, announced = _times(video, bar)
     total = len(times)
-    parts = stretches(times, frames)
-    expected = len(set(np.searchsorted(parts, times, side="right")))
+    limits = stretches(times, frames)
+    expected = len(set(np.searchsorted(limits, times, side="right")))
     bar.start("frames", total)
     folder.mkdir(parents=True, exist_ok=True)
-    photos = _write(sharpest(_read(video, times, bar), parts), folder)
+    photos = _write(sharpest(_read(video, times, bar), limits), folder)
     bar.finish()
     if len(photos) < expected:
         raise AwError(
@@ -242,9 +241,9 @@ def photos_from_camera(
         step = max(round(fps * every_s), 1)
         bar.start("frames", frames * step)
         with atomic_dir(out, replace=False) as folder:
-            parts = [k * step / fps for k in range(frames + 1)]
+            limits = [k * step / fps for k in range(frames + 1)]
             taken = (i / fps for i in range(frames * step))
-            photos = _write(sharpest(_frames(reader, taken, bar), parts), folder)
+            photos = _write(sharpest(_frames(reader, taken, bar), limits), folder)
             bar.finish()
             if len(photos) < frames:
                 raise AwError(
@@ -257,7 +256,7 @@ def photos_from_camera(
 
 def sharpest(
     frames: Iterator[tuple[int, float, np.ndarray]],  # index, seconds, BGR
-    parts: Sequence[float],  # seconds: where each part begins, and the end
+    limits: Sequence[float],  # seconds: where each part begins, and the end
 ) -> Iterator[VideoFrame]:
     """Yield the sharpest frame in the middle half of each part, the first of equally sharp ones.
 
@@ -266,11 +265,11 @@ def sharpest(
     best: VideoFrame | None = None
     k = 0
     for index, time_s, pixels in frames:
-        while k + 1 < len(parts) - 1 and time_s >= parts[k + 1]:
+        while k + 1 < len(limits) - 1 and time_s >= limits[k + 1]:
             if best is not None:
                 yield best
             best, k = None, k + 1
-        first, last = parts[k], parts[k + 1]
+        first, last = limits[k], limits[k + 1]
         quarter = (last - first) / 4
         if best is not None and not first + quarter <= time_s < last - quarter:
             continue

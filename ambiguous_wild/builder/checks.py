@@ -16,24 +16,24 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.capture_map import CaptureMap, joins, map_of_photos
+from ambiguous_wild.builder.capture_map import CaptureMap, component_gaps, map_of_photos
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.fixed_to_camera import words_of
-from ambiguous_wild.builder.growth import GrowthForecast, predict_growth
-from ambiguous_wild.builder.overlap_graph import Link
+from ambiguous_wild.builder.overlap_graph import GrowthForecast, Link, predict_growth
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
     compare_photos,
     photo_features,
 )
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.records import CheckedPhoto, SkippedPhoto
+from ambiguous_wild.builder.records import ScreenedPhoto, SkippedPhoto
 from ambiguous_wild.builder.screen import (
     BLUR_RATIO,
-    NEAR_DUPLICATE,
     exposure_stops,
+    near_duplicate_pairs,
     panorama_warnings,
     read_capture,
+    zoomed_cameras,
 )
 from ambiguous_wild.core.errors import AwError, shortlist
 
@@ -42,7 +42,6 @@ EXIF_STOPS = 0.5  # stops between the darkest and the lightest setting
 PIXEL_STOPS = 0.7  # stops between the 5th and 95th percentile photo, on the same surfaces
 PIXEL_BALANCE = 0.4  # log2 of red or blue over green, the same percentiles: 32 %
 ISO_RATIO = 2.0  # one stop
-FOCAL_RATIO = 1.01
 SOFT = -0.8  # log2 of fine detail on the same surfaces: a photo below it is softer than the others
 FOCUS_SPREAD = 1.2  # log2, the same percentiles
 # Share of the overlapping pairs that differ by motion along the line of sight: 0.9 in a walk down a street,
@@ -63,31 +62,32 @@ class CaptureCheck:
 
 
 def run_checks(
-    facts: Sequence[CheckedPhoto],
+    photos: Sequence[ScreenedPhoto],
+    noises: Sequence[float],  # see `noise`
     thumbnails: np.ndarray,  # [N, 1024], see `screen.thumbnail`
     compared: PhotoComparison,
     growth: GrowthForecast,
-    gaps: Sequence[tuple[int, int]],  # of `joins`
+    gaps: Sequence[tuple[int, int]],  # of `component_gaps`
 ) -> list[CaptureCheck]:
     """Run all checks, in the order of the table."""
     return [
-        exposure(facts, compared),
-        white_balance(facts, compared),
-        iso(facts),
-        focus(facts, compared),
-        focal_length(facts),
-        blur(facts, compared),
-        near_duplicates(facts, thumbnails),
-        overlap(facts, compared, growth, gaps),
+        exposure(photos, compared),
+        white_balance(photos, compared),
+        iso(photos, noises),
+        focus(photos, compared),
+        focal_length(photos),
+        blur(photos, compared),
+        near_duplicates(photos, thumbnails),
+        overlap(photos, compared, growth, gaps),
         motion(compared),
         fixed_to_camera(compared),
     ]
 
 
-def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
+def exposure(photos: Sequence[ScreenedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Compare exposure settings in stops, and the brightness of the same surfaces."""
     advice = "lock exposure (hold the finger on the screen: AE/AF lock), or train with an appearance model"
-    stops = [exposure_stops(f["exif"]) for f in facts]
+    stops = [exposure_stops(photo.exif) for photo in photos]
     spread = _spread(compared, 0)
     if all(s is not None for s in stops):
         span = max(s for s in stops if s is not None) - min(s for s in stops if s is not None)
@@ -102,16 +102,16 @@ def exposure(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> Captur
         return _row("exposure", "EXIF and pixels", spread > PIXEL_STOPS, finding, advice)
     if spread is None:
         return CaptureCheck(
-            "exposure", "unknown", _silent(facts, stops), "no two photos share enough surface to measure it"
+            "exposure", "unknown", _silent(photos, stops), "no two photos share enough surface to measure it"
         )
     finding = f"the same surfaces differ by {spread:.1f} stops"
     return _row("exposure", _basis(stops), spread > PIXEL_STOPS, finding, advice)
 
 
-def white_balance(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
+def white_balance(photos: Sequence[ScreenedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Check that white balance is locked: by EXIF if manual in every photo, else on the same surfaces."""
     advice = "lock white balance (manual, or a fixed preset), or train with an appearance model"
-    modes = [f["exif"].get("white_balance") for f in facts]
+    modes = [photo.exif.get("white_balance") for photo in photos]
     if all(m == 1 for m in modes):
         return CaptureCheck("white balance", "ok", "EXIF", "manual in every photo")
     source = "EXIF: automatic" if any(m == 0 for m in modes) else "EXIF silent"
@@ -125,10 +125,13 @@ def white_balance(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> C
     return _row("white balance", f"pixels ({source})", max(red, blue) > PIXEL_BALANCE, finding, advice)
 
 
-def iso(facts: Sequence[CheckedPhoto]) -> CaptureCheck:
+def iso(
+    photos: Sequence[ScreenedPhoto],
+    noises: Sequence[float],  # see `noise`
+) -> CaptureCheck:
     """Compare ISO by EXIF; without EXIF report the noise of flat areas."""
     advice = "fix ISO (pro mode), as low as the light allows"
-    values = [f["exif"].get("iso") for f in facts]
+    values = [photo.exif.get("iso") for photo in photos]
     recorded = [v for v in values if v is not None]
     if len(recorded) == len(values):
         finding = (
@@ -137,18 +140,17 @@ def iso(facts: Sequence[CheckedPhoto]) -> CaptureCheck:
             else f"{recorded[0]:.0f} throughout"
         )
         return _row("ISO", "EXIF", max(recorded) > ISO_RATIO * min(recorded), finding, advice)
-    noise = np.array([f["noise"] for f in facts])
-    if not np.isfinite(noise).any() or np.nanmedian(noise) <= 0:
+    if not np.isfinite(noises).any() or np.nanmedian(noises) <= 0:
         return CaptureCheck(
-            "ISO", "unknown", _silent(facts, values), "no flat areas in which to measure noise"
+            "ISO", "unknown", _silent(photos, values), "no flat areas in which to measure noise"
         )
-    low, high = np.nanpercentile(noise, [5, 95])
+    low, high = np.nanpercentile(noises, [5, 95])
     finding = f"not recorded; noise of flat areas {low:.1f} to {high:.1f} of 255"
     # Texture and compression look like noise, so this is not certain enough for a warning.
     return CaptureCheck("ISO", "unknown", "pixels (EXIF silent)", finding, "")
 
 
-def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
+def focus(photos: Sequence[ScreenedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Compare fine detail of the same surfaces across photos; EXIF does not record the focus."""
     spread = _spread(compared, 3)
     if spread is None:
@@ -159,40 +161,39 @@ def focus(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCh
     )
 
 
-def focal_length(facts: Sequence[CheckedPhoto]) -> CaptureCheck:
+def focal_length(photos: Sequence[ScreenedPhoto]) -> CaptureCheck:
     """Check for one focal length per camera and one picture size, as a single-camera model assumes."""
-    if wide := panorama_warnings(facts):
+    if wide := panorama_warnings(photos):
         return CaptureCheck("focal length", "warning", "picture size", wide[0])
     advice = "do not zoom; or build with --camera per-image"
-    spans = []
-    for camera in sorted({f["camera"] or "" for f in facts}):
-        values = [
-            f["exif"]["focal_mm"] for f in facts if (f["camera"] or "") == camera and "focal_mm" in f["exif"]
-        ]
-        if values and max(values) > FOCAL_RATIO * min(values):
-            spans.append(f"{camera or 'camera'}: {min(values):.1f} to {max(values):.1f} mm")
+    spans = [
+        f"{camera or 'camera'}: {shortest:.1f} to {longest:.1f} mm"
+        for camera, (shortest, longest) in zoomed_cameras(photos).items()
+    ]
     if spans:
         return CaptureCheck("focal length", "warning", "EXIF", shortlist(spans, 3), advice)
-    silent = [f["source"] for f in facts if "focal_mm" not in f["exif"]]
-    sizes = len({(f["width"], f["height"]) for f in facts})
-    cameras = len({f["camera"] for f in facts if f["camera"]})
+    silent = [photo.source for photo in photos if "focal_mm" not in photo.exif]
+    sizes = len({photo.size for photo in photos})
+    cameras = len({photo.camera for photo in photos if photo.camera})
     several = f"; {sizes} picture sizes" if sizes > 1 else ""
     if silent:
         state: State = "warning" if sizes > 2 else "unknown"
-        what = f"not recorded in {len(silent)} of {len(facts)} photos{several}"
+        what = f"not recorded in {len(silent)} of {len(photos)} photos{several}"
         return CaptureCheck(
             "focal length", state, "EXIF silent", what, "build with --camera per-image" if sizes > 2 else ""
         )
     return CaptureCheck("focal length", "ok", "EXIF", f"one per camera ({cameras or 1}){several}")
 
 
-def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureCheck:
+def blur(photos: Sequence[ScreenedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Find photos much softer than the median, or softer than others on the same surfaces."""
-    sharp = np.array([f["blur"] for f in facts])
+    sharp = np.array([photo.blur for photo in photos])
     soft = sharp < BLUR_RATIO * np.median(sharp)
     soft |= np.nan_to_num(compared.offsets[:, 3], nan=0.0) < SOFT
-    names = tuple(f["source"] for f, s in zip(facts, soft) if s)
-    finding = f"{len(names)} of {len(facts)} photos are soft: {shortlist(names, 3)}" if names else "all sharp"
+    names = tuple(photo.source for photo, s in zip(photos, soft) if s)
+    finding = (
+        f"{len(names)} of {len(photos)} photos are soft: {shortlist(names, 3)}" if names else "all sharp"
+    )
     return _row(
         "blur",
         "pixels",
@@ -203,10 +204,9 @@ def blur(facts: Sequence[CheckedPhoto], compared: PhotoComparison) -> CaptureChe
     )
 
 
-def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> CaptureCheck:
+def near_duplicates(photos: Sequence[ScreenedPhoto], thumbnails: np.ndarray) -> CaptureCheck:
     """Find pairs of photos that are nearly the same picture."""
-    close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
-    pairs = [(facts[i]["source"], facts[j]["source"]) for i, j in np.argwhere(close)]
+    pairs = [(photos[i].source, photos[j].source) for i, j in near_duplicate_pairs(thumbnails)]
     names = tuple(b for _, b in pairs)
     listed = shortlist([f"{a} = {b}" for a, b in pairs], 2)
     finding = f"{len(pairs)} pairs: {listed}" if pairs else "none"
@@ -221,25 +221,25 @@ def near_duplicates(facts: Sequence[CheckedPhoto], thumbnails: np.ndarray) -> Ca
 
 
 def overlap(
-    facts: Sequence[CheckedPhoto],
+    photos: Sequence[ScreenedPhoto],
     compared: PhotoComparison,
     growth: GrowthForecast,
-    gaps: Sequence[tuple[int, int]],  # of `joins`
+    gaps: Sequence[tuple[int, int]],  # of `component_gaps`
 ) -> CaptureCheck:
     """Predict how many photos will be placed, and name those that share too little with the others."""
-    names, count = [f["source"] for f in facts], len(facts)
-    if not growth.parts:
+    names, count = [photo.source for photo in photos], len(photos)
+    if not growth.components:
         finding = "no three photos share enough features: none will be placed"
         advice = "take more photos, each sharing two thirds of the picture with the next"
         return CaptureCheck("overlap", "warning", "pixels", finding, advice, tuple(names))
-    main = growth.parts[0]
+    main = growth.components[0]
     if len(main) == count:
-        median = float(np.median(compared.partners))
+        median = float(np.median(compared.covisible))
         finding = f"each overlaps with {median:.0f} others (median); all {count} photos will be placed"
         return CaptureCheck("overlap", "ok", "pixels", finding)
     finding = f"about {len(main)} of {count} photos will be placed"
-    if len(growth.parts) > 1:
-        finding += f"; parts: {', '.join(str(len(part)) for part in growth.parts)}"
+    if len(growth.components) > 1:
+        finding += f"; parts: {', '.join(str(len(component)) for component in growth.components)}"
     if growth.others:
         finding += "; the others share too few features with two photos at once: "
         finding += shortlist([names[k] for k in growth.others], 3)
@@ -293,8 +293,8 @@ def _basis(values: Sequence[Any]) -> str:
     return "pixels (EXIF silent)" if missing == len(values) else f"pixels (EXIF silent in {missing} photos)"
 
 
-def _silent(facts: Sequence[CheckedPhoto], values: Sequence[Any]) -> str:
-    return f"EXIF silent in {sum(v is None for v in values)} of {len(facts)} photos"
+def _silent(photos: Sequence[ScreenedPhoto], values: Sequence[Any]) -> str:
+    return f"EXIF silent in {sum(v is None for v in values)} of {len(photos)} photos"
 
 
 @dataclass(frozen=True)
@@ -339,18 +339,16 @@ def check_capture(
         jobs=jobs,
         bar=bar,
     )
-    facts: list[CheckedPhoto] = [
-        {**record, "noise": level} for record, (level, _) in zip(read.photos, read.more)
-    ]
+    photos, noises = read.photos, [level for level, _ in read.more]
     features = [found for _, found in read.more]
     compared = compare_photos(features, bar, jobs)
-    growth = predict_growth(len(facts), compared.matches)
-    gaps = joins(growth, compared.links)
-    checks = run_checks(facts, read.thumbnails, compared, growth, gaps)
+    growth = predict_growth(len(photos), compared.matches)
+    gaps = component_gaps(growth, compared.links)
+    checks = run_checks(photos, noises, read.thumbnails, compared, growth, gaps)
     if read.skipped:
         checks.insert(0, _files_check(read.skipped, len(capture.sources)))
-    names = [f["source"] for f in facts]
-    return CaptureReport(capture.root, len(facts), read.skipped, checks, names, compared.links, growth, gaps)
+    names = [photo.source for photo in photos]
+    return CaptureReport(capture.root, len(photos), read.skipped, checks, names, compared.links, growth, gaps)
 
 
 def _files_check(skipped: list[SkippedPhoto], total: int) -> CaptureCheck:

@@ -1,11 +1,7 @@
-"""First stage: list the photos of a capture and name them; find the truth of a simulated capture.
-
-Once photos are placed, they are split here into training and test photos.
-"""
+"""First stage: list the photos of a capture and name them; find the truth of a simulated capture."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import os
 import re
@@ -14,14 +10,12 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
-from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
-from ambiguous_wild.io.scene_folder import TEST_EVERY, read_list
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
 Side = Literal["train", "test"] | None
@@ -35,16 +29,16 @@ class PhotoSource:
     """One photo of the capture and the name it has in the scene."""
 
     path: Path  # absolute
-    relative: str  # path relative to the capture folder
+    source: str  # path relative to the capture folder
     stem: str  # unique in the scene; its files are <stem>.png
     side: Side  # from the sub-folder, if the capture has them
     sha256: str
     folder: str = ""  # unique name of its folder if there are several; the stem starts with it
 
     @property
-    def work_name(self) -> str:
-        """File name that COLMAP sees."""
-        return self.stem + self.path.suffix.lower()
+    def name(self) -> str:
+        """Name of its files in every stage, whatever their format, and in the scene."""
+        return f"{self.stem}.png"
 
 
 @dataclass(frozen=True)
@@ -52,7 +46,7 @@ class Capture:
     """The user's folders of photos; they are not changed."""
 
     root: Path  # the folder, or the parent of several folders
-    sources: tuple[PhotoSource, ...]  # natural order of their relative names
+    sources: tuple[PhotoSource, ...]  # natural order of their paths
     has_sides: bool  # the photos are in train/ and test/
     truth: Path | None  # truth/ of a simulated capture
     ignored: tuple[str, ...]  # names of other files
@@ -137,7 +131,7 @@ def identical(capture: Capture) -> list[list[str]]:
     """Return the groups of photos with the same bytes."""
     groups: dict[str, list[str]] = {}
     for source in capture.sources:
-        groups.setdefault(source.sha256, []).append(source.relative)
+        groups.setdefault(source.sha256, []).append(source.source)
     return [names for names in groups.values() if len(names) > 1]
 
 
@@ -258,98 +252,3 @@ def clean_stem(stem: str) -> str:
         return text
     digest = hashlib.sha256(data).hexdigest()[:8]
     return data[: _MAX_STEM_BYTES - 9].decode("utf-8", errors="ignore") + "_" + digest
-
-
-def split_photos(
-    facts: list[ScreenedPhoto], registered: set[str], test_stems: set[str] | None
-) -> tuple[list[str], list[str], str, list[str]]:
-    """Split the placed photos into training and test photos.
-
-    Args:
-        facts: screened photos.
-        registered: stems in the model.
-        test_stems: from the user's test list, or None.
-
-    Returns:
-        (train, test, "list" or "folders" or "every-8", warnings); names are ``<stem>.png``, sorted.
-
-    Raises:
-        AwError: fewer than two training photos, or a test set without a placed photo.
-    """
-    inside = sorted(f["stem"] for f in facts if f["stem"] in registered)
-    warnings = []
-    if test_stems is not None:
-        how, test = "list", [s for s in inside if s in test_stems]
-        wanted = len(test_stems)
-    elif any(f["side"] for f in facts):
-        sides = {f["stem"]: f["side"] for f in facts}
-        how, test = "folders", [s for s in inside if sides[s] == "test"]
-        wanted = sum(f["side"] == "test" for f in facts)
-    else:
-        how, test = f"every-{TEST_EVERY}", inside[::TEST_EVERY]
-        wanted = len(test)
-        warnings.append(
-            f"no test set given, so every {TEST_EVERY}th photo is a test photo: distractors in it count "
-            "as truth in the scores; give clean photos in test/, or --test-list FILE"
-        )
-    train = sorted(set(inside) - set(test))
-    if wanted and not test:
-        raise AwError(
-            f"none of the {wanted} test photos could be placed among the training photos: they show "
-            "another place or too little overlap; take them nearer to the training views"
-        )
-    if len(train) < 2:
-        raise AwError(f"only {len(train)} training photos could be placed; a scene needs at least 2")
-    if len(test) < wanted:
-        warnings.append(f"{wanted - len(test)} of {wanted} test photos are lost: scores cover {len(test)}")
-    return [f"{s}.png" for s in train], [f"{s}.png" for s in test], how, warnings
-
-
-def read_test_list(path: Path, facts: list[ScreenedPhoto]) -> set[str]:
-    """Return the stems of the photos in a test list.
-
-    The list names photos by path, by file name or without extension.
-
-    Raises:
-        AwError: the file cannot be read or is empty, names an unknown photo, or names all photos.
-    """
-    try:
-        names = read_list(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise AwError(f"cannot read the test list {path}: {error}") from error
-    stem_of: dict[str, str] = {}
-    stems_by_ending: dict[str, set[str]] = {}
-    for fact in facts:
-        source = PurePosixPath(fact["source"])
-        for key in (str(source), fact["stem"], fact["stem"] + ".png", *fact.get("copies", ())):
-            stem_of.setdefault(key, fact["stem"])
-        for i in range(len(source.parts)):
-            end = PurePosixPath(*source.parts[i:])
-            for key in (str(end), str(end.with_suffix(""))):
-                stems_by_ending.setdefault(key, set()).add(fact["stem"])
-    if twice := [n for n in names if n not in stem_of and len(stems_by_ending.get(n, ())) > 1]:
-        raise AwError(
-            f"{path}: {shortlist(map(repr, twice), 3)} is the name of several photos "
-            f"({shortlist(sorted(stems_by_ending[twice[0]]), 3)}); write their folders too"
-        )
-    stem_of = {key: next(iter(stems)) for key, stems in stems_by_ending.items()} | stem_of
-    unknown = [n for n in names if n not in stem_of]
-    if unknown:
-        what = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
-        sources = {f["stem"]: f["source"] for f in facts}
-        raise AwError(
-            f"{path} names {what} not in the capture: "
-            + shortlist((_with_nearest(n, stem_of, sources) for n in unknown), 3)
-        )
-    if not names:
-        raise AwError(f"{path} is empty; list test photos one a line, or leave out --test-list")
-    tests = {stem_of[n] for n in names}
-    if len(tests) == len(facts):
-        raise AwError(f"{path} names all {len(facts)} photos: no training photo would be left; list fewer")
-    return tests
-
-
-def _with_nearest(name: str, stem_of: dict[str, str], sources: dict[str, str]) -> str:
-    """Quote the unknown name and add the photo whose name is nearest to it."""
-    near = difflib.get_close_matches(name, stem_of, n=1, cutoff=0.5)
-    return f"{name!r} (did you mean {sources[stem_of[near[0]]]!r}?)" if near else repr(name)

@@ -16,8 +16,8 @@ from ambiguous_wild.builder.records import MatchResult, ModelSummary
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-MIN_SHARE = 0.3  # share of the readable photos that must be placed, or most of the scene is missing
-MIN_POINTS = 10  # per placed photo; fewer determine neither poses nor surfaces
+MIN_SHARE = 0.3  # share of the readable photos that must be registered, or most of the scene is missing
+MIN_POINTS = 10  # per registered photo; fewer determine neither poses nor surfaces
 _STRONG_PAIRS = 60  # pairs with the most inliers, used for the diagnosis
 
 
@@ -75,7 +75,7 @@ def check_registered(
         skipped: number of photos left out before.
         database: COLMAP's database with features and matches.
         matches: result of the matching stage.
-        part: of the capture, by size; from the second on, the user asked for it however small it is.
+        part: component, by size; from the second on, the user asked for it however small it is.
         remarks: other possible causes, added to the error.
 
     Raises:

@@ -20,7 +20,7 @@ import numpy as np
 from ambiguous_wild.builder.records import FixedMask
 
 if TYPE_CHECKING:
-    from ambiguous_wild.builder.motions import Pair
+    from ambiguous_wild.builder.relative_poses import Pair
 
 FIXED = "fixed.json"  # file of the stage `matches`: a list of `FixedMask`
 CELLS = 64  # cells along the longer side
@@ -95,7 +95,7 @@ class FixedArea:
         """Return the record of the area.
 
         Args:
-            names: work names of all photos.
+            names: names of all photos.
             mask: file name of its keep mask.
         """
         width, height = self.size

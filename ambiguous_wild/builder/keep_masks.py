@@ -6,7 +6,7 @@ Missing masks and wrong sizes are refused here, by name. White = keep, black = i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,42 +14,50 @@ import numpy as np
 from ambiguous_wild.builder.records import FixedMask, MaskResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import orientation, read_alpha, read_gray, read_mask, upright, write_png
+from ambiguous_wild.io.images import (
+    header_size,
+    orientation,
+    read_alpha,
+    read_gray,
+    read_mask,
+    upright,
+    write_png,
+)
 from ambiguous_wild.io.photos import TRANSPARENT
 from ambiguous_wild.io.scene_folder import find_masks as by_name
 
 LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
 
 
-def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[str, Path]:
+def find_masks(folder: Path, photos: Sequence[ScreenedPhoto], missing: str) -> dict[str, Path]:
     """Find the mask file of each photo, by stem.
 
     How files are named: see `io.scene_folder.find_masks`.
 
     Args:
         folder: the user's mask folder.
-        facts: screened photos.
+        photos: of the capture.
         missing: "error", or "keep": a photo without a mask is used whole.
 
     Raises:
-        AwError: no such folder, photos without a mask, masks of another size, or a file that is no mask.
+        AwError: no such folder, photos without a mask, or masks of another size.
     """
     if not folder.is_dir():
         what = "is a file; give the folder that holds the masks" if folder.exists() else "does not exist"
         raise AwError(f"mask folder {folder} {what}")
+    sources = [photo.source for photo in photos]
+    named = by_name(folder, sources) or by_name(folder, (s.removeprefix("images/") for s in sources))
     mask_files: dict[str, Path] = {}
     unmasked, misfits = [], []
-    sources = [fact["source"] for fact in facts]
-    named = by_name(folder, sources) or by_name(folder, (s.removeprefix("images/") for s in sources))
-    for fact in facts:
-        path = named.get(fact["source"]) or named.get(fact["source"].removeprefix("images/"))
+    for photo in photos:
+        path = named.get(photo.source) or named.get(photo.source.removeprefix("images/"))
         if path is None:
-            unmasked.append(fact["source"])
+            unmasked.append(photo.source)
             continue
-        height, width = upright(read_mask(path), orientation(path)).shape
-        if (width, height) != (fact["width"], fact["height"]):
-            misfits.append(f"{path.name} is {width}x{height} but its photo {fact['width']}x{fact['height']}")
-        mask_files[fact["stem"]] = path
+        width, height = upright_size(path)
+        if (width, height) != photo.size:
+            misfits.append(f"{path.name} is {width}x{height} but its photo {photo.width}x{photo.height}")
+        mask_files[photo.stem] = path
     if misfits:
         raise AwError(
             f"{len(misfits)} of {len(mask_files)} masks in {folder} have another size than their photo: "
@@ -57,54 +65,72 @@ def find_masks(folder: Path, facts: list[ScreenedPhoto], missing: str) -> dict[s
         )
     if unmasked and (missing == "error" or not mask_files):
         raise AwError(
-            f"{len(unmasked)} of {len(facts)} photos have no mask: {shortlist(unmasked)}; add them under "
+            f"{len(unmasked)} of {len(photos)} photos have no mask: {shortlist(unmasked)}; add them under "
             f"{folder} as NAME.png, or pass --masks-missing keep to use those photos whole"
         )
     return mask_files
 
 
-def alphas(capture: Path, facts: list[ScreenedPhoto]) -> dict[str, np.ndarray]:
-    """Read the photos' alpha as keep masks, [H, W] uint8 in {0, 255}, by stem; opaque photos are absent."""
-    masks = {}
-    for fact in facts:
-        if TRANSPARENT in fact["notes"] and (alpha := read_alpha(capture / fact["source"])) is not None:
-            masks[fact["stem"]] = upright(alpha, fact["exif"].get("orientation", 1))
-    return masks
+def upright_size(path: Path) -> tuple[int, int]:
+    """Return width and height of a mask file in px, upright by its own EXIF.
+
+    Raises:
+        AwError: the file does not decode.
+    """
+    size = header_size(path) or read_mask(path).shape[::-1]
+    return (size[1], size[0]) if orientation(path) > 4 else (size[0], size[1])
+
+
+def alpha_mask(capture: Path, photo: ScreenedPhoto) -> np.ndarray | None:  # [H, W] uint8 in {0, 255}
+    """Read a photo's alpha as a keep mask, upright; None where it is opaque."""
+    alpha = read_alpha(capture / photo.source) if TRANSPARENT in photo.notes else None
+    return None if alpha is None else upright(alpha, photo.exif.get("orientation", 1))
 
 
 def lay_out_masks(
-    folder: Path, mask_files: dict[str, Path], facts: list[ScreenedPhoto], alpha: Mapping[str, np.ndarray]
+    folder: Path, mask_files: Mapping[str, Path], photos: Sequence[ScreenedPhoto], capture: Path
 ) -> MaskResult:
-    """Write every photo's mask times its alpha, 0 or 255, to `folder/masks/<work name>.png` for COLMAP."""
+    """Write every photo's mask times its alpha, 0 or 255, to `folder/masks/<name>.png` for COLMAP.
+
+    Args:
+        folder: folder of the stage.
+        mask_files: stem -> mask; photos without one are absent.
+        photos: of the capture.
+        capture: the capture's folder.
+
+    Raises:
+        AwError: a file that is no mask.
+    """
     (folder / "masks").mkdir()
-    shares = {}
-    for fact in facts:
-        path = mask_files.get(fact["stem"])
+    shares, transparent = {}, []
+    for photo in photos:
+        path, alpha = mask_files.get(photo.stem), alpha_mask(capture, photo)
         if path is None:
-            mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
+            mask = np.full((photo.height, photo.width), 255, np.uint8)
         else:
             mask = upright(read_mask(path), orientation(path))
-        if fact["stem"] in alpha:
-            mask = np.minimum(mask, alpha[fact["stem"]])
-        if path is not None or fact["stem"] in alpha:
-            shares[fact["stem"]] = round(float((mask > 0).mean()), 4)
-        write_png(folder / "masks" / f"{fact['work_name']}.png", mask)
-    return {"kept_share": shares, "alpha": sorted(alpha)}
+        if alpha is not None:
+            transparent.append(photo.stem)
+            mask = np.minimum(mask, alpha)
+        if path is not None or alpha is not None:
+            shares[photo.stem] = round(float((mask > 0).mean()), 4)
+        write_png(folder / "masks" / f"{photo.name}.png", mask)
+    return {"kept_share": shares, "alpha": sorted(transparent)}
 
 
 def add_fixed(
     folder: Path,
-    facts: list[ScreenedPhoto],
+    photos: Sequence[ScreenedPhoto],
     matches: Path,
     fixed: list[FixedMask],
     before: Path | None,
     shares: Mapping[str, float],
 ) -> dict[str, float]:
-    """Write every photo's mask less what is fixed to the camera to `folder/masks/<work name>.png`.
+    """Write every photo's mask less what is fixed to the camera to `folder/masks/<name>.png`.
 
     Args:
         folder: folder of the stage, empty.
-        facts: screened photos.
+        photos: of the capture.
         matches: folder of the fixed masks.
         fixed: fixed masks.
         before: folder of the masks so far, as `lay_out_masks` writes them; None: there are none.
@@ -117,14 +143,14 @@ def add_fixed(
     kept, fixed_masks = dict(shares), {}
     for record in fixed:
         fixed_masks.update(dict.fromkeys(record["photos"], read_gray(matches / record["mask"])))
-    for fact in facts:
-        name = fact["work_name"]
+    for photo in photos:
+        name = photo.name
         mask = read_gray(before / f"{name}.png") if before else None
         if name in fixed_masks:
             mask = fixed_masks[name] if mask is None else np.minimum(mask, fixed_masks[name])
-            kept[fact["stem"]] = round(float((mask > 0).mean()), 4)
+            kept[photo.stem] = round(float((mask > 0).mean()), 4)
         if mask is None:
-            mask = np.full((fact["height"], fact["width"]), 255, np.uint8)
+            mask = np.full((photo.height, photo.width), 255, np.uint8)
         write_png(folder / "masks" / f"{name}.png", mask)
     return kept
 

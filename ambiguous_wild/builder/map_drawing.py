@@ -26,8 +26,8 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import atomic_path, check_output
 from ambiguous_wild.io.palette import CATEGORIES, NEUTRAL, plot_colour
+from ambiguous_wild.io.scene_folder import MAP
 
-FILE = "map.png"  # in the scene's folder
 SOFTWARE = "ambiguous_wild"  # text chunk `Software` of the file, followed by the version
 SIZE_PX, PANEL_PX, TITLE_PX = (1300, 860), 380, 40  # of the picture, its side panel and its title
 DPI = 100
@@ -45,7 +45,7 @@ WEAK_COLOUR, STAR_COLOUR, LINK_COLOUR = (200, 20, 110), CATEGORIES[4], (120, 130
 COLOURS: dict[Kind, tuple[int, int, int]] = {
     "train": CATEGORIES[0],
     "test": CATEGORIES[1],
-    "part": CATEGORIES[2],
+    "component": CATEGORIES[2],
     "left out": NEUTRAL,
 }
 
@@ -58,8 +58,8 @@ def draw_built(
     tests: Collection[str],
 ) -> MapResult:
     """Write the map of a built scene into a folder; arguments as in `map_of_model`."""
-    drawn = map_of_model(model, cast(Mapping[str, Any], mapping), sources, tests)
-    write_map(drawn, folder / FILE)
+    drawn = map_of_model(model, mapping, sources, tests)
+    write_map(drawn, folder / MAP)
     return {"advice": drawn.advice}
 
 
@@ -347,8 +347,8 @@ def _legend(drawn: CaptureMap) -> Iterator[tuple[str, str]]:
         yield "test", "test photo"
     if any(photo.heading for photo in drawn.photos):
         yield "wedge", "viewing direction"
-    if "part" in kinds:
-        yield "part", "another part"
+    if "component" in kinds:
+        yield "component", "another part"
     if any(photo.provisional for photo in drawn.photos):
         yield "provisional", "placed with little evidence"
     if any(photo.kind == "left out" and not photo.unsure for photo in drawn.photos):

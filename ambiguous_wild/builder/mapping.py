@@ -1,4 +1,4 @@
-"""Map matched photos with COLMAP, place every photo anew, and join the parts of the capture."""
+"""Map matched photos with COLMAP, register every photo anew, and merge the components of the pose graph."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.builder.adjustment import pipeline_options, plausible
-from ambiguous_wild.builder.joining import join
+from ambiguous_wild.builder.bundle_adjustment import pipeline_options, plausible
+from ambiguous_wild.builder.component_merging import merge
 from ambiguous_wild.builder.matched import Matched, connected_photos
-from ambiguous_wild.builder.photo_placement import LEAST_PHOTOS, Placement
 from ambiguous_wild.builder.records import ModelSummary, no_model
-from ambiguous_wild.builder.retrieval import FEW, MOTIONS
+from ambiguous_wild.builder.registration import LEAST_PHOTOS, Registration
+from ambiguous_wild.builder.retrieval import FEW, RELATIVE_POSES
 from ambiguous_wild.builder.settings import ENOUGH
 from ambiguous_wild.builder.sfm import MappingJob
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 FOCAL_CHANGE = 0.05  # relative change of half of the focal lengths after which pairs are verified again
-FOCAL_DOUBT = 0.015  # relative change after which a rival model is built; votes lie on a grid of 2 %
+FOCAL_DOUBT = 0.015  # relative change after which a competing model is built; votes lie on a grid of 2 %
 
 
 def run_mapping(job: MappingJob) -> None:
-    """Place all photos, from COLMAP's models; write `mapping.json`.
+    """Register all photos, from COLMAP's models; write `mapping.json`.
 
     Where COLMAP's incremental mapper leaves photos out, its global mapper is asked too: it needs no pair to
-    start from, and places photos that overlap little. Where photos look outwards, a wrong focal length on a
-    bent path explains nearly all matches (yard, seed 2: 4.4 % too long, no photo right). So if the pairs
-    voted for another focal length than the mapper found, the mapper runs again with the voted one held fixed,
+    start from, and registers photos that overlap little. Where photos look outwards, a wrong focal length on
+    a bent path explains nearly all matches (yard, seed 2: 4.4 % too long, no photo right). So if the pairs
+    voted for another focal length than the mapper found, the mapper runs again with the voted one constant,
     and the model with more observations is kept.
     """
     output, database = Path(job["output"]), Path(job["database"])
@@ -42,36 +42,39 @@ def run_mapping(job: MappingJob) -> None:
     if models and not plausible(models[0]):
         matched.distorted = False
         models = _models(job, output, matched)
-    parts: list[Placement] = []
+    components: list[Registration] = []
     if models:
         change = matched.take_cameras(max(models, key=_size))
-        rivals = _models(job, output, matched, held=True) if change > FOCAL_DOUBT else []
-        if rivals:
+        competing = _models(job, output, matched, constant_focal=True) if change > FOCAL_DOUBT else []
+        if competing:
             other = Matched.read(database)  # read now, while the database has the focal length of the votes
             other.distorted = matched.distorted
         if change > FOCAL_CHANGE:
             # The poses of pairs were wrong by as much, so verify and map again with the model's focal length.
-            matched.write_agreed(database, matched.find_motions(job["jobs"]))
+            matched.write_consistent(database, matched.find_relative_poses(job["jobs"]))
             models = _models(job, output, matched) or models
         else:
-            matched.load_motions(Path(job["motions"]))
-        parts = _placed(job, database, matched, models)
-        if rivals:
-            other.load_motions(Path(job["motions"]))
-            parts = max(parts, _placed(job, database, other, rivals), key=lambda p: _explained(p[0]))
-    chosen = parts[job["part"] - 1] if len(parts) >= job["part"] else None
-    for part in {*parts[:1], *([chosen] if chosen else [])}:
-        part.name_unsure()
-    firm = len(parts[0].poses.keys() - parts[0].provisional) if parts else 0
+            matched.load_relative_poses(Path(job["relative_poses"]))
+        components = _register(job, database, matched, models)
+        if competing:
+            other.load_relative_poses(Path(job["relative_poses"]))
+            components = max(
+                components, _register(job, database, other, competing), key=lambda p: _explained(p[0])
+            )
+    chosen = components[job["part"] - 1] if len(components) >= job["part"] else None
+    for component in {*components[:1], *([chosen] if chosen else [])}:
+        component.mark_provisional()
+    reliable = len(components[0].poses.keys() - components[0].provisional) if components else 0
     if chosen is None or len(chosen.poses) < LEAST_PHOTOS:
         left_out = dict.fromkeys(matched.names, "no pair of photos to start from")
-        left_out |= _left_out(parts[0], parts) if parts else {}
-        names = [_names(part, part.poses) for part in parts if part.poses]
+        left_out |= _left_out(components[0], components) if components else {}
+        names = [_names(component, component.poses) for component in components if component.poses]
         write_json(
-            output / "mapping.json", {**no_model(), "left_out": left_out, "parts": names, "firm": firm}
+            output / "mapping.json",
+            {**no_model(), "left_out": left_out, "components": names, "reliable": reliable},
         )
         return
-    chosen.matched.save_motions(output / MOTIONS)
+    chosen.matched.save_relative_poses(output / RELATIVE_POSES)
     model = chosen.model
     model.tear_down()
     model.extract_colors_for_all_images(job["photos"])
@@ -83,15 +86,16 @@ def run_mapping(job: MappingJob) -> None:
         "error_px": round(model.compute_mean_reprojection_error(), 4),
         "track_length": round(model.compute_mean_track_length(), 3),
     }
-    links = chosen.links()
     name = matched.names
     write_json(
         output / "mapping.json",
         {
             "model": summary,
-            "left_out": dict(sorted(_left_out(chosen, parts).items())),
+            "left_out": dict(sorted(_left_out(chosen, components).items())),
             "partners": {
-                name[k]: len(place.partners) for k, place in chosen.places.items() if k in chosen.poses
+                name[k]: len(hypothesis.support)
+                for k, hypothesis in chosen.accepted.items()
+                if k in chosen.poses
             },
             "provisional": _names(chosen, chosen.provisional),
             "hypotheses": {
@@ -99,40 +103,40 @@ def run_mapping(job: MappingJob) -> None:
                 for k, pose in chosen.hypotheses.items()
                 if k not in chosen.poses and np.isfinite(pose).all()
             },
-            "links": [[name[a], name[b], count] for (a, b), count in links.items()],
-            "unplaced_links": [
-                [name[a], name[b], len(motions[0].matches)]
-                for (a, b), motions in chosen.matched.motions.items()
-                if motions and not {a, b} <= chosen.poses.keys()
+            "links": [[name[a], name[b], count] for (a, b), count in chosen.links.items()],
+            "unregistered_links": [
+                [name[a], name[b], len(relative_poses[0].matches)]
+                for (a, b), relative_poses in chosen.matched.relative_poses.items()
+                if relative_poses and not {a, b} <= chosen.poses.keys()
             ],
-            "parts": [_names(part, part.poses) for part in parts],
-            "firm": firm,
+            "components": [_names(component, component.poses) for component in components],
+            "reliable": reliable,
             "cameras": chosen.cameras(),
         },
     )
 
 
-def _names(placement: Placement, photos: Collection[int]) -> list[str]:
-    return [placement.matched.names[photo] for photo in sorted(photos)]
+def _names(registration: Registration, photos: Collection[int]) -> list[str]:
+    return [registration.matched.names[photo] for photo in sorted(photos)]
 
 
-def _left_out(placement: Placement, parts: Sequence[Placement]) -> dict[str, str]:
+def _left_out(registration: Registration, components: Sequence[Registration]) -> dict[str, str]:
     """Return the name of each photo that is left out, with the reason."""
-    reasons = dict(placement.left_out)
-    for number, part in enumerate(parts, 1):
-        if part is not placement:
-            why = f"in part {number}: {len(part.poses)} photos that no photo joins to the others"
-            reasons |= dict.fromkeys(part.poses.keys() - placement.poses.keys(), why)
-    return {placement.matched.names[photo]: reason for photo, reason in reasons.items()}
+    reasons = dict(registration.left_out)
+    for number, component in enumerate(components, 1):
+        if component is not registration:
+            why = f"in part {number}: {len(component.poses)} photos that no photo joins to the others"
+            reasons |= dict.fromkeys(component.poses.keys() - registration.poses.keys(), why)
+    return {registration.matched.names[photo]: reason for photo, reason in reasons.items()}
 
 
-def _explained(placement: Placement) -> int:
+def _explained(registration: Registration) -> int:
     """Count the observations of a model; 0 where it lost its photos, because its points are then outdated."""
-    enough = len(placement.poses) >= LEAST_PHOTOS
-    return int(placement.model.compute_num_observations()) if enough else 0
+    enough = len(registration.poses) >= LEAST_PHOTOS
+    return int(registration.model.compute_num_observations()) if enough else 0
 
 
-def _models(job: MappingJob, output: Path, matched: Matched, *, held: bool = False) -> list[Any]:
+def _models(job: MappingJob, output: Path, matched: Matched, *, constant_focal: bool = False) -> list[Any]:
     """Return the models of COLMAP's mapper, and of the global one if it leaves photos out; largest first."""
     models: list[Any] = []
     connected = connected_photos(Path(job["database"]))
@@ -140,7 +144,9 @@ def _models(job: MappingJob, output: Path, matched: Matched, *, held: bool = Fal
     for mapper in dict.fromkeys((job["mapper"], "global")):
         run = _map_globally if mapper == "global" else _map_incrementally
         models += sorted(
-            run(job, output, matched.distorted and not held, held).values(), key=_size, reverse=True
+            run(job, output, matched.distorted and not constant_focal, constant_focal).values(),
+            key=_size,
+            reverse=True,
         )
         for folder in output.glob("[0-9]*"):
             shutil.rmtree(folder)
@@ -153,56 +159,58 @@ def _size(model: Any) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
-def _placed(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> list[Placement]:
-    """Place photos from the first model; where it leaves some out, from the others; join their parts.
+def _register(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> list[Registration]:
+    """Register photos from the first model, and those it leaves out from the others; merge the components.
 
     Returns:
-        The largest part, then those that no photo joins to it.
+        The largest component, then those that no photo joins to it.
     """
-    parts: list[Placement] = []
-    started: set[int] = set()  # photos of parts that were placed alone
+    components: list[Registration] = []
+    started: set[int] = set()  # photos of components that were registered alone
     for model in models:
-        todo = set(range(len(matched.ids))).difference(*(part.poses for part in parts))
+        todo = set(range(len(matched.ids))).difference(*(component.poses for component in components))
         if not todo & matched.poses(model).keys():
             continue
-        waiting = [Placement(matched.copy(), database, model, job["seed"])]
+        waiting = [Registration(matched.copy(), database, model, job["seed"])]
         while waiting:
-            part = waiting.pop()
-            part.run()
-            parts.append(part)
-            for poses in part.split_off:
+            component = waiting.pop()
+            component.run()
+            components.append(component)
+            for poses in component.split_off:
                 if poses.keys() <= started:  # it grew into the photos that it was taken out of
                     continue
                 started |= poses.keys()
-                waiting.append(Placement(matched.copy(), database, part.model, job["seed"]))
+                waiting.append(Registration(matched.copy(), database, component.model, job["seed"]))
                 waiting[-1].poses = poses
-        if len(parts[-1].poses) == len(matched.ids):
+        if len(components[-1].poses) == len(matched.ids):
             break
-    parts.sort(key=lambda part: -len(part.poses))
-    best, *others = parts
-    joined = True
-    while joined:
+    components.sort(key=lambda component: -len(component.poses))
+    best, *others = components
+    merged = True
+    while merged:
         before, cameras = dict(best.poses), best.matched.copy()
         for other in others:
-            join(best, other)
-        joined = len(best.poses) > len(before)
-        if joined:
+            merge(best, other)
+        merged = len(best.poses) > len(before)
+        if merged:
             best.run()
-            joined = len(best.poses) > len(before)
-        if len(best.poses) < len(before):  # what was joined did not hold
-            best.matched, best.poses, best.joined = cameras, before, []
+            merged = len(best.poses) > len(before)
+        if len(best.poses) < len(before):  # what was merged did not hold
+            best.matched, best.poses, best.merged = cameras, before, []
             best.run()
-    kept, placed = [best], set(best.poses)
+    kept, registered = [best], set(best.poses)
     for other in others:
-        if len(other.poses.keys() - placed) >= LEAST_PHOTOS:
+        if len(other.poses.keys() - registered) >= LEAST_PHOTOS:
             kept.append(other)
-            placed |= other.poses.keys()
+            registered |= other.poses.keys()
     return kept
 
 
-def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: bool) -> dict[int, Any]:
+def _map_incrementally(
+    job: MappingJob, output: Path, distorted: bool, constant_focal: bool
+) -> dict[int, Any]:
     options = pipeline_options(job["seed"])
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not held
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not constant_focal
     options.min_model_size = LEAST_PHOTOS
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
     options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
@@ -232,7 +240,7 @@ def _map_incrementally(job: MappingJob, output: Path, distorted: bool, held: boo
     )
 
 
-def _map_globally(job: MappingJob, output: Path, distorted: bool, held: bool) -> dict[int, Any]:
+def _map_globally(job: MappingJob, output: Path, distorted: bool, constant_focal: bool) -> dict[int, Any]:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = job["seed"]
@@ -243,7 +251,7 @@ def _map_globally(job: MappingJob, output: Path, distorted: bool, held: bool) ->
     adjustment = options.mapper.bundle_adjustment.ceres
     adjustment.use_gpu = False
     options.mapper.bundle_adjustment.refine_extra_params = distorted
-    options.mapper.bundle_adjustment.refine_focal_length = not held
+    options.mapper.bundle_adjustment.refine_focal_length = not constant_focal
     adjustment.min_num_residuals_for_cpu_multi_threading = 10**9
     options.min_model_size = LEAST_PHOTOS
     return pycolmap.global_mapping(job["database"], job["photos"], str(output), options=options)

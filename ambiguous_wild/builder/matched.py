@@ -1,4 +1,7 @@
-"""Matched photos: their focal lengths, the motions of every pair, and matches that fit given poses."""
+"""Matched photos: their focal lengths, the relative poses of every pair, and the inliers of given poses.
+
+`PointLookup` finds the 3D points that a photo may show, by its matches.
+"""
 
 from __future__ import annotations
 
@@ -13,24 +16,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from ambiguous_wild.builder.motions import (
+from ambiguous_wild.builder.overlap_graph import component_labels
+from ambiguous_wild.builder.relative_poses import (
     LEAST,
-    Motion,
     Pair,
-    agreed_motions,
+    RelativePose,
+    consistent_relative_poses,
     cycle_votes,
     focal_votes,
-    motions_of_pairs,
+    relative_poses_of_pairs,
 )
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-# A match fits within this distance of its epipolar line: a share of the longer side, between bounds in px.
-FITS_PX, FITS_SHARE = (1.5, 3.0), 0.003
+# Largest epipolar error of an inlier: a share of the longer side, between bounds in px.
+INLIER_PX, INLIER_SHARE = (1.5, 3.0), 0.003
 ALL_MAPPED = 200  # photos up to which COLMAP's mapper gets all: its adjustments grow faster than their number
-MAPPED_PARTNERS = 5  # partners that the mapper gets of every photo, so that each can be placed by them
+MAPPED_COVISIBLE = 5  # covisible photos that the mapper gets of every photo, so that these register it
 
 
 @dataclass
@@ -42,12 +44,12 @@ class Matched:
     cameras: list[Any]  # pycolmap.Camera of every photo
     features: list[np.ndarray]  # a photo each: [N, 2] px
     matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with at least `LEAST`
-    motions: dict[Pair, list[Motion]] = field(default_factory=dict)
+    relative_poses: dict[Pair, list[RelativePose]] = field(default_factory=dict)
     distorted: bool = True  # whether the lens's distortion is estimated; else there is none
 
     @classmethod
     def read(cls, database: Path) -> Matched:
-        """Read COLMAP's database; motions are not in it."""
+        """Read COLMAP's database; relative poses are not in it."""
         db = pycolmap.Database.open(str(database))
         try:
             images = sorted(db.read_all_images(), key=lambda image: image.image_id)
@@ -69,7 +71,7 @@ class Matched:
             db.close()
 
     def copy(self) -> Matched:
-        """Return a copy with cameras of its own; features, matches and motions are shared."""
+        """Return a copy with cameras of its own; features, matches and relative poses are shared."""
         cameras = {camera.camera_id: copy.deepcopy(camera) for camera in self.cameras}
         return replace(self, cameras=[cameras[camera.camera_id] for camera in self.cameras])
 
@@ -84,8 +86,8 @@ class Matched:
         finally:
             db.close()
 
-    def rays(self) -> list[np.ndarray]:
-        """Return the features of every photo as x / z and y / z, [N, 2], by its present camera."""
+    def normalised(self) -> list[np.ndarray]:
+        """Return the features of every photo in normalised coordinates, [N, 2] x / z and y / z."""
         return [
             np.asarray(camera.cam_from_img(points)) if len(points) else points
             for camera, points in zip(self.cameras, self.features)
@@ -95,43 +97,43 @@ class Matched:
         """Return the focal length of a photo's camera."""
         return float(self.cameras[photo].mean_focal_length())
 
-    def misfit(
-        self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
+    def epipolar_error(
+        self, pair: Pair, first: np.ndarray, second: np.ndarray, normalised: Sequence[np.ndarray]
     ) -> np.ndarray:
-        """Return the distances [K] of a pair's matches from their epipolar lines (Sampson); 1 = just fits.
+        """Return the Sampson errors [K] of a pair's matches, relative to the largest of an inlier.
 
         Args:
             pair: two photos.
             first: [3, 4] pose of the first photo, camera from world.
             second: [3, 4] pose of the second photo.
-            rays: result of `rays`.
+            normalised: result of `normalised`.
         """
         rows = self.matches[pair]
-        essential = _essential(relative_pose(first, second))
-        a, b = (np.column_stack([rays[k][rows[:, c]], np.ones(len(rows))]) for c, k in enumerate(pair))
+        essential = _essential(pose_between(first, second))
+        a, b = (np.column_stack([normalised[k][rows[:, c]], np.ones(len(rows))]) for c, k in enumerate(pair))
         line, back = a @ essential.T, b @ essential
         size = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
         side = max(max(self.cameras[k].width, self.cameras[k].height) for k in pair)
-        error = np.clip(FITS_SHARE * side, *FITS_PX) / np.sqrt(
+        error = np.clip(INLIER_SHARE * side, *INLIER_PX) / np.sqrt(
             self.focal_px(pair[0]) * self.focal_px(pair[1])
         )
         return np.abs((b * line).sum(axis=1)) / np.sqrt(np.maximum(size, 1e-30)) / error
 
-    def fit(
-        self, pair: Pair, first: np.ndarray, second: np.ndarray, rays: Sequence[np.ndarray]
+    def inliers(
+        self, pair: Pair, first: np.ndarray, second: np.ndarray, normalised: Sequence[np.ndarray]
     ) -> np.ndarray:
-        """Tell which matches of a pair fit two poses, [K] bool; arguments as in `misfit`."""
-        return self.misfit(pair, first, second, rays) <= 1.0
+        """Tell which matches of a pair are inliers of two poses, [K] bool; see `epipolar_error`."""
+        return self.epipolar_error(pair, first, second, normalised) <= 1.0
 
-    def fitting(self, poses: Mapping[int, np.ndarray]) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
-        """Return of every placed pair its pose, second from first [3, 4], and the matches that fit it."""
-        rays, fitting_pairs = self.rays(), {}
+    def verified_pairs(self, poses: Mapping[int, np.ndarray]) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
+        """Return of every registered pair its relative pose, second from first [3, 4], and the inliers."""
+        normalised, verified = self.normalised(), {}
         for a, b in self.matches:
             if a in poses and b in poses:
-                rows = np.flatnonzero(self.fit((a, b), poses[a], poses[b], rays))
+                rows = np.flatnonzero(self.inliers((a, b), poses[a], poses[b], normalised))
                 if len(rows) >= LEAST:
-                    fitting_pairs[a, b] = relative_pose(poses[a], poses[b]), rows
-        return fitting_pairs
+                    verified[a, b] = pose_between(poses[a], poses[b]), rows
+        return verified
 
     def write_verified(self, database: Path, verified: Mapping[Pair, tuple[np.ndarray, np.ndarray]]) -> None:
         """Replace the database's verified pairs: their poses, second from first [3, 4], and matches."""
@@ -166,14 +168,14 @@ class Matched:
         for camera, side in zip(self.cameras, sides):
             camera.params = [focals[camera.camera_id] * side, *camera.params[1:]]
 
-    def find_motions(self, jobs: int) -> dict[Pair, tuple[int, int]]:
-        """Find the motions of all pairs; return motion and way, by number, of pairs that agree."""
+    def find_relative_poses(self, jobs: int) -> dict[Pair, tuple[int, int]]:
+        """Find the relative poses of all pairs; see `consistent_relative_poses` for what is returned."""
         focals_px = [self.focal_px(k) for k in range(len(self.ids))]
-        self.motions = motions_of_pairs(self.rays(), focals_px, self.matches, jobs)
-        return agreed_motions(self.motions, cycle_votes(self.motions))
+        self.relative_poses = relative_poses_of_pairs(self.normalised(), focals_px, self.matches, jobs)
+        return consistent_relative_poses(self.relative_poses, cycle_votes(self.relative_poses))
 
     def poses(self, model: Any) -> dict[int, np.ndarray]:
-        """Return the poses [3, 4], camera from world, of the photos that a model places."""
+        """Return the poses [3, 4], camera from world, of the photos that a model registers."""
         return {
             k: np.asarray(model.images[i].cam_from_world().matrix())
             for k, i in enumerate(self.ids)
@@ -190,10 +192,10 @@ class Matched:
         changes = np.abs(after / before - 1.0)[list(self.poses(model))]
         return float(np.median(changes)) if len(changes) else 0.0
 
-    def write_agreed(self, database: Path, agreed: Mapping[Pair, tuple[int, int]]) -> None:
-        """Write cameras and one motion of every pair that agrees to the database, for COLMAP's mapper.
+    def write_consistent(self, database: Path, consistent: Mapping[Pair, tuple[int, int]]) -> None:
+        """Write cameras and the consistent relative poses to the database, for COLMAP's mapper.
 
-        Of more than `ALL_MAPPED` photos it gets some: `Placement` places the others, each in constant time.
+        Of more than `ALL_MAPPED` photos it gets some: `Registration` adds the others, each in constant time.
         """
         db = pycolmap.Database.open(str(database))
         try:
@@ -202,18 +204,22 @@ class Matched:
         finally:
             db.close()
         if len(self.ids) > ALL_MAPPED:
-            mapped = _well_connected(agreed)
-            agreed = {pair: found for pair, found in agreed.items() if mapped.issuperset(pair)}
+            mapped = _well_connected(consistent)
+            consistent = {pair: found for pair, found in consistent.items() if mapped.issuperset(pair)}
         verified = {}
-        for pair, (number, decomposition) in agreed.items():
-            motion = self.motions[pair][number]
-            pose = np.column_stack([motion.rotations[decomposition], motion.translations[decomposition]])
-            verified[pair] = pose, motion.matches
+        for pair, (number, decomposition) in consistent.items():
+            relative = self.relative_poses[pair][number]
+            pose = np.column_stack([relative.rotations[decomposition], relative.translations[decomposition]])
+            verified[pair] = pose, relative.matches
         self.write_verified(database, verified)
 
-    def save_motions(self, path: Path) -> None:
-        """Save pair, matches and ways of every motion as .npz."""
-        every = [(pair, motion) for pair, motions in self.motions.items() for motion in motions]
+    def save_relative_poses(self, path: Path) -> None:
+        """Save pair, inliers and decompositions of every relative pose as .npz."""
+        every = [
+            (pair, relative)
+            for pair, relative_poses in self.relative_poses.items()
+            for relative in relative_poses
+        ]
         np.savez(
             path,
             pairs=np.array([pair for pair, _ in every], int).reshape(-1, 2),
@@ -223,68 +229,103 @@ class Matched:
             translations=np.concatenate([np.zeros((0, 3)), *(m.translations for _, m in every)]),
         )
 
-    def load_motions(self, path: Path) -> None:
-        """Load the motions that `save_motions` wrote."""
+    def load_relative_poses(self, path: Path) -> None:
+        """Load the relative poses that `save_relative_poses` wrote."""
         with np.load(path, allow_pickle=False) as file:
             cuts = np.cumsum(file["counts"], axis=0)[:-1]
             matches = np.split(file["matches"], cuts[:, 0])
             decompositions = (np.split(file[name], cuts[:, 1]) for name in ("rotations", "translations"))
-            self.motions = {pair: [] for pair in self.matches}
-            for (a, b), *motion in zip(file["pairs"].tolist(), matches, *decompositions):
-                self.motions[a, b].append(Motion(*motion))
+            self.relative_poses = {pair: [] for pair in self.matches}
+            for (a, b), *relative in zip(file["pairs"].tolist(), matches, *decompositions):
+                self.relative_poses[a, b].append(RelativePose(*relative))
 
 
-def largest_group(pairs: Collection[Pair]) -> int:
+@dataclass
+class PointLookup:
+    """Points of a model, found by the features that observe them: the 2D-3D matches of a photo."""
+
+    matched: Matched
+    rows: list[np.ndarray]  # a photo each: [N] row of `xyz` that a feature observes, -1 without a point
+    xyz: np.ndarray  # [P, 3]
+    views: np.ndarray  # [P] number of photos that observe the point
+
+    @classmethod
+    def read(cls, matched: Matched, model: Any) -> PointLookup:
+        at = {number: k for k, number in enumerate(matched.ids)}
+        rows = [np.full(len(f), -1) for f in matched.features]
+        xyz, views = np.zeros((len(model.points3D), 3)), np.zeros(len(model.points3D), int)
+        for row, point in enumerate(model.points3D.values()):
+            xyz[row] = point.xyz
+            elements = point.track.elements
+            views[row] = len({e.image_id for e in elements})
+            for element in elements:
+                rows[at[element.image_id]][element.point2D_idx] = row
+        return cls(matched, rows, xyz, views)
+
+    def matched_with(
+        self, photo: int, pairs: Sequence[Pair], poses: Mapping[int, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return features [K] of a photo, and their points [K, 3], which at least two others observe."""
+        own = np.zeros(len(self.xyz), int)
+        own[np.unique(self.rows[photo][self.rows[photo] >= 0])] = 1
+        links = [np.zeros((0, 2), int)]
+        for pair in pairs:
+            side = pair.index(photo)
+            if pair[1 - side] in poses:
+                matches = self.matched.matches[pair].astype(int)
+                seen = self.rows[pair[1 - side]][matches[:, 1 - side]]
+                links.append(np.column_stack([matches[:, side], seen])[seen >= 0])
+        both = np.unique(np.concatenate(links), axis=0)
+        both = both[self.views[both[:, 1]] - own[both[:, 1]] >= 2]
+        return both[:, 0], self.xyz[both[:, 1]]
+
+
+def largest_component(pairs: Collection[Pair]) -> int:
     """Return the largest number of photos that pairs connect."""
     if not pairs:
         return 0
-    ends = np.array(list(pairs)).T
-    size = int(ends.max()) + 1
-    label = connected_components(coo_array((np.ones(ends.shape[1]), tuple(ends)), (size, size)), False)[1]
-    return int(np.bincount(label).max())
+    return int(np.bincount(component_labels(1 + max(map(max, pairs)), pairs)).max())
 
 
 def connected_photos(database: Path) -> int:
     """Return the largest number of photos that the verified pairs of COLMAP's database connect."""
     with closing(sqlite3.connect(database)) as db:
         numbers = [row[0] for row in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")]
-    return largest_group([pycolmap.pair_id_to_image_pair(number) for number in numbers])
+    return largest_component([pycolmap.pair_id_to_image_pair(number) for number in numbers])
 
 
 def _well_connected(pairs: Collection[Pair]) -> set[int]:
-    """Choose photos so that each photo has `MAPPED_PARTNERS` chosen partners, or all that it has.
+    """Choose photos so that each photo has `MAPPED_COVISIBLE` chosen covisible ones, or all that it has.
 
-    Photos with no more partners are chosen too, because `Placement` asks more of those that the mapper did
-    not place, and so are all pairs between parts that would fall apart, of which the mapper keeps only one.
+    Photos with no more are chosen too, because `Registration` asks more of those that the mapper did not
+    register, and so are all pairs between components that would fall apart: the mapper keeps one component.
     """
-    partners: dict[int, set[int]] = {}
+    covisible: dict[int, set[int]] = {}
     for a, b in pairs:
-        partners.setdefault(a, set()).add(b)
-        partners.setdefault(b, set()).add(a)
-    wanted = {photo: min(MAPPED_PARTNERS, len(others)) for photo, others in partners.items()}
+        covisible.setdefault(a, set()).add(b)
+        covisible.setdefault(b, set()).add(a)
+    wanted = {photo: min(MAPPED_COVISIBLE, len(others)) for photo, others in covisible.items()}
     chosen: set[int] = set()
     # Gains only fall, so the largest is at the top of the heap if it is the same when it is counted anew.
-    heap = [(-len(o) if len(o) > MAPPED_PARTNERS else -math.inf, photo) for photo, o in partners.items()]
+    heap = [(-len(o) if len(o) > MAPPED_COVISIBLE else -math.inf, photo) for photo, o in covisible.items()]
     heapq.heapify(heap)
     while heap:
         listed, photo = heapq.heappop(heap)
-        gain = sum(wanted[other] > 0 for other in partners[photo])
+        gain = sum(wanted[other] > 0 for other in covisible[photo])
         if listed > -math.inf and gain < -listed:
             if gain:
                 heapq.heappush(heap, (-gain, photo))
             continue
         chosen.add(photo)
-        for other in partners[photo]:
+        for other in covisible[photo]:
             wanted[other] = max(wanted[other] - 1, 0)
     rows = [(a, b) for a, b in pairs if a in chosen and b in chosen]
-    size = max(partners, default=-1) + 1
-    ends = np.array(rows, int).reshape(-1, 2).T
-    part = connected_components(coo_array((np.ones(len(rows)), tuple(ends)), (size, size)), False)[1]
-    near = {photo: {part[k] for k in (others | {photo}) & chosen} for photo, others in partners.items()}
+    component = component_labels(max(covisible, default=-1) + 1, rows)
+    near = {photo: {component[k] for k in (others | {photo}) & chosen} for photo, others in covisible.items()}
     return chosen.union(*(pair for pair in pairs if len(near[pair[0]] | near[pair[1]]) > 1))
 
 
-def relative_pose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def pose_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the pose [3, 4] of the second camera from the first, given their poses [3, 4] from world."""
     rotation = second[:, :3] @ first[:, :3].T
     return np.column_stack([rotation, second[:, 3] - rotation @ first[:, 3]])

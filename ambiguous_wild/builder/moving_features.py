@@ -1,8 +1,8 @@
-"""Find features that move: their matches fit another motion of the pair than that of the static scene.
+"""Find features that move: inliers of another relative pose of the pair than that of the static scene.
 
 Structure from motion discards these matches, but nothing else reveals a distractor that looks like the static
-scene, or like itself a moment later. Features of a distractor that stands still in some photos fit the static
-scene; photos that show what lies behind their 3D points reveal them.
+scene, or like itself a moment later. Features of a distractor that stands still in some photos are inliers of
+the static scene; photos that show what lies behind their 3D points reveal them.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ambiguous_wild.builder.matched import Matched
-from ambiguous_wild.builder.motions import LEAST
-from ambiguous_wild.builder.photo_placement import FITS
 from ambiguous_wild.builder.records import MotionResult
+from ambiguous_wild.builder.registration import INLIER_RATIO
+from ambiguous_wild.builder.relative_poses import LEAST
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-CLEARLY = 2.0  # a match moves if its misfit is this many times what still fits
-LEAST_FITTING = 0.25  # share of a photo's partners that must share a motion that fits its pose
+CLEARLY = 2.0  # a match moves if its epipolar error is this many times the largest of an inlier
+LEAST_CONSISTENT = 0.25  # share of the covisible photos that must be consistent with the pose of a photo
 # A point is seen through by comparing it with at most this many points around it, no farther away than this
 # share of the photo's longer side, which must be deeper by this factor.
 AROUND, THROUGH, BEHIND = 12, 0.02, 1.2
@@ -42,8 +42,8 @@ class Votes:
     static: np.ndarray  # [N] photos that call a feature static
     moving: np.ndarray  # [N] photos that call it moving
     motions: list[np.ndarray] = field(default_factory=list)  # features of each motion but the static scene's
-    partners: int = 0  # photos with which it shares a motion
-    fitting: int = 0  # partners of which some motion fits its pose
+    covisible: int = 0  # photos with which it has a relative pose
+    consistent: int = 0  # covisible photos of which a relative pose is consistent with its pose
 
 
 def count_votes(
@@ -52,28 +52,28 @@ def count_votes(
     """Count how many photos call each feature static or moving, by the matches among the voters.
 
     Args:
-        matched: photos, with the motions of their pairs.
+        matched: photos, with the relative poses of their pairs.
         poses: photo -> [3, 4] camera from world.
         voters: photos that vote and are voted on; test photos must not vote on train photos.
     """
-    rays = matched.rays()
+    normalised = matched.normalised()
     votes = {k: Votes(*np.zeros((2, len(matched.features[k])), int)) for k in voters if k in poses}
     for (a, b), rows in matched.matches.items():
         if a not in votes or b not in votes:
             continue
-        off, motions = matched.misfit((a, b), poses[a], poses[b], rays), matched.motions.get((a, b), [])
-        fits = [bool(np.mean(off[motion.matches] <= 1.0) >= FITS) for motion in motions]
+        errors = matched.epipolar_error((a, b), poses[a], poses[b], normalised)
+        relative_poses = matched.relative_poses.get((a, b), [])
+        static = [bool(np.mean(errors[found.matches] <= 1.0) >= INLIER_RATIO) for found in relative_poses]
         for photo in (a, b):
-            votes[photo].partners += bool(motions)
-            votes[photo].fitting += any(fits)
-        for motion, fit in zip(motions, fits):
-            of_motion = off[motion.matches]
-            if fit:
-                fitting = rows[motion.matches[of_motion <= 1.0]]
-                votes[a].static[fitting[:, 0]] += 1
-                votes[b].static[fitting[:, 1]] += 1
-            # A motion fitted to static scene and distractor together also has matches that do not fit.
-            moving = rows[motion.matches[of_motion > CLEARLY]]
+            votes[photo].covisible += bool(relative_poses)
+            votes[photo].consistent += any(static)
+        for found, is_static in zip(relative_poses, static):
+            if is_static:
+                inliers = rows[found.matches[errors[found.matches] <= 1.0]]
+                votes[a].static[inliers[:, 0]] += 1
+                votes[b].static[inliers[:, 1]] += 1
+            # A relative pose of static scene and distractor together also has outliers.
+            moving = rows[found.matches[errors[found.matches] > CLEARLY]]
             if len(moving) >= LEAST:
                 for photo, features in ((a, moving[:, 0]), (b, moving[:, 1])):
                     votes[photo].moving[features] += 1
@@ -124,23 +124,23 @@ def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> d
 def motion_points(
     matched: Matched,
     poses: Mapping[int, np.ndarray],
-    names: Mapping[str, str],
+    train: Collection[str],
     pinholes: Mapping[str, ModelCamera],
     through: Mapping[int, np.ndarray],
 ) -> dict[str, MotionPoints]:
-    """Return the static and moving points of the train photos, by their names in the scene.
+    """Return the static and moving points of the train photos, by name.
 
-    A photo whose pose fits few of its partners gets no points, as all of it would seem to move.
+    A photo whose pose is consistent with few covisible ones gets no points, as all of it would seem to move.
 
     Args:
-        matched: photos with the motions of their pairs and the model's cameras.
+        matched: photos with the relative poses of their pairs and the model's cameras.
         poses: photo -> [3, 4] camera from world.
-        names: work name -> name in the scene, of the train photos.
-        pinholes: name in the scene -> camera of the undistorted photo.
+        train: names of the train photos.
+        pinholes: name -> camera of the undistorted photo.
         through: photo -> result of `seen_through`.
     """
-    voters = {k: names[name] for k, name in enumerate(matched.names) if name in names}
-    rays, points = matched.rays(), {}
+    voters = {k: name for k, name in enumerate(matched.names) if name in train}
+    normalised, points = matched.normalised(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
         reach = NEIGHBOURS * max(matched.cameras[photo].width, matched.cameras[photo].height)
         for thing in _group_features(matched.features[photo], through.get(photo, np.zeros(0)), reach):
@@ -148,9 +148,9 @@ def motion_points(
             votes.motions.append(thing)
         camera = pinholes[voters[photo]]
         fx, fy, cx, cy = camera.pinhole()
-        xy = (rays[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
+        xy = (normalised[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
         # Only features that got votes and that undistortion leaves inside the photo are kept.
-        vote_counts = (votes.static + votes.moving) * (votes.fitting >= LEAST_FITTING * votes.partners)
+        vote_counts = (votes.static + votes.moving) * (votes.consistent >= LEAST_CONSISTENT * votes.covisible)
         some = np.flatnonzero((vote_counts > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
         # Features at one position that differ in orientation become one point: the one with most votes.
         some = some[np.argsort(-vote_counts[some], kind="stable")]
@@ -181,33 +181,33 @@ def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> 
 
 
 def write_motion(
-    folder: Path, database: Path, motions: Path, model: Path, flat: Path, names: Mapping[str, str]
+    folder: Path, database: Path, relative_poses: Path, model: Path, flat: Path, train: Collection[str]
 ) -> MotionResult:
     """Write the motion points of a scene into the folder of their stage.
 
     Args:
         folder: folder of the stage.
         database: COLMAP's database with features and matches.
-        motions: file of the motions of pairs.
+        relative_poses: file of the relative poses of pairs.
         model: folder of COLMAP's model, whose cameras have distortion.
         flat: folder of the model of the undistorted photos.
-        names: work name -> name in the scene, of the train photos.
+        train: names of the train photos.
     """
     matched, colmap_model = Matched.read(database), pycolmap.Reconstruction(str(model))
     matched.take_cameras(colmap_model)
-    matched.load_motions(motions)
+    matched.load_relative_poses(relative_poses)
     undistorted = read_model(flat)
     pinholes = {image.name: undistorted.cameras[image.camera_id] for image in undistorted.images.values()}
     # A model from another program has no points of these features.
     photos = {
         number: k
         for k, number in enumerate(matched.ids)
-        if matched.names[k] in names
+        if matched.names[k] in train
         and number in colmap_model.images
         and colmap_model.images[number].num_points2D() == len(matched.features[k])
     }
     through = seen_through(colmap_model, photos)
-    points = motion_points(matched, matched.poses(colmap_model), names, pinholes, through)
+    points = motion_points(matched, matched.poses(colmap_model), train, pinholes, through)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),

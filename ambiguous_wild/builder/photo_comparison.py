@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import FixedArea, find_fixed
+from ambiguous_wild.builder.overlap_graph import component_labels
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.core.srgb import srgb_to_linear
 
@@ -53,8 +54,8 @@ class PhotoFeatures:
 class PhotoComparison:
     """Result of the comparison, over all pairs."""
 
-    offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a partner
-    partners: np.ndarray  # [N] int, number of photos that overlap with it
+    offsets: np.ndarray  # [N, 4] float64, log2, median 0; NaN for photos without a covisible one
+    covisible: np.ndarray  # [N] int, photos that overlap with it
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
     fixed: list[FixedArea]  # fixed to the camera; its features are not compared
     matches: Matches
@@ -157,8 +158,8 @@ def compare_photos(
 
     enter_all(ordered, raw)
     # A photo that overlaps with few others is tried against more candidates before it counts as isolated.
-    groups = _groups(graph)
-    lonely = np.flatnonzero((groups != 0) | (graph.sum(axis=1) < 2)).tolist()
+    labels = component_labels(count, np.argwhere(graph))
+    lonely = np.flatnonzero((labels != 0) | (graph.sum(axis=1) < 2)).tolist()
     more = [(min(i, j), max(i, j)) for i in lonely for j in most_similar(features, i, EXTRA_CANDIDATES)]
     more = [pair for pair in dict.fromkeys(more) if pair not in raw]
     enter_all(more, _all_raw_matches(features, more, "comparing photos that overlap with few", bar, jobs))
@@ -168,19 +169,21 @@ def compare_photos(
 
 def confirmed(matches: Matches) -> Matches:
     """Leave out pairs with fewer than `MIN_INLIERS` matches of which no third photo confirms `CONFIRMED`."""
-    partner: dict[int, dict[int, dict[int, int]]] = {}  # photo -> other photo -> feature -> its feature
+    matched_features: dict[
+        int, dict[int, dict[int, int]]
+    ] = {}  # photo -> other photo -> feature -> its feature
     for (a, b), (one, two) in matches.items():
-        partner.setdefault(a, {})[b] = dict(zip(one.tolist(), two.tolist()))
-        partner.setdefault(b, {})[a] = dict(zip(two.tolist(), one.tolist()))
+        matched_features.setdefault(a, {})[b] = dict(zip(one.tolist(), two.tolist()))
+        matched_features.setdefault(b, {})[a] = dict(zip(two.tolist(), one.tolist()))
 
     def confirms(third: int, a: int, b: int) -> bool:
-        first, second = partner[a][third], partner[b][third]
-        both = ((first.get(f), second.get(g)) for f, g in partner[a][b].items())
+        first, second = matched_features[a][third], matched_features[b][third]
+        both = ((first.get(f), second.get(g)) for f, g in matched_features[a][b].items())
         return sum(f is not None and f == g for f, g in both) >= CONFIRMED
 
     sure: Matches = {}
     for (a, b), ends in matches.items():
-        third = partner[a].keys() & partner[b].keys()
+        third = matched_features[a].keys() & matched_features[b].keys()
         if len(ends[0]) >= MIN_INLIERS or any(confirms(c, a, b) for c in third):
             sure[a, b] = ends
     return sure
@@ -318,12 +321,3 @@ def _solve(count: int, rows: list[tuple[int, int, np.ndarray, float]]) -> np.nda
         solved = lsqr(matrix, weight * np.array([r[2][q] for r in rows]))[0]
         offsets[seen, q] = solved[seen] - np.median(solved[seen])
     return offsets
-
-
-def _groups(graph: np.ndarray) -> np.ndarray:
-    """Number the connected groups of photos by size, 0 the largest."""
-    from scipy.sparse.csgraph import connected_components
-
-    _, label = connected_components(graph, directed=False)
-    order = np.argsort(-np.bincount(label), kind="stable")
-    return np.argsort(order)[label]

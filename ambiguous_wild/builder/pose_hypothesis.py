@@ -7,17 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ambiguous_wild.builder.motions import Pair
+from ambiguous_wild.builder.relative_poses import Pair
 
-AGREE = 2  # smallest number of partners that agree with a photo's place
-AGREE_NEW = 3  # the same for a photo that is not placed yet, if less than `AREA_NEW` of it agrees
-RIVAL = 0.7  # relative weight of a second place from which on a photo has two places
-LEAST_AREA = 0.2  # share of a photo that must agree: a smaller part may be a distractor
-# The same if all placed photos that share a motion with it agree, and the matches are spread over the photo
-# at least so much of what as many features drawn at random would be: those of a distractor are crowded.
-LITTLE_AREA, LITTLE_SPREAD = 0.05, 0.2
-CROWDED = 0.28  # spread of matches below which `AREA_NEW` of a photo must agree
-AREA_NEW = 0.3  # share of a photo that is not placed yet, from which on two partners are enough
+LEAST_SUPPORT = 2  # covisible photos that must support a photo's pose
+LEAST_SUPPORT_NEW = 3  # the same for a photo that is not registered yet, if inliers cover under `AREA_NEW`
+COMPETING_WEIGHT = 0.7  # relative weight of a competing hypothesis from which on neither is accepted
+LEAST_AREA = 0.2  # share of a photo that inliers must cover: what is smaller may be a distractor
+# The same if all registered photos that share a relative pose with it support the hypothesis, and the least
+# coverage of the inliers, relative to as many features drawn at random: those of a distractor are clustered.
+LITTLE_AREA, LITTLE_COVERAGE = 0.05, 0.2
+CLUSTERED = 0.28  # coverage of the inliers below which they must cover `AREA_NEW` of a photo
+AREA_NEW = 0.3  # share of a photo that is not registered yet, from which on the support of two is enough
 
 
 @dataclass(frozen=True)
@@ -25,33 +25,34 @@ class PoseHypothesis:
     """A possible pose of a photo, and the evidence for it."""
 
     pose: np.ndarray | None  # [3, 4] camera from world; None: only its rotation is known
-    partners: frozenset[int]  # placed photos that agree with it
-    area: float  # share of the photo's textured part that their matches cover
-    spread: float = 1.0  # cells with matches, relative to as many features drawn at random
-    evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)  # motion -> its features
+    support: frozenset[int]  # registered photos with enough inliers under it
+    area: float  # share of the grid cells with features that hold inliers
+    coverage: float = 1.0  # cells with inliers, over those of as many features drawn at random
+    # Relative pose -> its inliers.
+    evidence: Mapping[tuple[Pair, int], np.ndarray] = field(default_factory=dict)
 
     @property
     def weight(self) -> float:
-        """Partners times area, because a distractor may have partners but covers little of the photo."""
-        return len(self.partners) * self.area
+        """Support times area, because a distractor may have support but covers little of the photo."""
+        return len(self.support) * self.area
 
     @property
-    def crowded(self) -> bool:
-        """Whether the matches are all in a small part of the photo: they may show a distractor."""
-        return self.area < LITTLE_AREA or self.spread < LITTLE_SPREAD
+    def clustered(self) -> bool:
+        """Whether the inliers are all in a small part of the photo: they may show a distractor."""
+        return self.area < LITTLE_AREA or self.coverage < LITTLE_COVERAGE
 
 
-def reason_against(best: PoseHypothesis, rival: PoseHypothesis, needed: int) -> str | None:
-    """Return why a photo cannot stay at its best place; None if it can."""
-    if not best.partners:
-        return "no placed photo agrees with it on a place"
-    if len(best.partners) == 1 < needed:
-        return "only one placed photo agrees with it on a place"
-    if len(best.partners) < needed:
-        return f"only {len(best.partners)} placed photos agree with it on a place"
-    if best.area < LEAST_AREA or (best.area < AREA_NEW and best.spread < CROWDED):
-        part = f"{best.area:.0%}, spread {best.spread:.2f}"
-        return f"only a small part of it agrees with {len(best.partners)} placed photos ({part})"
-    if len(rival.partners) >= AGREE and rival.weight > RIVAL * best.weight:
-        return f"two places: {len(best.partners)} photos agree on one, {len(rival.partners)} on another"
+def reason_against(best: PoseHypothesis, competing: PoseHypothesis, needed: int) -> str | None:
+    """Return why the best hypothesis is not accepted; None if it is."""
+    if not best.support:
+        return "no placed photo agrees with it on a pose"
+    if len(best.support) == 1 < needed:
+        return "only one placed photo agrees with it on a pose"
+    if len(best.support) < needed:
+        return f"only {len(best.support)} placed photos agree with it on a pose"
+    if best.area < LEAST_AREA or (best.area < AREA_NEW and best.coverage < CLUSTERED):
+        part = f"{best.area:.0%}, coverage {best.coverage:.2f}"
+        return f"only a small part of it agrees with {len(best.support)} placed photos ({part})"
+    if len(competing.support) >= LEAST_SUPPORT and competing.weight > COMPETING_WEIGHT * best.weight:
+        return f"two poses: {len(best.support)} photos agree on one, {len(competing.support)} on another"
     return None

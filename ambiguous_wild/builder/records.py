@@ -5,7 +5,9 @@ They are written as JSON with the keys below: a stage's result to stage.json, `S
 
 from __future__ import annotations
 
-from typing import Literal, NotRequired, TypedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, NotRequired, TypedDict
 
 from ambiguous_wild.core.scene import FileEntry
 
@@ -30,33 +32,42 @@ class ExifRecord(TypedDict, total=False):
     taken_at: str
 
 
-class PhotoRecord(TypedDict):
-    """One photo of the capture that can be read."""
+@dataclass(frozen=True)
+class ScreenedPhoto:
+    """A photo of the capture that can be read."""
 
     source: str  # path relative to the capture folder
-    stem: str  # its files in the scene are <stem>.png
-    side: Literal["train", "test"] | None
-    sha256: str
-    width: int  # px
-    height: int  # px
-    exif: ExifRecord
-    camera: str | None  # make and model
-    blur: float  # variance of the Laplacian: the lower, the softer
-    mean_luma: float  # of 255
-    notes: list[str]  # what reading converted
+    name: str  # of its files in every stage, whatever their format, and in the scene
+    side: Literal["train", "test"] | None = None
+    sha256: str = ""
+    width: int = 0  # px; 0: not measured, as of the other values below
+    height: int = 0  # px
+    exif: ExifRecord = field(default_factory=ExifRecord)
+    camera: str | None = None  # make and model
+    blur: float = 0.0  # variance of the Laplacian: the lower, the softer
+    mean_luma: float = 0.0  # of 255
+    notes: Sequence[str] = ()  # what reading converted
+    copies: Sequence[str] = ()  # files of the capture with the same bytes, left out
+
+    @property
+    def stem(self) -> str:
+        """Its name without .png, the key of masks in scene.json."""
+        return self.name.removesuffix(".png")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self.width, self.height
 
 
-class CheckedPhoto(PhotoRecord):
-    """A photo as the capture checks see it."""
+@dataclass(frozen=True)
+class PhotoSplit:
+    """The registered photos, by name, as training and test photos."""
 
-    noise: float  # of 255; NaN where it cannot be measured
-
-
-class ScreenedPhoto(PhotoRecord):
-    """A photo as structure from motion gets it."""
-
-    work_name: str  # file name that COLMAP sees
-    copies: list[str]  # files of the capture with the same bytes, left out
+    train: list[str]
+    test: list[str]
+    how: str  # "list", "folders" or "every-8"
+    warnings: list[str]
 
 
 class SkippedPhoto(TypedDict):
@@ -69,7 +80,7 @@ class SkippedPhoto(TypedDict):
 class ScreenResult(TypedDict):
     """Result of the stage `screen`."""
 
-    photos: list[ScreenedPhoto]
+    photos: list[dict[str, Any]]  # fields of `ScreenedPhoto`
     skipped: list[SkippedPhoto]
     warnings: list[str]
 
@@ -85,13 +96,13 @@ class FeatureResult(TypedDict):
     """Result of the stage `features`."""
 
     camera: str  # "single", "per-device", "per-folder" or "per-image"
-    features: dict[str, int]  # work name -> number
+    features: dict[str, int]  # name -> number
 
 
 class FixedRecord(TypedDict):
     """What stands still in all photos of one camera and size while the rest moves."""
 
-    photos: list[str]  # photos that it is masked in: work names; sources in scene.json
+    photos: list[str]  # photos that it is masked in: names; sources in scene.json
     width: int  # px, of these photos
     height: int  # px
     share: float  # of the photo
@@ -109,9 +120,9 @@ class MatchResult(TypedDict):
 
     matcher: str  # "exhaustive", "sequential" or "retrieval"
     pairs: int  # pairs tried
-    verified: int  # pairs with a motion that other pairs confirm
+    verified: int  # pairs with a relative pose that other pairs confirm
     planar: int  # verified pairs whose matches lie on one plane
-    connected: int  # photos that verified pairs connect, so that no more can be placed
+    connected: int  # photos that verified pairs connect, so that no more can be registered
     fixed: list[FixedMask]  # fixed to the camera; none of its features is matched
 
 
@@ -127,7 +138,7 @@ class ModelSummary(TypedDict):
 class CameraFact(TypedDict):
     """A camera with the focal length that the photos determine."""
 
-    photos: list[str]  # work names; sources in scene.json
+    photos: list[str]  # names; sources in scene.json
     focal_px: float
     focal_sd_px: float | None  # standard deviation; None: unknown
 
@@ -136,29 +147,30 @@ class MappingResult(TypedDict):
     """Result of the stage `mapping`."""
 
     model: ModelSummary | None
-    left_out: dict[str, str]  # work name of a photo that is not placed -> reason
-    partners: dict[str, int]  # work name -> photos that agree with its place
-    provisional: list[str]  # work names of photos placed with little evidence
-    hypotheses: dict[str, list[float]]  # work name of a photo that is left out -> likely position
-    links: list[tuple[str, str, int]]  # pairs of placed photos that agree, with their matches that fit
-    unplaced_links: list[tuple[str, str, int]]  # other pairs, with the matches of their main motion
-    parts: list[list[str]]  # work names of parts that no photo joins, the largest first
-    firm: int  # photos of the largest part that are not provisional
+    left_out: dict[str, str]  # name of a photo that is not registered -> reason
+    partners: dict[str, int]  # name -> covisible photos that support its pose
+    provisional: list[str]  # names of photos registered with little evidence
+    hypotheses: dict[str, list[float]]  # name of a photo that is left out -> likely position
+    links: list[tuple[str, str, int]]  # pairs of registered photos that agree, with their inliers
+    unregistered_links: list[tuple[str, str, int]]  # other pairs, with the inliers of the first relative pose
+    components: list[list[str]]  # names of the photos of each, the largest first
+    reliable: int  # photos of the largest component that are not provisional
     cameras: list[CameraFact]
     plan: str  # "fast", "wider", "thorough" or "covariant"
 
 
 def no_model() -> MappingResult:
-    """Return the result of a mapping that placed no photo."""
+    """Return the result of a mapping that registered no photo."""
     return {
         "model": None, "left_out": {}, "partners": {}, "provisional": [], "hypotheses": {}, "links": [],
-        "unplaced_links": [], "parts": [], "firm": 0, "cameras": [], "plan": "",
+        "unregistered_links": [], "components": [], "reliable": 0, "cameras": [], "plan": "",
     }  # fmt: skip
 
 
-class UndistortResult(TypedDict):
+class ResampleResult(TypedDict):
     """Result of the stage `undistort`."""
 
+    factor: int  # of the smaller copies; 1: there are none
     truth: dict[str, int] | None  # part of the truth -> photos that have it
 
 
@@ -174,12 +186,6 @@ class MapResult(TypedDict):
     """Result of the stage `map`."""
 
     advice: list[str]  # where to take more photos
-
-
-class DownsampleResult(TypedDict):
-    """Result of the stage `downsample`."""
-
-    size: list[int]  # width and height of most photos, px
 
 
 class PackageResult(TypedDict):
@@ -234,8 +240,8 @@ class ScenePhoto(TypedDict):
     blur: float
     mean_luma: float
     features: int
-    partners: int  # photos that agree with its place; 0: not in the scene
-    provisional: bool  # placed with little evidence
+    partners: int  # covisible photos that support its pose; 0: not in the scene
+    provisional: bool  # registered with little evidence
     notes: list[str]
     exif: ExifRecord  # without GPS
 

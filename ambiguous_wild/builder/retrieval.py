@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 PAIRS = "pairs.txt"  # file in the stage's folder that lists the matched pairs
-MOTIONS = "motions.npz"  # file beside it with the motions of each pair
+RELATIVE_POSES = "relative_poses.npz"  # file beside it with the relative poses of each pair
 OVERLAP = 10  # neighbours on each side
 FAST_EXHAUSTIVE_LIMIT = 25  # photos
 EXHAUSTIVE_LIMIT = 200  # photos; 19 900 pairs, about nine minutes on two cores at 3000 features
@@ -25,7 +25,7 @@ RATIO = 0.8  # of the angle to the nearest descriptor over that to the second ne
 FARTHEST = 0.7  # radians between two descriptors that match
 CHANCE = 5  # matches that may be chance: with fewer, only the best pairs of a photo are kept
 KEPT = 4  # number of these best pairs
-FAR, FAR_LEAST = 0.5, 20  # share of partners that are far, and their smallest number of matches
+FAR, FAR_LEAST = 0.5, 20  # share of a photo's pairs that are far, and their smallest number of matches
 WORDS = 64  # visual words
 SAMPLE = 20_000  # descriptors that the words are learnt from
 MOST = 1500  # descriptors of a photo that are used: the largest features come first in COLMAP
@@ -92,12 +92,12 @@ def _vlad(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
 
 def most_similar(
     vectors: np.ndarray,  # [N, D]
-    queries: Sequence[int],  # rows that look for partners
-    among: Sequence[int],  # rows that may be partners
+    queries: Sequence[int],  # rows that look for pairs
+    among: Sequence[int],  # rows that they may be paired with
     count: int = SIMILAR,
     far: int = 0,
 ) -> list[tuple[int, int]]:
-    """Return (query, partner) pairs, the most similar first; equal ones by row.
+    """Return (query, other) pairs, the most similar first; equal ones by row.
 
     Each query gets at most `count`, and `far` more, ever farther from each other, of the more similar half.
     """
@@ -129,7 +129,7 @@ def retrieval_pairs(
 
     Photos of a separate test set get no next ones. Up to `FEW` photos every pair is compared; above,
     each photo is compared with `SHORTLIST` times `similar` photos, most of them those with the most similar
-    vectors, and some of its partners are far.
+    vectors, and some of its pairs are far.
 
     Args:
         read: returns the descriptors of a photo; called several times a name.
@@ -137,7 +137,7 @@ def retrieval_pairs(
         test_names: photos of a separate test set.
         similar: largest number of photos that each is matched with.
         neighbours: next photos that each is matched with.
-        only: photos that look for partners; None: all.
+        only: photos that look for pairs; None: all.
         seed: of the visual words.
         jobs: threads.
 
@@ -153,13 +153,13 @@ def retrieval_pairs(
         for s in range(1, neighbours + 1)
         if i + s < len(walk) and (only is None or {names[walk[i]], names[walk[i + s]]} & set(only))
     }
-    spread = 0.0
+    far_share = 0.0
     if len(names) <= FEW:
         listed = [(a, b) for a in asking for b in everyone if a != b]
     else:
-        spread, near = FAR, (SHORTLIST - 1) * similar
+        far_share, near = FAR, (SHORTLIST - 1) * similar
         listed = most_similar(embed(read, names, seed), asking, everyone, near, similar)
-    pairs |= best_partners(shared_features(read, names, listed, jobs), dict.fromkeys(asking, similar), spread)
+    pairs |= best_pairs(shared_features(read, names, listed, jobs), dict.fromkeys(asking, similar), far_share)
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 
 
@@ -180,7 +180,7 @@ def sequential_pairs(names: list[str], test_names: set[str]) -> list[tuple[str, 
     """Pair neighbours in the given order, and photos 2^k further on.
 
     Photos of a separate test set are not part of the walk: their neighbours by name are other test photos.
-    `pairs_of_tests` finds their partners.
+    `pairs_of_tests` finds theirs.
 
     Args:
         names: photos in the order of capture.
@@ -227,7 +227,7 @@ def _matches(a: np.ndarray, b: np.ndarray) -> int:
     return int(np.sum(mutual & (first < RATIO * second) & (first < FARTHEST)))
 
 
-def best_partners(
+def best_pairs(
     shared: Mapping[tuple[int, int], int], wanted: Mapping[int, int], far: float = 0.0
 ) -> set[tuple[int, int]]:
     """Choose the best pairs of each photo, at most `wanted`, and at most `KEPT` that may be chance.
@@ -235,13 +235,13 @@ def best_partners(
     `far` is the share of pairs that are spread over all that are no chance, instead of the best: in a dense
     capture the best are next to each other, and such a chain of short steps bends.
     """
-    partners: dict[int, list[tuple[int, int]]] = {}
+    matched_with: dict[int, list[tuple[int, int]]] = {}
     for (a, b), count in shared.items():
-        partners.setdefault(a, []).append((-count, b))
-        partners.setdefault(b, []).append((-count, a))
+        matched_with.setdefault(a, []).append((-count, b))
+        matched_with.setdefault(b, []).append((-count, a))
     best = set()
     for photo, most in wanted.items():
-        ranked = sorted(partners.get(photo, []))
+        ranked = sorted(matched_with.get(photo, []))
         sure = sum(-minus >= FAR_LEAST for minus, _ in ranked)
         near = most - round(far * most)
         if sure > most > near:

@@ -19,8 +19,7 @@ from ambiguous_wild.io.scene_folder import SCENE_SCHEMA
 class SceneParts:
     """Files of the finished stages that the scene consists of."""
 
-    full: Path  # images/, sparse/0, masks/, truth/ at full size
-    small: Path | None  # the same folders downsampled; None at factor 1
+    resampled: Path  # images/, sparse/0, with a factor images_FACTOR/, masks/, truth/
     factor: int
     train: list[str]
     test: list[str]
@@ -42,22 +41,19 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
     """
     begun = time.perf_counter()
     folder.mkdir()
-    small = parts.small or parts.full
-    _place(parts.full / "images", folder / "images", link)
-    if parts.small is not None:
-        _place(small / "images", folder / f"images_{parts.factor}", link)
-    _place(parts.full / "sparse" / "0", folder / "sparse" / "0", link)
-    if (small / "masks").is_dir():
+    copies = (f"images_{parts.factor}",) if parts.factor > 1 else ()
+    for name in ("images", *copies, "sparse/0", "truth/distractor", "truth/clean"):
+        if (parts.resampled / name).is_dir():
+            _add_folder(parts.resampled / name, folder / name, link)
+    masks = parts.resampled / "masks"
+    if masks.is_dir():
         # Two folders, not masks/NAME.png: from there NerfBaselines would leave pixels out of its scores.
-        _place(small / "masks", folder / "masks" / "train", link, set(parts.train))
-        _place(small / "masks", folder / "masks" / "test", link, set(parts.masked))  # for psnr_valid alone
-    for part in ("distractor", "clean"):
-        if (small / "truth" / part).is_dir():
-            _place(small / "truth" / part, folder / "truth" / part, link)
+        _add_folder(masks, folder / "masks" / "train", link, set(parts.train))
+        _add_folder(masks, folder / "masks" / "test", link, set(parts.masked))  # for psnr_valid alone
     for path in parts.truth_files:
-        _place_file(path, folder / "truth" / path.name, link=False)
+        _add_file(path, folder / "truth" / path.name, link=False)
     for path in (parts.motion, parts.map):
-        _place_file(path, folder / path.name, link=link)
+        _add_file(path, folder / path.name, link=link)
     (folder / "train_list.txt").write_text("".join(f"{n}\n" for n in parts.train), encoding="utf-8")
     (folder / "test_list.txt").write_text("".join(f"{n}\n" for n in parts.test), encoding="utf-8")
     write_json(folder / "nb-info.json", nerfbaselines_info(parts.factor, record["name"]))
@@ -98,13 +94,13 @@ def list_files(folder: Path, jobs: int) -> dict[str, FileEntry]:
     }
 
 
-def _place(source: Path, target: Path, link: bool, names: set[str] | None = None) -> None:
+def _add_folder(source: Path, target: Path, link: bool, names: set[str] | None = None) -> None:
     for path in sorted(source.iterdir()):
         if names is None or path.name in names:
-            _place_file(path, target / path.name, link=link)
+            _add_file(path, target / path.name, link=link)
 
 
-def _place_file(source: Path, target: Path, *, link: bool) -> None:
+def _add_file(source: Path, target: Path, *, link: bool) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
         try:

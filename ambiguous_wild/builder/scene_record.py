@@ -5,20 +5,20 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import words_of
-from ambiguous_wild.builder.map_drawing import FILE as MAP
+from ambiguous_wild.builder.keep_masks import mask_warnings
 from ambiguous_wild.builder.records import (
     BuildInputs,
     BuildRecord,
     CameraFact,
     ExifRecord,
     FeatureResult,
-    FixedMask,
     FixedRecord,
     LostPhoto,
     MappingResult,
@@ -26,6 +26,8 @@ from ambiguous_wild.builder.records import (
     MaskResult,
     MatchResult,
     MotionResult,
+    PhotoSplit,
+    ResampleResult,
     ScenePhoto,
     SceneRecord,
     ScreenedPhoto,
@@ -36,6 +38,7 @@ from ambiguous_wild.builder.sfm import exif_focal
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.io.colmap_records import ColmapModel
+from ambiguous_wild.io.scene_folder import MAP
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
 ENOUGH_PHOTOS = 20  # with fewer, most of a place is seen in one or two of them
@@ -43,79 +46,80 @@ LEAST_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
 SFM_STAGES = ("features", "matches", "mapping")
 
 
+@dataclass(frozen=True)
+class BuildResults:
+    """Results of the stages that scene.json tells of."""
+
+    photos: Sequence[ScreenedPhoto]
+    screened: ScreenResult
+    features: FeatureResult
+    matches: MatchResult
+    mapping: MappingResult
+    masks: MaskResult | None
+    resampled: ResampleResult
+    motion: MotionResult
+    map: MapResult
+
+
 def scene_record(
-    settings: BuildSettings,
-    screened: ScreenResult,
-    features: FeatureResult,
-    matches: MatchResult,
-    mapping: MappingResult,
-    model: ColmapModel,
-    *,
-    train: list[str],
-    test: list[str],
-    how: str,
-    factor: int,
-    truth: dict[str, int] | None,
-    motion: MotionResult,
-    masks: MaskResult | None,
-    fixed: Sequence[FixedMask],
-    warnings: list[str],
+    settings: BuildSettings, results: BuildResults, model: ColmapModel, split: PhotoSplit
 ) -> BuildRecord:
     """Assemble scene.json without its files, inputs and timings."""
-    facts = screened["photos"]
-    lost = _lost_photos(facts, mapping["left_out"], features["features"])
-    summary = mapping["model"]
+    photos, features = results.photos, results.features["features"]
+    screened, matches, mapping = results.screened, results.matches, results.mapping
+    summary, factor = mapping["model"], results.resampled["factor"]
     assert summary is not None  # a build without a model has ended before
-    sources = {f["work_name"]: f["source"] for f in facts}
+    sources = {photo.name: photo.source for photo in photos}
     cameras: list[CameraFact] = [
         {**camera, "photos": [sources[name] for name in camera["photos"]]} for camera in mapping["cameras"]
     ]
-    sides = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
-    only_test, short = point_checks(model, {f["work_name"]: f"{f['stem']}.png" for f in facts}, set(test))
+    only_test, short = point_checks(model, set(split.test))
     return {
         "name": settings.name,
         "license": settings.license or "not stated",
         "factor": factor,
         "images": "images" if factor == 1 else f"images_{factor}",
-        "split": how,
+        "split": split.how,
         "seed": settings.seed,
         "settings": to_plain(settings),
         "chosen": {
-            "camera": features["camera"],
+            "camera": results.features["camera"],
             "sfm": mapping["plan"],
             "matcher": matches["matcher"],
             "mapper": settings.mapper,
         },
         "counts": {
-            "photos": len(facts) + len(screened["skipped"]),
-            "readable": len(facts),
+            "photos": len(photos) + len(screened["skipped"]),
+            "readable": len(photos),
             "registered": len(model.images),
-            "train": len(train),
-            "test": len(test),
+            "train": len(split.train),
+            "test": len(split.test),
             "cameras": len(model.cameras),
             "points": summary["points"],
             "points_seen_in_test_only": only_test,
             "points_of_track_length_2": short,
             "pairs": matches["pairs"],
             "pairs_verified": matches["verified"],
-            "features_that_stay": motion["static"],
-            "features_that_move": motion["moving"],
+            "features_that_stay": results.motion["static"],
+            "features_that_move": results.motion["moving"],
         },
         "reprojection_error_px": summary["error_px"],
         "mean_track_length": summary["track_length"],
         "cameras": cameras,
-        "lost": lost,
+        "lost": _lost_photos(photos, mapping["left_out"], features),
         "skipped": screened["skipped"],
         "warnings": [
             *screened["warnings"],
-            *_focal_warnings(cameras, facts),
+            *_focal_warnings(cameras, photos),
             *_parallax_warnings(model),
-            *part_lines(mapping["parts"], sources, settings.part),
+            *part_lines(mapping["components"], sources, settings.part),
             *_provisional_warnings([sources[name] for name in mapping["provisional"]]),
-            *warnings,
+            *mask_warnings(results.masks),
+            *split.warnings,
+            *map_warnings(results.map),
         ],
-        "photos": {f"{f['stem']}.png": _photo(f, sides, features["features"], mapping) for f in facts},
-        "masks": masks,
+        "photos": {photo.name: _photo(photo, split, features, mapping) for photo in photos},
+        "masks": results.masks,
         "fixed_to_camera": [
             {
                 "photos": [sources[name] for name in area["photos"]],
@@ -124,16 +128,16 @@ def scene_record(
                 "share": area["share"],
                 "where": area["where"],
             }
-            for area in fixed
+            for area in matches["fixed"]
         ],
-        "truth": truth,
+        "truth": results.resampled["truth"],
     }
 
 
-def point_checks(model: ColmapModel, names: dict[str, str], test: set[str]) -> tuple[int, int]:
+def point_checks(model: ColmapModel, test: set[str]) -> tuple[int, int]:
     """Count the points that only test photos see (leaked) and those of track length 2 (poorly determined)."""
     points = model.points
-    tests = [i.image_id for i in model.images.values() if names[i.name] in test]
+    tests = [i.image_id for i in model.images.values() if i.name in test]
     lengths = np.diff(points.track_offsets)
     if not len(lengths):
         return 0, 0
@@ -222,42 +226,42 @@ def what_changed(
 
 
 def _lost_photos(
-    facts: list[ScreenedPhoto], left_out: dict[str, str], features: dict[str, int]
+    photos: Sequence[ScreenedPhoto], left_out: Mapping[str, str], features: Mapping[str, int]
 ) -> list[LostPhoto]:
     """List the readable photos that are not in the scene, each with the reason."""
     lost: list[LostPhoto] = []
-    for fact in facts:
-        count = features.get(fact["work_name"], 0)
-        if fact["work_name"] in left_out:
-            reason = left_out[fact["work_name"]] if count >= 50 else f"only {count} features"
-            lost.append({"source": fact["source"], "reason": reason})
+    for photo in photos:
+        count = features.get(photo.name, 0)
+        if photo.name in left_out:
+            reason = left_out[photo.name] if count >= 50 else f"only {count} features"
+            lost.append({"source": photo.source, "reason": reason})
     return lost
 
 
 def _photo(
-    fact: ScreenedPhoto, sides: dict[str, str], features: dict[str, int], mapping: MappingResult
+    photo: ScreenedPhoto, split: PhotoSplit, features: Mapping[str, int], mapping: MappingResult
 ) -> ScenePhoto:
     # Scenes are published: GPS positions stay out of them.
-    exif = {k: v for k, v in fact["exif"].items() if k not in ("latitude_deg", "longitude_deg", "altitude_m")}
+    exif = {k: v for k, v in photo.exif.items() if k not in ("latitude_deg", "longitude_deg", "altitude_m")}
     return {
-        "source": fact["source"],
-        "sha256": fact["sha256"],
-        "split": sides.get(f"{fact['stem']}.png"),
-        "width": fact["width"],
-        "height": fact["height"],
-        "blur": fact["blur"],
-        "mean_luma": fact["mean_luma"],
-        "features": features.get(fact["work_name"], 0),
-        "partners": mapping["partners"].get(fact["work_name"], 0),
-        "provisional": fact["work_name"] in mapping["provisional"],
-        "notes": fact["notes"],
+        "source": photo.source,
+        "sha256": photo.sha256,
+        "split": "train" if photo.name in split.train else "test" if photo.name in split.test else None,
+        "width": photo.width,
+        "height": photo.height,
+        "blur": photo.blur,
+        "mean_luma": photo.mean_luma,
+        "features": features.get(photo.name, 0),
+        "partners": mapping["partners"].get(photo.name, 0),
+        "provisional": photo.name in mapping["provisional"],
+        "notes": list(photo.notes),
         "exif": cast(ExifRecord, exif),
     }
 
 
-def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> list[str]:
+def _focal_warnings(cameras: Sequence[CameraFact], photos: Sequence[ScreenedPhoto]) -> list[str]:
     """Warn of cameras whose focal length contradicts their photos' EXIF."""
-    stated = {f["source"]: (exif_focal(f), max(f["width"], f["height"])) for f in facts}
+    stated = {photo.source: (exif_focal(photo), max(photo.size)) for photo in photos}
     odd = []
     for camera in cameras:
         share, side = stated[camera["photos"][0]]
@@ -268,24 +272,24 @@ def _focal_warnings(cameras: list[CameraFact], facts: list[ScreenedPhoto]) -> li
     return [f"focal length of {len(odd)} of {len(cameras)} cameras contradicts EXIF: {shortlist(odd, 2)}"]
 
 
-def part_lines(parts: Sequence[Sequence[str]], sources: Mapping[str, str], built: int) -> list[str]:
-    """Return one line if the photos fall into parts (work names each) that no photo joins, else none.
+def part_lines(components: Sequence[Sequence[str]], sources: Mapping[str, str], built: int) -> list[str]:
+    """Return one line if the pose graph has several components, the user's parts, else none.
 
     Args:
-        parts: work names of each part, the largest part first.
-        sources: work name -> path in the capture.
+        components: names of each, the largest first.
+        sources: name -> path in the capture.
         built: number of the part that is built, from 1.
     """
-    if len(parts) < 2:
+    if len(components) < 2:
         return []
     named = [
-        f"part {number} of {len(part)} ({shortlist([sources[name] for name in part], 2)})"
-        for number, part in enumerate(parts, 1)
+        f"part {number} of {len(photos)} ({shortlist([sources[name] for name in photos], 2)})"
+        for number, photos in enumerate(components, 1)
     ]
     other = 1 if built > 1 else 2
     return [
-        f"the photos fall into {len(parts)} parts that no photo joins: {', '.join(named)}; take photos that "
-        f"show two of them at once; --part {other} builds part {other}"
+        f"the photos fall into {len(components)} parts that no photo joins: {', '.join(named)}; take photos "
+        f"that show two of them at once; --part {other} builds part {other}"
     ]
 
 

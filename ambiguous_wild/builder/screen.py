@@ -21,7 +21,6 @@ from ambiguous_wild.builder.collect import MIN_PHOTOS, VIDEO_SUFFIXES, Capture, 
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     ExifRecord,
-    PhotoRecord,
     ScreenedPhoto,
     ScreenResult,
     SkippedPhoto,
@@ -34,6 +33,7 @@ BLUR_SIDE = 1024  # px, longer side: the Laplacian grows with resolution, so blu
 BLUR_RATIO = 0.2  # of the capture's median; a photo below it counts as blurred
 NEAR_DUPLICATE = 0.995  # correlation of 32 x 32 thumbnails
 EXPOSURE_STOPS = 1.0
+FOCAL_RATIO = 1.01  # longest over shortest focal length of a camera that counts as zoomed
 _THUMBNAIL = 32
 More = TypeVar("More")
 
@@ -42,10 +42,10 @@ More = TypeVar("More")
 class ReadCapture(Generic[More]):
     """The photos of a capture that can be used."""
 
-    photos: list[PhotoRecord]
+    photos: list[ScreenedPhoto]
     thumbnails: np.ndarray  # [N, 1024], see `thumbnail`
     more: list[More]  # what the caller's function returned for each photo
-    copies: dict[str, str]  # relative name of a copy or of another format -> name of the photo that is used
+    copies: dict[str, str]  # path of a copy or of another format -> path of the photo that is used
     skipped: list[SkippedPhoto]  # unreadable photos and copies
 
 
@@ -57,36 +57,37 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     Raises:
         AwError: too few photos can be read, or with `strict` one cannot.
     """
-    photos = folder / "photos"
-    photos.mkdir()
+    laid_out = folder / "photos"
+    laid_out.mkdir()
     read = read_capture(
         capture,
-        lambda source, photo, pixels: _lay_out(source, photo, pixels, photos),
+        lambda listed, photo, pixels: _lay_out(listed, photo, pixels, laid_out),
         strict=strict,
         jobs=jobs,
         bar=bar,
     )
-    for path in photos.iterdir():
-        if path.name not in read.more:  # left out: another format of the same photo is used
+    used = {photo.name for photo in read.photos}
+    for path in laid_out.iterdir():
+        if path.name not in used:  # left out: another format of the same photo is used
             path.unlink()
-    facts: list[ScreenedPhoto] = [
-        {
-            **record,
-            "work_name": work_name,
-            "copies": [copy for copy, kept in read.copies.items() if kept == record["source"]],
-        }
-        for record, work_name in zip(read.photos, read.more)
+    screened = [
+        dataclasses.replace(photo, copies=[c for c, kept in read.copies.items() if kept == photo.source])
+        for photo in read.photos
     ]
     warnings = [
         *_skipped_warning(read.skipped, len(capture.sources)),
-        *(f"{p['source']}: {n}" for p in facts for n in p["notes"]),
+        *(f"{photo.source}: {note}" for photo in screened for note in photo.notes),
         *(_identical_warning(group) for group in identical(capture) if capture.has_sides),
-        *_near_duplicates(facts, read.thumbnails),
-        *_burst_warnings(facts, read.thumbnails),
+        *_near_duplicates(screened, read.thumbnails),
+        *_burst_warnings(screened, read.thumbnails),
         *_live_photo_warnings(capture),
-        *drift_warnings(facts),
+        *drift_warnings(screened),
     ]
-    return {"photos": facts, "skipped": read.skipped, "warnings": warnings}
+    return {
+        "photos": [dataclasses.asdict(photo) for photo in screened],
+        "skipped": read.skipped,
+        "warnings": warnings,
+    }
 
 
 def read_capture(
@@ -112,14 +113,14 @@ def read_capture(
     sources, copies = without_copies(capture)
     bar.start("reading photos", len(sources))
 
-    def one(source: PhotoSource) -> tuple[PhotoRecord, np.ndarray, More] | SkippedPhoto:
+    def one(listed: PhotoSource) -> tuple[ScreenedPhoto, np.ndarray, More] | SkippedPhoto:
         try:
-            photo, pixels = read_photo(source.path)
+            photo, pixels = read_photo(listed.path)
         except UnreadablePhoto as error:
-            return {"source": source.relative, "skipped": error.reason}
+            return {"source": listed.source, "skipped": error.reason}
         finally:
             bar.step()
-        return photo_record(source, photo, pixels), thumbnail(pixels), more(source, photo, pixels)
+        return photo_record(listed, photo, pixels), thumbnail(pixels), more(listed, photo, pixels)
 
     with ThreadPoolExecutor(jobs) as pool:
         rows = list(pool.map(one, sources))
@@ -128,7 +129,7 @@ def read_capture(
     good = [r for r in rows if isinstance(r, tuple)]
     if not capture.has_sides:
         twins = _format_twins([record for record, _, _ in good], [small for _, small, _ in good])
-        good = [row for row in good if row[0]["source"] not in twins]
+        good = [row for row in good if row[0].source not in twins]
         copies = copies | twins
     _refuse_bad(capture, unreadable, copies, len(good), strict)
     photos, thumbnails, results = zip(*good)
@@ -137,26 +138,26 @@ def read_capture(
     )
 
 
-def photo_record(source: PhotoSource, photo: Photo, pixels: np.ndarray) -> PhotoRecord:
+def photo_record(listed: PhotoSource, photo: Photo, pixels: np.ndarray) -> ScreenedPhoto:
     """Measure size, EXIF, blur and brightness of one photo."""
     exif = {k: v for k, v in dataclasses.asdict(photo.exif).items() if v is not None}
-    return {
-        "source": source.relative,
-        "stem": source.stem,
-        "side": source.side,
-        "sha256": source.sha256,
-        "width": photo.width,
-        "height": photo.height,
-        "exif": cast(ExifRecord, exif),
-        "camera": photo.exif.camera,
-        "blur": round(sharpness(pixels), 3),
-        "mean_luma": round(float(pixels.mean()), 2),
-        "notes": list(photo.notes),
-    }
+    return ScreenedPhoto(
+        source=listed.source,
+        name=listed.name,
+        side=listed.side,
+        sha256=listed.sha256,
+        width=photo.width,
+        height=photo.height,
+        exif=cast(ExifRecord, exif),
+        camera=photo.exif.camera,
+        blur=round(sharpness(pixels), 3),
+        mean_luma=round(float(pixels.mean()), 2),
+        notes=list(photo.notes),
+    )
 
 
 def without_copies(capture: Capture) -> tuple[list[PhotoSource], dict[str, str]]:
-    """Return the photos to use, and the copies to leave out: relative name -> first file with the same bytes.
+    """Return the photos to use, and the copies to leave out: path -> first file with the same bytes.
 
     One of two copies could be a training photo and the other a test photo, which leaks test data. In a
     capture with train/ and test/ the copies stay, and a warning names them.
@@ -165,10 +166,10 @@ def without_copies(capture: Capture) -> tuple[list[PhotoSource], dict[str, str]]
         return list(capture.sources), {}
     first: dict[str, PhotoSource] = {}
     copies = {}
-    for source in capture.sources:
-        kept = first.setdefault(source.sha256, source)
-        if kept is not source:
-            copies[source.relative] = kept.relative
+    for listed in capture.sources:
+        kept = first.setdefault(listed.sha256, listed)
+        if kept is not listed:
+            copies[listed.source] = kept.source
     return list(first.values()), copies
 
 
@@ -193,37 +194,51 @@ def thumbnail(
     return (small / max(float(np.linalg.norm(small)), 1e-6)).ravel()
 
 
-def drift_warnings(facts: Sequence[PhotoRecord]) -> list[str]:
+def drift_warnings(photos: Sequence[ScreenedPhoto]) -> list[str]:
     """Warn of blurred photos, and of camera settings that changed within the capture."""
     warnings = []
-    blur = np.array([f["blur"] for f in facts])
+    blur = np.array([photo.blur for photo in photos])
     limit = BLUR_RATIO * float(np.median(blur))
-    soft = [f["source"] for f, b in zip(facts, blur) if b < limit]
+    soft = [photo.source for photo, b in zip(photos, blur) if b < limit]
     if soft:
         warnings.append(
             f"{len(soft)} photos are blurred (Laplacian variance under {limit:.0f}, a fifth of the "
             f"capture's median): {shortlist(soft)}"
         )
-    stops = [s for f in facts if (s := exposure_stops(f["exif"])) is not None]
+    stops = [s for photo in photos if (s := exposure_stops(photo.exif)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_STOPS:
         warnings.append(
             f"exposure settings span {max(stops) - min(stops):.1f} stops: appearance changes between photos"
         )
-    balances = {f["exif"]["white_balance"] for f in facts if "white_balance" in f["exif"]}
+    balances = {photo.exif["white_balance"] for photo in photos if "white_balance" in photo.exif}
     if len(balances) > 1:
         warnings.append("white balance is automatic in some photos and manual in others: colours may shift")
-    for camera in sorted({f["camera"] for f in facts if f["camera"]}):
-        focal = [f["exif"]["focal_mm"] for f in facts if f["camera"] == camera and "focal_mm" in f["exif"]]
-        if focal and max(focal) > 1.01 * min(focal):
-            warnings.append(f"{camera} was zoomed: {min(focal):.1f} to {max(focal):.1f} mm")
-    if len({(f["width"], f["height"]) for f in facts}) > 1:
-        warnings.append(f"photos have {len({(f['width'], f['height']) for f in facts})} different sizes")
-    return warnings + panorama_warnings(facts)
+    for camera, (shortest, longest) in zoomed_cameras(photos).items():
+        if camera:
+            warnings.append(f"{camera} was zoomed: {shortest:.1f} to {longest:.1f} mm")
+    if len({photo.size for photo in photos}) > 1:
+        warnings.append(f"photos have {len({photo.size for photo in photos})} different sizes")
+    return warnings + panorama_warnings(photos)
 
 
-def panorama_warnings(facts: Sequence[PhotoRecord]) -> list[str]:
+def zoomed_cameras(photos: Sequence[ScreenedPhoto]) -> dict[str, tuple[float, float]]:
+    """Return the shortest and longest focal length, mm by EXIF, of cameras that were zoomed; "": unnamed."""
+    focals: dict[str, list[float]] = {}
+    for photo in sorted(photos, key=lambda photo: photo.camera or ""):
+        if "focal_mm" in photo.exif:
+            focals.setdefault(photo.camera or "", []).append(photo.exif["focal_mm"])
+    spans = {camera: (min(values), max(values)) for camera, values in focals.items()}
+    return {camera: span for camera, span in spans.items() if span[1] > FOCAL_RATIO * span[0]}
+
+
+def near_duplicate_pairs(thumbnails: np.ndarray) -> np.ndarray:
+    """Return the pairs [K, 2] of photos whose thumbnails [N, 1024] hardly differ."""
+    return np.argwhere(np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1))
+
+
+def panorama_warnings(photos: Sequence[ScreenedPhoto]) -> list[str]:
     """Warn of photos shaped like 360 degree photos: a tool may have dropped the XMP data that says so."""
-    wide = [f["source"] for f in facts if f["width"] == 2 * f["height"]]
+    wide = [photo.source for photo in photos if photo.width == 2 * photo.height]
     name = f"{len(wide)} photos are 2:1, as 360 degree photos are ({shortlist(wide, 2)})"
     return [f"{name}: {SPLIT_PANORAMAS}"] if wide else []
 
@@ -235,12 +250,11 @@ def exposure_stops(exif: ExifRecord) -> float | None:
     return math.log2(exif["exposure_s"] * exif.get("iso", 100.0) / exif.get("f_number", 1.0) ** 2)
 
 
-def _near_duplicates(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> list[str]:
-    close = np.triu(thumbnails @ thumbnails.T > NEAR_DUPLICATE, k=1)
+def _near_duplicates(photos: Sequence[ScreenedPhoto], thumbnails: np.ndarray) -> list[str]:
     pairs = [
-        f"{facts[i]['source']} = {facts[j]['source']}"
-        for i, j in np.argwhere(close)
-        if facts[i]["sha256"] != facts[j]["sha256"]
+        f"{photos[i].source} = {photos[j].source}"
+        for i, j in near_duplicate_pairs(thumbnails)
+        if photos[i].sha256 != photos[j].sha256
     ]
     if not pairs:
         return []
@@ -250,46 +264,46 @@ def _near_duplicates(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> li
     ]
 
 
-def _format_twins(facts: Sequence[PhotoRecord], thumbnails: Sequence[np.ndarray]) -> dict[str, str]:
+def _format_twins(photos: Sequence[ScreenedPhoto], thumbnails: Sequence[np.ndarray]) -> dict[str, str]:
     """Find photos saved in two formats: source to leave out -> source to keep.
 
     Phones save or export IMG_1.HEIC and IMG_1.JPG. The larger one is kept, of equal ones the first by name.
 
     Args:
-        facts: photos that can be read.
+        photos: those that can be read.
         thumbnails: [1024] each, as `thumbnail` returns them.
     """
     groups: dict[str, list[int]] = {}
-    for index, fact in enumerate(facts):
-        groups.setdefault(str(PurePosixPath(fact["source"]).with_suffix("")).casefold(), []).append(index)
+    for index, photo in enumerate(photos):
+        groups.setdefault(str(PurePosixPath(photo.source).with_suffix("")).casefold(), []).append(index)
     twins = {}
     for members in groups.values():
         if len(members) < 2:
             continue
-        first = max(members, key=lambda i: (facts[i]["width"] * facts[i]["height"], -i))
+        first = max(members, key=lambda i: (photos[i].width * photos[i].height, -i))
         for other in members:
-            suffixes = {PurePosixPath(facts[i]["source"]).suffix.lower() for i in (first, other)}
+            suffixes = {PurePosixPath(photos[i].source).suffix.lower() for i in (first, other)}
             if (
                 other != first
                 and len(suffixes) == 2
                 and float(thumbnails[first] @ thumbnails[other]) > NEAR_DUPLICATE
             ):
-                twins[facts[other]["source"]] = facts[first]["source"]
+                twins[photos[other].source] = photos[first].source
     return twins
 
 
-def _burst_warnings(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> list[str]:
+def _burst_warnings(photos: Sequence[ScreenedPhoto], thumbnails: np.ndarray) -> list[str]:
     """Warn of runs of near-identical photos that one camera took within the same second."""
     groups: dict[tuple[str | None, str], list[int]] = {}
-    for index, fact in enumerate(facts):
-        taken = fact["exif"].get("taken_at")
+    for index, photo in enumerate(photos):
+        taken = photo.exif.get("taken_at")
         if taken is not None:
-            groups.setdefault((fact["camera"], taken), []).append(index)
+            groups.setdefault((photo.camera, taken), []).append(index)
     bursts = []
     for members in groups.values():
         alike = [i for i in members[1:] if float(thumbnails[members[0]] @ thumbnails[i]) > NEAR_DUPLICATE]
         if alike:
-            bursts.append(f"{facts[members[0]]['source']} and {len(alike)} more")
+            bursts.append(f"{photos[members[0]].source} and {len(alike)} more")
     if not bursts:
         return []
     return [
@@ -300,7 +314,7 @@ def _burst_warnings(facts: Sequence[PhotoRecord], thumbnails: np.ndarray) -> lis
 
 def _live_photo_warnings(capture: Capture) -> list[str]:
     """Warn of videos that belong to photos of the same name."""
-    stems = {PurePosixPath(s.relative).stem.casefold() for s in capture.sources}
+    stems = {PurePosixPath(s.source).stem.casefold() for s in capture.sources}
     videos = [
         name
         for name in capture.ignored
@@ -310,23 +324,23 @@ def _live_photo_warnings(capture: Capture) -> list[str]:
     return [f"{len(videos)} videos of live photos are left out: {shortlist(videos, 3)}"] if videos else []
 
 
-def _lay_out(source: PhotoSource, photo: Photo, pixels: np.ndarray, folder: Path) -> str:
+def _lay_out(listed: PhotoSource, photo: Photo, pixels: np.ndarray, folder: Path) -> None:
+    """Link a photo as PNG, whatever its format, which decoders tell by its content; else convert it."""
     if photo.plain:
-        (folder / source.work_name).symlink_to(source.path)
-        return source.work_name
+        (folder / listed.name).symlink_to(listed.path)
+        return
     import OpenImageIO as oiio
 
     # OpenImageIO copies the EXIF focal length, from which COLMAP starts.
-    name = source.stem + ".png"
+    path = str(folder / listed.name)
     spec = oiio.ImageSpec(photo.width, photo.height, 3, "uint8")
     for key, value in _attributes(photo).items():
         spec.attribute(key, value)  # passed with its uint16 type, it would be dropped
-    output = oiio.ImageOutput.create(str(folder / name))
-    if output is None or not output.open(str(folder / name), spec) or not output.write_image(pixels):
+    output = oiio.ImageOutput.create(path)
+    if output is None or not output.open(path, spec) or not output.write_image(pixels):
         reason = oiio.geterror() if output is None else output.geterror()
-        raise AwError(f"cannot convert {source.relative} to PNG: {' '.join(reason.split())}")
+        raise AwError(f"cannot convert {listed.source} to PNG: {' '.join(reason.split())}")
     output.close()
-    return name
 
 
 def _attributes(photo: Photo) -> dict[str, str | int | float]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from ambiguous_wild.builder.records import PhotoRecord
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, FEW, NEIGHBOURS
 from ambiguous_wild.core.errors import AwError
 
@@ -19,8 +19,8 @@ Mapper = Literal["incremental", "global"]
 Effort = Literal["auto", "fast", "thorough"]
 
 
-WIDER = 40  # partners in the second attempt of a photo that was left out
-ENOUGH = 0.9  # placed share that ends the attempts: more pairs seldom place the rest
+WIDER = 40  # pairs in the second attempt of a photo that was left out
+ENOUGH = 0.9  # registered share that ends the attempts: more pairs seldom register the rest
 HALF = 0.5  # the same of more than `FEW` photos, before all pairs are matched
 MANY_FEATURES = 8000  # of a photo in the last attempt at a small capture, whose photos may overlap little
 RATIO, LOOSE_RATIO = 0.8, 0.9  # of the distances of matches; the second where photos may overlap little
@@ -73,14 +73,14 @@ class SfmPlan:
     growth: float  # all cameras are adjusted whenever the model has grown by this factor
     refinements: int  # rounds of such an adjustment, at most
     tolerance: float  # relative change of the error that ends a round; 0: when the gradient is small
-    local_refinements: int  # rounds of the adjustment after a photo was placed, at most
+    local_refinements: int  # rounds of the adjustment after a photo was registered, at most
     local_cameras: int  # cameras in that adjustment: the new one and those that share most points with it
-    continues: bool = False  # only photos left out so far look for partners, besides the pairs matched so far
+    continues: bool = False  # only photos left out so far look for pairs, besides those matched so far
     worth: float = 0.0  # share of the photos that pairs must connect, else nothing is mapped
-    below: float = 1.0  # the plan runs only if a smaller share of the photos is placed so far
+    below: float = 1.0  # the plan runs only if a smaller share of the photos is registered so far
 
 
-def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPlan]:
+def plans(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> list[SfmPlan]:
     """Return the attempts in order; each next one runs if the one before leaves photos out."""
     thorough = _thorough(len(photos), settings)
     # Other features find other pairs: a capture that one kind leaves in parts may be whole by the other.
@@ -99,7 +99,7 @@ def plans(photos: Sequence[PhotoRecord], settings: BuildSettings) -> list[SfmPla
     return [fast, wider, replace(thorough, below=below), *careful[1:]]
 
 
-def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
+def _fast(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> SfmPlan:
     matcher = _matcher(len(photos), settings, FAST_EXHAUSTIVE_LIMIT)
     many = len(photos) > EXHAUSTIVE_LIMIT
     return SfmPlan(
@@ -112,7 +112,7 @@ def _fast(photos: Sequence[PhotoRecord], settings: BuildSettings) -> SfmPlan:
         neighbours=5 if many else 2,
         growth=2.0,
         refinements=1,
-        # All photos are placed anew afterwards, and of many the last digits cost most of the time.
+        # All photos are registered anew afterwards, and of many the last digits cost most of the time.
         tolerance=1e-4 if len(photos) > FEW else 0.0,
         local_refinements=1,
         local_cameras=4,

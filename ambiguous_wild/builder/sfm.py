@@ -15,6 +15,7 @@ import subprocess
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NotRequired, TypedDict, cast
 
@@ -24,11 +25,10 @@ from ambiguous_wild.builder.records import (
     FeatureResult,
     MappingResult,
     MatchResult,
-    PhotoRecord,
     ScreenedPhoto,
     no_model,
 )
-from ambiguous_wild.builder.retrieval import MOTIONS, PAIRS
+from ambiguous_wild.builder.retrieval import PAIRS, RELATIVE_POSES
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.processes import python_command
@@ -69,7 +69,7 @@ class MatchJob(TypedDict):
     ratio: float
     similar: int
     neighbours: int
-    only: list[str] | None  # names that look for partners; None: all
+    only: list[str] | None  # names that look for pairs; None: all
     focals: dict[str, float] | None  # name -> EXIF focal length over the longer side; None: poses are known
     earlier: str | None  # file of the pairs that are matched already
     photos: str | None  # folder; None: what is fixed to the camera stays matched
@@ -83,12 +83,12 @@ class MappingJob(TypedDict):
 
     task: Literal["mapping"]
     database: str
-    motions: str  # file that the stage `matches` wrote
+    relative_poses: str  # file that the stage `matches` wrote
     photos: str  # folder
     output: str  # folder
-    progress: str  # file that holds the number of placed photos
+    progress: str  # file that holds the number of registered photos
     mapper: str
-    part: int  # of the capture, from 1
+    part: int  # component, from 1, the largest
     growth: float  # of `SfmPlan`, as the four below
     refinements: int
     tolerance: float
@@ -111,10 +111,10 @@ class TriangulationJob(TypedDict):
     parent: NotRequired[int]
 
 
-class MotionJob(TypedDict):
-    """Job: find the motions of matched pairs whose cameras are known."""
+class RelativePoseJob(TypedDict):
+    """Job: find the relative poses of matched pairs whose cameras are known."""
 
-    task: Literal["motions"]
+    task: Literal["relative_poses"]
     database: str
     model: str  # folder; cameras, numbered as in the database
     output: str  # file
@@ -123,14 +123,14 @@ class MotionJob(TypedDict):
     parent: NotRequired[int]
 
 
-SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob | MotionJob
+SfmJob = FeatureJob | MatchJob | MappingJob | TriangulationJob | RelativePoseJob
 
 
 class SfmCrash(AwError):
     """COLMAP ended without a result; the work folder stays, and the same command continues from it."""
 
 
-def choose_camera(photos: Sequence[PhotoRecord], wanted: str) -> str:
+def choose_camera(photos: Sequence[ScreenedPhoto], wanted: str) -> str:
     """Choose which photos share a camera: "single", "per-device", "per-folder" or "per-image".
 
     "single" where size, camera model and focal length are the same in all photos. Photos of one size and
@@ -146,16 +146,16 @@ def choose_camera(photos: Sequence[PhotoRecord], wanted: str) -> str:
     return "per-device" if any(len(group) > 1 for group in groups) else "per-image"
 
 
-def _device(photo: PhotoRecord) -> tuple[Any, ...]:
-    exif = photo["exif"]
-    return (photo["width"], photo["height"], photo["camera"], exif.get("focal_mm"), exif.get("focal_35mm"))
+def _device(photo: ScreenedPhoto) -> tuple[Any, ...]:
+    exif = photo.exif
+    return (*photo.size, photo.camera, exif.get("focal_mm"), exif.get("focal_35mm"))
 
 
-def _folder(photo: PhotoRecord) -> tuple[str, ...]:
-    return tuple(p for p in PurePosixPath(photo["source"]).parent.parts if p != photo["side"])
+def _folder(photo: ScreenedPhoto) -> tuple[str, ...]:
+    return tuple(p for p in PurePosixPath(photo.source).parent.parts if p != photo.side)
 
 
-def camera_groups(photos: Sequence[PhotoRecord], camera: str = "per-device") -> list[list[int]]:
+def camera_groups(photos: Sequence[ScreenedPhoto], camera: str = "per-device") -> list[list[int]]:
     """Group the indices of photos that share a camera by EXIF and size; "per-folder": by folder and size.
 
     Photos without make and focal length share one if all photos of their folder may be of one camera, turned
@@ -170,7 +170,7 @@ def camera_groups(photos: Sequence[PhotoRecord], camera: str = "per-device") -> 
         device, folder = _device(photo), _folder(photo)
         if camera == "per-folder":
             key: tuple[Any, ...] = (device[:2], folder)
-        elif photo["camera"] and ("focal_mm" in photo["exif"] or "focal_35mm" in photo["exif"]):
+        elif photo.camera and ("focal_mm" in photo.exif or "focal_35mm" in photo.exif):
             key = device
         else:
             key = (device, folder) if len(turned[folder]) == 1 else (index,)
@@ -178,172 +178,157 @@ def camera_groups(photos: Sequence[PhotoRecord], camera: str = "per-device") -> 
     return list(groups.values())
 
 
-def exif_focal(photo: PhotoRecord) -> float | None:
+def exif_focal(photo: ScreenedPhoto) -> float | None:
     """Return the focal length over the longer side, from the 35 mm equivalent; None if EXIF has none."""
-    focal_mm = photo["exif"].get("focal_35mm")
+    focal_mm = photo.exif.get("focal_35mm")
     if not focal_mm:
         return None
-    diagonal = math.hypot(photo["width"], photo["height"])
-    return focal_mm / _DIAGONAL_35MM * diagonal / max(photo["width"], photo["height"])
+    diagonal = math.hypot(*photo.size)
+    return focal_mm / _DIAGONAL_35MM * diagonal / max(photo.size)
 
 
-def extract_features(
-    folder: Path,
-    photos: Path,
-    facts: list[ScreenedPhoto],
-    settings: BuildSettings,
-    plan: SfmPlan,
-    jobs: int,
-    camera: str,
-    masks: Path | None,
-    bar: Bar,
-) -> FeatureResult:
-    """Write the SIFT features of every photo to `folder/database.db`."""
-    database = folder / DATABASE
-    bar.start("features", len(facts))
-    job: FeatureJob = {
-        "task": "features",
-        "database": str(database),
-        "photos": str(photos),
-        "names": [f["work_name"] for f in facts],
-        "camera": camera,
-        "groups": [[facts[i]["work_name"] for i in g] for g in camera_groups(facts, camera)]
-        if camera in ("per-device", "per-folder")
-        else [],
-        "masks": str(masks) if masks else None,
-        "max_features": plan.max_features,
-        "max_side": settings.max_side,
-        "sift": plan.sift,
-        "seed": settings.seed,
-        "jobs": jobs,
-    }
-    run_job(job, folder, lambda: bar.at(_count(database, "keypoints")))
-    bar.finish()
-    with closing(sqlite3.connect(database)) as db:
-        rows = db.execute(
-            "SELECT images.name, keypoints.rows FROM images LEFT JOIN keypoints USING (image_id)"
-        ).fetchall()
-    features = {name: int(count or 0) for name, count in rows}
-    lost = [f["source"] for f in facts if f["work_name"] not in features]
-    if lost:
-        raise SfmCrash(
-            f"COLMAP dropped {len(lost)} photos without a message, the first is {lost[0]}; its log is in "
-            "the work folder that --keep-work leaves"
-        )
-    return {"camera": camera, "features": features}
+@dataclass(frozen=True)
+class StructureFromMotion:
+    """One attempt: each method runs a stage in a child process, in a folder of its own."""
 
+    photos: Sequence[ScreenedPhoto]
+    folder: Path  # of the photos' files
+    settings: BuildSettings
+    plan: SfmPlan
+    jobs: int  # threads
+    bar: Bar
 
-def match(
-    folder: Path,
-    features: Path,
-    facts: list[ScreenedPhoto],
-    settings: BuildSettings,
-    plan: SfmPlan,
-    jobs: int,
-    bar: Bar,
-    earlier: Path | None = None,
-    left_out: Sequence[str] | None = None,
-    posed: bool = False,
-    photos: Path | None = None,
-) -> MatchResult:
-    """Match pairs, and find the motions that they show.
+    def extract_features(self, folder: Path, camera: str, masks: Path | None = None) -> FeatureResult:
+        """Write the SIFT features of every photo to `folder/database.db`.
 
-    Args:
-        folder: gets the database and the list of pairs.
-        features: folder of the database with features.
-        facts: screened photos.
-        settings: settings of the build.
-        plan: gives the matcher and the number of partners a photo.
-        jobs: threads.
-        bar: progress.
-        earlier: folder of an earlier result whose pairs are kept.
-        left_out: work names of the photos that look for partners; None: all.
-        posed: the poses are known, so pairs are matched only.
-        photos: folder of the photos, to take out what is fixed to the camera; None: it stays matched.
-    """
-    matcher = plan.matcher
-    database = folder / DATABASE
-    shutil.copyfile((earlier or features) / DATABASE, database)
-    names = [f["work_name"] for f in facts]
-    test_names = [f["work_name"] for f in facts if f["side"] == "test"]
-    listed = folder / PAIRS
-    every = len(names) * (len(names) - 1) // 2
-    # The number of pairs that retrieval chooses is not known in advance.
-    bar.start("matching pairs", every if matcher == "exhaustive" else None)
-    job: MatchJob = {
-        "task": "matches",
-        "database": str(database),
-        "names": names,
-        "test_names": test_names,
-        "matcher": matcher,
-        "ratio": plan.ratio,
-        "similar": plan.similar,
-        "neighbours": plan.neighbours,
-        "only": list(left_out) if left_out is not None else None,
-        "focals": None if posed else {f["work_name"]: x for f in facts if (x := exif_focal(f)) is not None},
-        "earlier": str(earlier / PAIRS) if earlier else None,
-        "photos": str(photos) if photos else None,
-        "seed": settings.seed,
-        "jobs": jobs,
-    }
-    run_job(job, folder, lambda: bar.at(_count(database, "matches")))
-    bar.finish()
-    pairs = every if matcher == "exhaustive" else len(listed.read_text(encoding="utf-8").splitlines())
-    counts = (
-        dict.fromkeys(("verified", "planar", "connected"), 0)
-        if posed
-        else json.loads((folder / "pairs.json").read_text())
-    )
-    fixed = json.loads((folder / FIXED).read_text(encoding="utf-8")) if photos else []
-    return cast(MatchResult, {"matcher": matcher, "pairs": pairs, **counts, "fixed": fixed})
+        Args:
+            folder: folder of the stage.
+            camera: which photos share a camera, see `choose_camera`.
+            masks: folder of `<name>.png`, black where no features are wanted; None: there are none.
+        """
+        database = folder / DATABASE
+        self.bar.start("features", len(self.photos))
+        grouped = camera_groups(self.photos, camera) if camera in ("per-device", "per-folder") else []
+        job: FeatureJob = {
+            "task": "features",
+            "database": str(database),
+            "photos": str(self.folder),
+            "names": [photo.name for photo in self.photos],
+            "camera": camera,
+            "groups": [[self.photos[k].name for k in group] for group in grouped],
+            "masks": str(masks) if masks else None,
+            "max_features": self.plan.max_features,
+            "max_side": self.settings.max_side,
+            "sift": self.plan.sift,
+            "seed": self.settings.seed,
+            "jobs": self.jobs,
+        }
+        run_job(job, folder, lambda: self.bar.at(_count(database, "keypoints")))
+        self.bar.finish()
+        with closing(sqlite3.connect(database)) as db:
+            rows = db.execute(
+                "SELECT images.name, keypoints.rows FROM images LEFT JOIN keypoints USING (image_id)"
+            ).fetchall()
+        features = {name: int(count or 0) for name, count in rows}
+        lost = [photo.source for photo in self.photos if photo.name not in features]
+        if lost:
+            raise SfmCrash(
+                f"COLMAP dropped {len(lost)} photos without a message, the first is {lost[0]}; its log is in "
+                "the work folder that --keep-work leaves"
+            )
+        return {"camera": camera, "features": features}
 
+    def match(
+        self,
+        folder: Path,
+        features: Path,
+        earlier: Path | None = None,
+        left_out: Sequence[str] | None = None,
+        posed: bool = False,
+    ) -> MatchResult:
+        """Match pairs, and find their relative poses.
 
-def map_scene(
-    folder: Path,
-    matches: Path,
-    photos: Path,
-    count: int,
-    connected: int,
-    settings: BuildSettings,
-    plan: SfmPlan,
-    jobs: int,
-    bar: Bar,
-) -> MappingResult:
-    """Build the model into `folder/0`; it has none if pairs connect too few photos for the plan."""
-    if connected < plan.worth * count:
-        return {**no_model(), "plan": plan.name}
-    progress = folder / "progress"
-    bar.start("placing photos", count if settings.mapper == "incremental" else None)
-    database = folder / DATABASE
-    shutil.copyfile(matches / DATABASE, database)  # the mapper may write to it
-    job: MappingJob = {
-        "task": "mapping",
-        "database": str(database),
-        "motions": str(matches / MOTIONS),
-        "photos": str(photos),
-        "output": str(folder),
-        "progress": str(progress),
-        "mapper": settings.mapper,
-        "part": settings.part,
-        "growth": plan.growth,
-        "refinements": plan.refinements,
-        "tolerance": plan.tolerance,
-        "local_refinements": plan.local_refinements,
-        "local_cameras": plan.local_cameras,
-        "seed": settings.seed,
-        "jobs": jobs,
-    }
-    with ThreadPoolExecutor(1) as ahead:
-        # The map is drawn next; these imports take a second, in which this process has nothing to do.
-        ahead.map(importlib.import_module, ("networkx", "matplotlib.figure"))
-        run_job(job, folder, lambda: bar.at(_number(progress)))
-    bar.finish()
-    database.unlink()
-    progress.unlink(missing_ok=True)
-    return cast(
-        MappingResult,
-        {**json.loads((folder / "mapping.json").read_text(encoding="utf-8")), "plan": plan.name},
-    )
+        Args:
+            folder: gets the database and the list of pairs.
+            features: folder of the database with features.
+            earlier: folder of an earlier result whose pairs are kept.
+            left_out: names of the photos that look for pairs; None: all.
+            posed: the poses are known, so pairs are matched only, and what is fixed to the camera stays.
+        """
+        matcher, photos = self.plan.matcher, self.photos
+        database = folder / DATABASE
+        shutil.copyfile((earlier or features) / DATABASE, database)
+        every = len(photos) * (len(photos) - 1) // 2
+        # The number of pairs that retrieval chooses is not known in advance.
+        self.bar.start("matching pairs", every if matcher == "exhaustive" else None)
+        focals = {photo.name: focal for photo in photos if (focal := exif_focal(photo)) is not None}
+        job: MatchJob = {
+            "task": "matches",
+            "database": str(database),
+            "names": [photo.name for photo in photos],
+            "test_names": [photo.name for photo in photos if photo.side == "test"],
+            "matcher": matcher,
+            "ratio": self.plan.ratio,
+            "similar": self.plan.similar,
+            "neighbours": self.plan.neighbours,
+            "only": list(left_out) if left_out is not None else None,
+            "focals": None if posed else focals,
+            "earlier": str(earlier / PAIRS) if earlier else None,
+            "photos": None if posed else str(self.folder),
+            "seed": self.settings.seed,
+            "jobs": self.jobs,
+        }
+        run_job(job, folder, lambda: self.bar.at(_count(database, "matches")))
+        self.bar.finish()
+        listed = folder / PAIRS
+        pairs = every if matcher == "exhaustive" else len(listed.read_text(encoding="utf-8").splitlines())
+        if posed:
+            counts, fixed = dict.fromkeys(("verified", "planar", "connected"), 0), []
+        else:
+            counts = json.loads((folder / "pairs.json").read_text())
+            fixed = json.loads((folder / FIXED).read_text(encoding="utf-8"))
+        return cast(MatchResult, {"matcher": matcher, "pairs": pairs, **counts, "fixed": fixed})
+
+    def map(self, folder: Path, matches: Path, connected: int) -> MappingResult:
+        """Build the model into `folder/0`; it has none if pairs connect too few photos for the plan.
+
+        Args:
+            folder: folder of the stage.
+            matches: folder of the stage `matches`.
+            connected: photos that verified pairs connect.
+        """
+        plan, settings = self.plan, self.settings
+        if connected < plan.worth * len(self.photos):
+            return {**no_model(), "plan": plan.name}
+        progress, database = folder / "progress", folder / DATABASE
+        self.bar.start("placing photos", len(self.photos) if settings.mapper == "incremental" else None)
+        shutil.copyfile(matches / DATABASE, database)  # the mapper may write to it
+        job: MappingJob = {
+            "task": "mapping",
+            "database": str(database),
+            "relative_poses": str(matches / RELATIVE_POSES),
+            "photos": str(self.folder),
+            "output": str(folder),
+            "progress": str(progress),
+            "mapper": settings.mapper,
+            "part": settings.part,
+            "growth": plan.growth,
+            "refinements": plan.refinements,
+            "tolerance": plan.tolerance,
+            "local_refinements": plan.local_refinements,
+            "local_cameras": plan.local_cameras,
+            "seed": settings.seed,
+            "jobs": self.jobs,
+        }
+        with ThreadPoolExecutor(1) as ahead:
+            # The map is drawn next; these imports take a second, in which this process has nothing to do.
+            ahead.map(importlib.import_module, ("networkx", "matplotlib.figure"))
+            run_job(job, folder, lambda: self.bar.at(_number(progress)))
+        self.bar.finish()
+        database.unlink()
+        progress.unlink(missing_ok=True)
+        result = json.loads((folder / "mapping.json").read_text(encoding="utf-8"))
+        return cast(MappingResult, {**result, "plan": plan.name})
 
 
 def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:

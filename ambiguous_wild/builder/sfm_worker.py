@@ -27,14 +27,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.adjustment import pipeline_options
+from ambiguous_wild.builder.bundle_adjustment import pipeline_options
 from ambiguous_wild.builder.fixed_to_camera import FIXED, FixedArea, find_fixed, moving_matches
 from ambiguous_wild.builder.mapping import run_mapping
-from ambiguous_wild.builder.matched import Matched, largest_group
+from ambiguous_wild.builder.matched import Matched, largest_component
 from ambiguous_wild.builder.records import FixedMask
 from ambiguous_wild.builder.retrieval import (
-    MOTIONS,
     PAIRS,
+    RELATIVE_POSES,
     embed,
     pairs_of_tests,
     retrieval_pairs,
@@ -43,7 +43,7 @@ from ambiguous_wild.builder.retrieval import (
 from ambiguous_wild.builder.sfm import (
     FeatureJob,
     MatchJob,
-    MotionJob,
+    RelativePoseJob,
     SfmJob,
     TriangulationJob,
 )
@@ -56,7 +56,7 @@ SCALE = 512.0  # descriptors are stored as bytes; of a unit vector few elements 
 OCTAVES = 4  # octaves used, from the doubled photo on; features of coarser ones are badly localised
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads
 # Positions per requested feature: COLMAP finishes the octave that exceeds its limit, so it returns more.
-PLACES_A_FEATURE = 1.4
+POSITIONS_A_FEATURE = 1.4
 AHEAD = 2  # photos in work a thread, so that few lie in memory
 
 
@@ -77,10 +77,10 @@ def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[n
     keypoints = [k for k in finder.detect(gray, mask) if (k.octave + 1 & 255) < OCTAVES]
     if not keypoints:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
-    places = np.array([(k.size, *k.pt) for k in keypoints], np.float32)
-    order = np.lexsort((places[:, 1], places[:, 2], -places[:, 0]))  # by size, then position
-    next_place = np.any(np.diff(places[order], axis=0) != 0.0, axis=1)
-    kept = order[np.concatenate([[0], np.cumsum(next_place)]) < most]
+    positions = np.array([(k.size, *k.pt) for k in keypoints], np.float32)
+    order = np.lexsort((positions[:, 1], positions[:, 2], -positions[:, 0]))  # by size, then position
+    next_position = np.any(np.diff(positions[order], axis=0) != 0.0, axis=1)
+    kept = order[np.concatenate([[0], np.cumsum(next_position)]) < most]
     described, words = finder.compute(gray, [keypoints[i] for i in kept])
     points = np.array([(*k.pt, k.size / 2, np.radians(k.angle)) for k in described], np.float32)
     points[:, :2] += 0.5  # OpenCV counts from the centre of the first pixel
@@ -177,7 +177,7 @@ def _extract_with_opencv(job: FeatureJob) -> None:
             Path(job["photos"]),
             masks,
             job["names"],
-            round(PLACES_A_FEATURE * job["max_features"]),
+            round(POSITIONS_A_FEATURE * job["max_features"]),
             job["max_side"],
             job["jobs"],
         ):
@@ -189,7 +189,7 @@ def _extract_with_opencv(job: FeatureJob) -> None:
 
 
 def run_matches(job: MatchJob) -> None:
-    """Match all pairs or those that are likely to overlap, then find the motions of each pair."""
+    """Match all pairs or those that are likely to overlap, then find the relative poses of each pair."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = job["jobs"]
@@ -213,11 +213,13 @@ def run_matches(job: MatchJob) -> None:
     if job["photos"] and _take_out_fixed(job, matched):
         matched = Matched.read(database)
     matched.find_focals(job["focals"], job["jobs"])
-    agreed = matched.find_motions(job["jobs"])
-    matched.write_agreed(database, agreed)
-    matched.save_motions(database.with_name(MOTIONS))
-    planar = [len(matched.motions[pair][number].rotations) > 1 for pair, (number, _) in agreed.items()]
-    counts = {"verified": len(agreed), "planar": sum(planar), "connected": largest_group(agreed)}
+    consistent = matched.find_relative_poses(job["jobs"])
+    matched.write_consistent(database, consistent)
+    matched.save_relative_poses(database.with_name(RELATIVE_POSES))
+    planar = [
+        len(matched.relative_poses[pair][number].rotations) > 1 for pair, (number, _) in consistent.items()
+    ]
+    counts = {"verified": len(consistent), "planar": sum(planar), "connected": largest_component(consistent)}
     write_json(database.with_name("pairs.json"), counts)
 
 
@@ -293,11 +295,11 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
 
 def run_triangulation(job: TriangulationJob) -> None:
-    """Triangulate points from the matches that fit the poses; poses and intrinsics do not change."""
+    """Triangulate points from the inliers of the poses; poses and intrinsics do not change."""
     posed = pycolmap.Reconstruction(job["model"])
     matched = Matched.read(Path(job["database"]))
     matched.take_cameras(posed)
-    matched.write_verified(Path(job["database"]), matched.fitting(matched.poses(posed)))
+    matched.write_verified(Path(job["database"]), matched.verified_pairs(matched.poses(posed)))
     triangulated = pycolmap.triangulate_points(
         posed,
         job["database"],
@@ -309,12 +311,12 @@ def run_triangulation(job: TriangulationJob) -> None:
     triangulated.write_binary(job["output"])
 
 
-def run_motions(job: MotionJob) -> None:
-    """Find the motions of every matched pair, with known cameras."""
+def run_relative_poses(job: RelativePoseJob) -> None:
+    """Find the relative poses of every matched pair, with known cameras."""
     matched = Matched.read(Path(job["database"]))
     matched.take_cameras(pycolmap.Reconstruction(job["model"]))
-    matched.find_motions(job["jobs"])
-    matched.save_motions(Path(job["output"]))
+    matched.find_relative_poses(job["jobs"])
+    matched.save_relative_poses(Path(job["output"]))
 
 
 def main() -> None:
@@ -332,7 +334,7 @@ def main() -> None:
         run_matches(job)
     elif job["task"] == "mapping":
         run_mapping(job)
-    elif job["task"] == "motions":
-        run_motions(job)
+    elif job["task"] == "relative_poses":
+        run_relative_poses(job)
     else:
         run_triangulation(job)

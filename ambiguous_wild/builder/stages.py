@@ -1,29 +1,24 @@
-"""The stages of a build in order: what each reads, and the inputs that its result is stored under.
-
-A reconstruction that holds too few photos or points is refused here, with the likely cause.
-"""
+"""The stages of a build in order: what each reads, and the inputs that its result is stored under."""
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-
-import numpy as np
+from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.builder import scene_record
-from ambiguous_wild.builder.collect import Capture, read_test_list, split_photos
+from ambiguous_wild.builder.collect import Capture
 from ambiguous_wild.builder.diagnosis import check_registered
-from ambiguous_wild.builder.downsample import auto_factor, check_factor, downsample
 from ambiguous_wild.builder.keep_masks import (
     add_fixed,
-    alphas,
+    alpha_mask,
     find_masks,
     lay_out_masks,
     mask_hashes,
     mask_warnings,
 )
-from ambiguous_wild.builder.map_drawing import FILE as MAP
 from ambiguous_wild.builder.map_drawing import draw_built
 from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.progress import Bar
@@ -35,43 +30,38 @@ from ambiguous_wild.builder.records import (
     MaskResult,
     MatchResult,
     PackageResult,
+    PhotoSplit,
     ScreenedPhoto,
     ScreenResult,
-    UndistortResult,
 )
-from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.resample import auto_factor, check_factor, resample
+from ambiguous_wild.builder.retrieval import RELATIVE_POSES
 from ambiguous_wild.builder.scene_package import SceneParts, package
+from ambiguous_wild.builder.scene_record import BuildResults
 from ambiguous_wild.builder.screen import panorama_warnings, screen, without_copies
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan, plans
-from ambiguous_wild.builder.sfm import (
-    DATABASE,
-    choose_camera,
-    extract_features,
-    map_scene,
-    match,
-)
+from ambiguous_wild.builder.sfm import DATABASE, StructureFromMotion, choose_camera
 from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key, versions
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.motion_points import FILE
+from ambiguous_wild.io.scene_folder import MAP, TEST_EVERY, read_list
 
 
 @dataclass(frozen=True)
 class SfmStages:
-    """One attempt at structure from motion."""
+    """Results of one attempt at structure from motion."""
 
     features: StageResult[FeatureResult]
     matches: StageResult[MatchResult]
     mapping: StageResult[MappingResult]
 
     @property
-    def placed(self) -> int:
-        """Number of photos in the largest part."""
-        return max(map(len, self.mapping.facts["parts"]), default=0)
+    def registered(self) -> int:
+        """Number of photos in the largest component."""
+        return max(map(len, self.mapping.facts["components"]), default=0)
 
 
 @dataclass
@@ -92,7 +82,7 @@ class Stages:
         _, copies = without_copies(self.capture)
         return {
             "photos": [
-                [s.relative, s.stem, s.side, s.sha256, *["copy"] * (s.relative in copies)]
+                [s.source, s.stem, s.side, s.sha256, *["copy"] * (s.source in copies)]
                 for s in self.capture.sources
             ],
             "masks": _file_hashes(self.mask_folder),
@@ -117,83 +107,73 @@ class Stages:
         Returns:
             The scene folder, inside the work folder.
         """
-        capture, settings, bar = self.capture, self.settings, self.bar
-        inputs = self.inputs
+        capture, settings, inputs = self.capture, self.settings, self.inputs
         screened = work.run(
             "screen",
             [inputs["versions"], inputs["photos"], settings.strict],
-            lambda f: screen(capture, f, strict=settings.strict, jobs=self.jobs, bar=bar),
+            lambda f: screen(capture, f, strict=settings.strict, jobs=self.jobs, bar=self.bar),
         )
-        facts = screened.facts["photos"]
-        sides = sorted((min(f["width"], f["height"]), f["work_name"]) for f in facts)
-        # Before the slow part the larger half of the photos; after it those that are placed.
+        photos = [ScreenedPhoto(**fields) for fields in screened.facts["photos"]]
+        sides = sorted((min(photo.size), photo.name) for photo in photos)
+        # Before the slow part the larger half of the photos; after it those that are registered.
         check_factor(settings.factor or 1, sides[len(sides) // 2 :])
-        tests = read_test_list(self.test_list, facts) if self.test_list else None
-        mask_stage = self._masks(work, screened)
-        sfm = self._sfm(work, screened, mask_stage)
-        mapping, features, matches = sfm.mapping, sfm.features, sfm.matches
+        tests = read_test_list(self.test_list, photos) if self.test_list else None
+        masks = self._masks(work, screened, photos)
+        sfm = self._sfm(work, screened, photos, masks)
+        mapping, matches = sfm.mapping, sfm.matches
         model = read_model(mapping.folder / "0")
-        stems = {f["work_name"]: f["stem"] for f in facts}
-        registered = {stems[i.name] for i in model.images.values()}
-        check_factor(settings.factor or 1, [s for s in sides if stems[s[1]] in registered])
-        train, test, how, split_warnings = split_photos(facts, registered, tests)
-        mask_stage = self._fixed_masks(work, screened, mask_stage, matches)
-        flat = self._undistort(work, screened, mask_stage, mapping, model)
+        registered = {image.name for image in model.images.values()}
+        check_factor(settings.factor or 1, [side for side in sides if side[1] in registered])
+        split = split_photos(photos, registered, tests)
+        masks = self._fixed_masks(work, photos, masks, matches)
+        factor = settings.factor or auto_factor([photo.size for photo in photos])
+        flat = work.run(
+            "undistort",
+            [mapping.key, inputs["truth"], factor],
+            lambda f: resample(
+                f,
+                model,
+                photos,
+                screened.folder / "photos",
+                masks.folder / "masks" if masks else None,
+                capture.truth,
+                factor,
+                jobs=self.jobs,
+                bar=self.bar,
+            ),
+        )
         motion = work.run(
             "motion",
-            [flat.key, train],
+            [mapping.key, split.train],
             lambda f: write_motion(
                 f,
                 matches.folder / DATABASE,
-                mapping.folder / MOTIONS,
+                mapping.folder / RELATIVE_POSES,
                 mapping.folder / "0",
                 flat.folder / "sparse" / "0",
-                {work_name: f"{stem}.png" for work_name, stem in stems.items() if f"{stem}.png" in train},
+                split.train,
             ),
         )
         drawn = work.run(
             "map",
-            [inputs["versions"], mapping.key, test],
+            [inputs["versions"], mapping.key, split.test],
             lambda f: draw_built(
-                f,
-                model,
-                mapping.facts,
-                {fact["work_name"]: fact["source"] for fact in facts},
-                [name for name, stem in stems.items() if f"{stem}.png" in test],
+                f, model, mapping.facts, {photo.name: photo.source for photo in photos}, split.test
             ),
         )
-        factor = settings.factor or auto_factor([(f["width"], f["height"]) for f in facts])
-        small_key, small_folder = flat.key, None
-        if factor > 1:
-            small = work.run(
-                "downsample",
-                [inputs["versions"], flat.key, factor],
-                lambda f: downsample(f, flat.folder, factor, jobs=self.jobs, bar=bar),
-            )
-            small_key, small_folder = small.key, small.folder
-        record_of_build = scene_record.scene_record(
-            settings,
+        results = BuildResults(
+            photos,
             screened.facts,
-            features.facts,
+            sfm.features.facts,
             matches.facts,
             mapping.facts,
-            model,
-            train=train,
-            test=test,
-            how=how,
-            factor=factor,
-            truth=flat.facts["truth"],
-            motion=motion.facts,
-            masks=mask_stage.facts if mask_stage else None,
-            fixed=matches.facts["fixed"],
-            warnings=[
-                *mask_warnings(mask_stage.facts if mask_stage else None),
-                *split_warnings,
-                *scene_record.map_warnings(drawn.facts),
-            ],
+            masks.facts if masks else None,
+            flat.facts,
+            motion.facts,
+            drawn.facts,
         )
         record: KeyedRecord = {
-            **record_of_build,
+            **scene_record.scene_record(settings, results, model, split),
             "build_key": self.build_key,
             "inputs": inputs,
             "seconds": {"collect": round(collect_s, 3), **work.seconds()},
@@ -201,22 +181,21 @@ class Stages:
         truth_files = [capture.truth / n for n in ("cameras.json", "capture.json")] if capture.truth else []
         parts = SceneParts(
             flat.folder,
-            small_folder,
             factor,
-            train,
-            test,
+            split.train,
+            split.test,
             [p for p in truth_files if p.is_file()],
             motion.folder / FILE,
             drawn.folder / MAP,
-            [n for n in test if mask_stage and n.removesuffix(".png") in mask_stage.facts["kept_share"]],
+            [n for n in split.test if masks and n.removesuffix(".png") in masks.facts["kept_share"]],
         )
-        return self._package(work, small_key, parts, record)
+        return self._package(work, flat.key, parts, record)
 
-    def _package(self, work: Workspace, small_key: str, parts: SceneParts, record: KeyedRecord) -> Path:
+    def _package(self, work: Workspace, flat_key: str, parts: SceneParts, record: KeyedRecord) -> Path:
         def run() -> StageResult[PackageResult]:
             return work.run(
                 "package",
-                [self.inputs, small_key],
+                [self.inputs, flat_key],
                 lambda f: package(f / "scene", parts, record, link=self.link, jobs=self.jobs),
             )
 
@@ -227,20 +206,21 @@ class Stages:
             done = run()
         return done.folder / "scene"
 
-    def _masks(self, work: Workspace, screened: StageResult[ScreenResult]) -> StageResult[MaskResult] | None:
-        facts, mask_files = screened.facts["photos"], {}
-        alpha = alphas(self.capture.root, facts)
+    def _masks(
+        self, work: Workspace, screened: StageResult[ScreenResult], photos: Sequence[ScreenedPhoto]
+    ) -> StageResult[MaskResult] | None:
+        root, mask_files = self.capture.root, {}
         if self.mask_folder is not None:
-            mask_files = find_masks(self.mask_folder, facts, self.settings.masks_missing)
-        elif not alpha:
+            mask_files = find_masks(self.mask_folder, photos, self.settings.masks_missing)
+        elif all(alpha_mask(root, photo) is None for photo in photos):
             return None
         key = [screened.key, mask_hashes(mask_files)]
-        return work.run("masks", key, lambda f: lay_out_masks(f, mask_files, facts, alpha))
+        return work.run("masks", key, lambda f: lay_out_masks(f, mask_files, photos, root))
 
     def _fixed_masks(
         self,
         work: Workspace,
-        screened: StageResult[ScreenResult],
+        photos: Sequence[ScreenedPhoto],
         masks: StageResult[MaskResult] | None,
         matches: StageResult[MatchResult],
     ) -> StageResult[MaskResult] | None:
@@ -248,11 +228,11 @@ class Stages:
         fixed = matches.facts["fixed"]
         if not fixed:
             return masks
-        before, facts = masks.folder / "masks" if masks else None, screened.facts["photos"]
+        before = masks.folder / "masks" if masks else None
         old: MaskResult = masks.facts if masks else {"kept_share": {}, "alpha": []}
 
         def add(folder: Path) -> MaskResult:
-            shares = add_fixed(folder, facts, matches.folder, fixed, before, old["kept_share"])
+            shares = add_fixed(folder, photos, matches.folder, fixed, before, old["kept_share"])
             return {"kept_share": shares, "alpha": old["alpha"]}
 
         return work.run("fixed-masks", [matches.key, masks and masks.key], add)
@@ -261,34 +241,36 @@ class Stages:
         self,
         work: Workspace,
         screened: StageResult[ScreenResult],
+        photos: Sequence[ScreenedPhoto],
         masks: StageResult[MaskResult] | None,
     ) -> SfmStages:
-        facts = screened.facts["photos"]
         attempts: list[SfmStages] = []
-        for plan in plans(facts, self.settings):
-            placed = max((attempt.placed for attempt in attempts), default=0)
-            if placed >= plan.below * len(facts):
+        for plan in plans(photos, self.settings):
+            registered = max((attempt.registered for attempt in attempts), default=0)
+            if registered >= plan.below * len(photos):
                 break
             if attempts:
-                self.bar.say(f"{placed} of {len(facts)} photos placed: trying harder")
-            attempts.append(self._attempt(work, screened, masks, plan, attempts[-1] if attempts else None))
-        # Of attempts that place equally many photos the last is taken, which is the most precise.
-        best = max(reversed(attempts), key=lambda a: (a.mapping.facts["firm"], a.placed))
-        sources, wanted = {f["work_name"]: f["source"] for f in facts}, self.settings.part
-        parts = scene_record.part_lines(best.mapping.facts["parts"], sources, wanted)
-        if wanted > len(best.mapping.facts["parts"]) > 0:
+                self.bar.say(f"{registered} of {len(photos)} photos placed: trying harder")
+            before = attempts[-1] if attempts else None
+            attempts.append(self._attempt(work, screened, photos, masks, plan, before))
+        # Of attempts that register equally many photos the last is taken, which is the most precise.
+        best = max(reversed(attempts), key=lambda a: (a.mapping.facts["reliable"], a.registered))
+        sources, wanted = {photo.name: photo.source for photo in photos}, self.settings.part
+        components = best.mapping.facts["components"]
+        parts = scene_record.part_lines(components, sources, wanted)
+        if wanted > len(components) > 0:
             raise AwError(f"no part {wanted}: {'; '.join(parts) or 'the photos form one part'}; omit --part")
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
         used = mask_warnings(masks.facts if masks else None) or used
         check_registered(
             best.mapping.facts["model"],
-            len(facts),
+            len(photos),
             len(screened.facts["skipped"]),
             best.matches.folder / DATABASE,
             best.matches.facts,
             self.settings.part,
             [
-                *panorama_warnings(facts),
+                *panorama_warnings(photos),
                 *used,
                 *scene_record.fixed_lines(best.matches.facts["fixed"]),
                 *parts,
@@ -301,22 +283,20 @@ class Stages:
         self,
         work: Workspace,
         screened: StageResult[ScreenResult],
+        photos: Sequence[ScreenedPhoto],
         masks: StageResult[MaskResult] | None,
         plan: SfmPlan,
         before: SfmStages | None,
     ) -> SfmStages:
-        settings, facts = self.settings, screened.facts["photos"]
-        photos = screened.folder / "photos"
-        camera = choose_camera(facts, settings.camera)
+        settings = self.settings
+        sfm = StructureFromMotion(photos, screened.folder / "photos", settings, plan, self.jobs, self.bar)
+        camera = choose_camera(photos, settings.camera)
         mask_folder = masks.folder / "masks" if masks else None
-
         features = work.run(
             "features",
             [screened.key, masks and masks.key, camera, plan.max_features, settings.max_side, plan.sift,
              settings.seed],
-            lambda f: extract_features(
-                f, photos, facts, settings, plan, self.jobs, camera, mask_folder, self.bar
-            ),
+            lambda f: sfm.extract_features(f, camera, mask_folder),
         )  # fmt: skip
         earlier = before if plan.continues else None
         left_out = (sorted(earlier.mapping.facts["left_out"]) or None) if earlier else None
@@ -324,57 +304,103 @@ class Stages:
             "matches",
             [features.key, plan.matcher, plan.ratio, plan.similar, plan.neighbours,
              earlier and earlier.matches.key, left_out, settings.seed],
-            lambda f: match(
-                f, features.folder, facts, settings, plan, self.jobs, self.bar,
-                earlier.matches.folder if earlier else None, left_out, photos=photos,
-            ),
+            lambda f: sfm.match(f, features.folder, earlier.matches.folder if earlier else None, left_out),
         )  # fmt: skip
         mapping = work.run(
             "mapping",
             [matches.key, settings.mapper, settings.part, to_plain(plan), settings.seed],
-            lambda f: map_scene(
-                f,
-                matches.folder,
-                photos,
-                len(facts),
-                matches.facts["connected"],
-                settings,
-                plan,
-                self.jobs,
-                self.bar,
-            ),
+            lambda f: sfm.map(f, matches.folder, matches.facts["connected"]),
         )
         return SfmStages(features, matches, mapping)
 
-    def _undistort(
-        self,
-        work: Workspace,
-        screened: StageResult[ScreenResult],
-        masks: StageResult[MaskResult] | None,
-        mapping: StageResult[MappingResult],
-        model: ColmapModel,
-    ) -> StageResult[UndistortResult]:
-        from ambiguous_wild.builder.undistort import undistort
 
-        photos = screened.folder / "photos"
+def split_photos(photos: Sequence[ScreenedPhoto], registered: set[str], tests: set[str] | None) -> PhotoSplit:
+    """Split the registered photos into training and test photos.
 
-        def read(fact: ScreenedPhoto) -> np.ndarray:
-            return read_png_rgb(photos / fact["work_name"])
+    Args:
+        photos: of the capture.
+        registered: names of those in the model.
+        tests: names in the user's test list, or None.
 
-        return work.run(
-            "undistort",
-            [mapping.key, _file_hashes(self.capture.truth)],
-            lambda f: undistort(
-                f,
-                model,
-                screened.facts["photos"],
-                read,
-                masks.folder / "masks" if masks else None,
-                self.capture.truth,
-                jobs=self.jobs,
-                bar=self.bar,
-            ),
+    Raises:
+        AwError: fewer than two training photos, or a test set without a registered photo.
+    """
+    inside = sorted((photo for photo in photos if photo.name in registered), key=lambda photo: photo.stem)
+    warnings = []
+    if tests is not None:
+        how, test = "list", [photo.name for photo in inside if photo.name in tests]
+        wanted = len(tests)
+    elif any(photo.side for photo in photos):
+        how, test = "folders", [photo.name for photo in inside if photo.side == "test"]
+        wanted = sum(photo.side == "test" for photo in photos)
+    else:
+        how, test = f"every-{TEST_EVERY}", [photo.name for photo in inside[::TEST_EVERY]]
+        wanted = len(test)
+        warnings.append(
+            f"no test set given, so every {TEST_EVERY}th photo is a test photo: distractors in it count "
+            "as truth in the scores; give clean photos in test/, or --test-list FILE"
         )
+    train = [photo.name for photo in inside if photo.name not in test]
+    if wanted and not test:
+        raise AwError(
+            f"none of the {wanted} test photos could be placed among the training photos: they show "
+            "another place or too little overlap; take them nearer to the training views"
+        )
+    if len(train) < 2:
+        raise AwError(f"only {len(train)} training photos could be placed; a scene needs at least 2")
+    if len(test) < wanted:
+        warnings.append(f"{wanted - len(test)} of {wanted} test photos are lost: scores cover {len(test)}")
+    return PhotoSplit(train, test, how, warnings)
+
+
+def read_test_list(path: Path, photos: Sequence[ScreenedPhoto]) -> set[str]:
+    """Return the names of the photos in a test list.
+
+    The list names photos by path, by file name or without extension.
+
+    Raises:
+        AwError: the file cannot be read or is empty, names an unknown photo, or names all photos.
+    """
+    try:
+        lines = read_list(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise AwError(f"cannot read the test list {path}: {error}") from error
+    by_line: dict[str, ScreenedPhoto] = {}
+    by_ending: dict[str, dict[str, ScreenedPhoto]] = {}  # line -> name -> photo
+    for photo in photos:
+        source = PurePosixPath(photo.source)
+        for key in (str(source), photo.stem, photo.name, *photo.copies):
+            by_line.setdefault(key, photo)
+        for i in range(len(source.parts)):
+            end = PurePosixPath(*source.parts[i:])
+            for key in (str(end), str(end.with_suffix(""))):
+                by_ending.setdefault(key, {})[photo.name] = photo
+    if twice := [line for line in lines if line not in by_line and len(by_ending.get(line, ())) > 1]:
+        stems = sorted(photo.stem for photo in by_ending[twice[0]].values())
+        raise AwError(
+            f"{path}: {shortlist(map(repr, twice), 3)} is the name of several photos "
+            f"({shortlist(stems, 3)}); write their folders too"
+        )
+    by_line = {key: next(iter(found.values())) for key, found in by_ending.items()} | by_line
+    unknown = [line for line in lines if line not in by_line]
+    if unknown:
+        what = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
+        raise AwError(
+            f"{path} names {what} not in the capture: "
+            + shortlist((_with_nearest(line, by_line) for line in unknown), 3)
+        )
+    if not lines:
+        raise AwError(f"{path} is empty; list test photos one a line, or leave out --test-list")
+    tests = {by_line[line].name for line in lines}
+    if len(tests) == len(photos):
+        raise AwError(f"{path} names all {len(photos)} photos: no training photo would be left; list fewer")
+    return tests
+
+
+def _with_nearest(line: str, by_line: dict[str, ScreenedPhoto]) -> str:
+    """Quote the unknown line and add the photo whose name is nearest to it."""
+    near = difflib.get_close_matches(line, by_line, n=1, cutoff=0.5)
+    return f"{line!r} (did you mean {by_line[near[0]].source!r}?)" if near else repr(line)
 
 
 def _file_hashes(folder: Path | None) -> list[list[str]] | None:

@@ -12,8 +12,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.downsample import downsample_mask, downsample_photo, downsampled_size
-from ambiguous_wild.builder.undistort import MOST_LOST, Lens, make_lens
+from ambiguous_wild.builder.resample import (
+    MOST_LOST,
+    Lens,
+    downsample_mask,
+    downsample_photo,
+    downsampled_size,
+    make_lens,
+)
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene, find_photo
 from ambiguous_wild.io.colmap_records import ONE_FOCAL, ColmapModel, ModelCamera, ModelImage

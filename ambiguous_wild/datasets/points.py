@@ -9,16 +9,21 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
 from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import MotionResult, ScreenedPhoto
-from ambiguous_wild.builder.retrieval import MOTIONS
+from ambiguous_wild.builder.retrieval import RELATIVE_POSES
 from ambiguous_wild.builder.settings import BuildSettings, Effort, plans
-from ambiguous_wild.builder.sfm import DATABASE, MotionJob, TriangulationJob, extract_features, match, run_job
+from ambiguous_wild.builder.sfm import (
+    DATABASE,
+    RelativePoseJob,
+    StructureFromMotion,
+    TriangulationJob,
+    run_job,
+)
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split, near_others
 from ambiguous_wild.io.colmap_model import read_model, write_model
@@ -154,22 +159,22 @@ def find_motion(
     model = read_model(scene / "sparse" / "0")
     split: dict[str, Split] = dict.fromkeys(train, "train")
     database = _match_posed(scratch, model, scene / "images", split, "auto", seed, jobs, bar)
-    job: MotionJob = {
-        "task": "motions",
+    job: RelativePoseJob = {
+        "task": "relative_poses",
         "database": str(database),
         "model": str(scratch / "known"),
-        "output": str(scratch / MOTIONS),
+        "output": str(scratch / RELATIVE_POSES),
         "seed": seed,
         "jobs": jobs,
     }
     bar.start("motions", None)
     run_job(job, scratch, lambda: None)
     bar.finish()
-    names = {name: name for name in train}
-    stats = write_motion(scene, database, scratch / MOTIONS, scratch / "known", scene / "sparse" / "0", names)
-    if 2 * stats["silent"] > len(names):
+    known = scratch / "known"
+    stats = write_motion(scene, database, scratch / RELATIVE_POSES, known, scene / "sparse" / "0", train)
+    if 2 * stats["silent"] > len(train):
         raise AwError(
-            f"in {stats['silent']} of {len(names)} train photos no matches fit the given poses, so it is "
+            f"in {stats['silent']} of {len(train)} train photos no matches fit the given poses, so it is "
             "unknown what moves; import without --motion, or place the photos anew with 'aw build-scene'"
         )
     return stats
@@ -187,17 +192,16 @@ def _match_posed(
 ) -> Path:
     """Make COLMAP's database of the matched photos in `split` with known cameras; write poses to known/."""
     used = {i.name: i for i in model.images.values() if i.name in split}
-    facts = [
-        cast(ScreenedPhoto, {"work_name": name, "source": name, "side": split[name]}) for name in sorted(used)
-    ]
+    used_photos = [ScreenedPhoto(source=name, name=name, side=split[name]) for name in sorted(used)]
     settings = BuildSettings(seed=seed, sfm=sfm)
     camera = "single" if len(model.cameras) == 1 else "per-image"
     for part in ("features", "matches", "known"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    plan = replace(plans(facts, settings)[0], max_features=settings.max_features)
-    extract_features(folder / "features", photos, facts, settings, plan, jobs, camera, None, bar)
+    plan = replace(plans(used_photos, settings)[0], max_features=settings.max_features)
+    attempt = StructureFromMotion(used_photos, photos, settings, plan, jobs, bar)
+    attempt.extract_features(folder / "features", camera)
     _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
-    match(folder / "matches", folder / "features", facts, settings, plan, jobs, bar, posed=True)
+    attempt.match(folder / "matches", folder / "features", posed=True)
     return folder / "matches" / DATABASE
 
 

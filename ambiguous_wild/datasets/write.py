@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NotRequired, TypedDict, cast
 
-from ambiguous_wild.builder.downsample import check_factor
 from ambiguous_wild.builder.keep_masks import mask_warnings
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.resample import check_factor
 from ambiguous_wild.builder.scene_package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.scene_record import point_checks
 from ambiguous_wild.builder.workspace import content_key, versions
@@ -327,7 +327,7 @@ def _record(
 ) -> ImportRecord:
     """Assemble scene.json without its files and times."""
     tests = {n for n, s in sides.items() if s == "test"}
-    only_test, short = point_checks(model, {n: n for n in sides}, tests)
+    only_test, short = point_checks(model, tests)
     warnings = [
         f"{counted(len(names), f'listed {side} photo')} not in the model: {shortlist(names)}"
         for side, names in foreign.missing.items()

@@ -22,6 +22,7 @@ from ambiguous_wild.io.images import image_size
 SCENE_SCHEMA = 1  # version of scene.json, raised when an older reader would misread it
 MOST_FACTOR = 1000  # largest downsampling factor; the builder allows 64
 SIDES: tuple[Split, Split] = ("train", "test")
+MAP = "map.png"  # in the scene's folder: the cameras from above
 TEST_EVERY = 8  # in scenes without lists every 8th photo is a test photo, as in 3DGS and gsplat
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")

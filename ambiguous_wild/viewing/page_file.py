@@ -16,13 +16,13 @@ from ambiguous_wild.io.files import check_output, refuse_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
+from ambiguous_wild.io.scene_folder import MAP
 from ambiguous_wild.io.splat_arrays import finite, sigmoid
 from ambiguous_wild.io.splat_files import FORMATS, drawable
 from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
 PAGE = "index.html"
-MAP = "map.png"  # in the scene's folder
 GENERATOR = '<meta name="generator" content="aw view">'
 MOST_GAUSSIANS = 150_000  # default size of a model: about 6 MB, which a phone still turns smoothly
 MOST_PHOTO_BYTES = 1_000_000  # text of all photos and of the map

@@ -29,16 +29,16 @@ def texture(seed: int) -> np.ndarray:
     return np.clip(255 * image / image.max(), 0, 255).astype(np.uint8)
 
 
-def walls() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, int]]:
+def walls(seeds: tuple[int, int] = (1, 2)) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, int]]:
     """(corner, edge u, edge v, texture seed) of each wall, world units."""
     up = np.array([0.0, 4.0, 0.0])
     return [
-        (np.array([-3.0, -2.0, 4.5]), np.array([3.0, 0.0, 1.5]), up, 1),
-        (np.array([0.0, -2.0, 6.0]), np.array([3.0, 0.0, -1.5]), up, 2),
+        (np.array([-3.0, -2.0, 4.5]), np.array([3.0, 0.0, 1.5]), up, seeds[0]),
+        (np.array([0.0, -2.0, 6.0]), np.array([3.0, 0.0, -1.5]), up, seeds[1]),
     ]
 
 
-def render(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+def render(eye: np.ndarray, target: np.ndarray, seeds: tuple[int, int] = (1, 2)) -> np.ndarray:
     """[H, W, 3] uint8 as a camera at `eye` looking at `target` sees the walls."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross([0.0, 1.0, 0.0], z)
@@ -46,7 +46,7 @@ def render(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     rotation = np.stack([x, np.cross(z, x), z])
     k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     photo = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
-    for corner, u, v, seed in walls():
+    for corner, u, v, seed in walls(seeds):
         plane = np.column_stack([u / _TEXELS, v / _TEXELS, corner - eye])  # texel -> world, from the eye
         homography = k @ rotation @ plane
         warped = cv2.warpPerspective(texture(seed), homography, (WIDTH, HEIGHT), flags=cv2.INTER_AREA)
@@ -61,13 +61,15 @@ def eyes(count: int) -> list[np.ndarray]:
     return [np.array([3.0 * np.sin(a), 0.2 * np.cos(5 * a), 5.0 - 4.5 * np.cos(a)]) for a in angles]
 
 
-def write_capture(folder: Path, count: int = 6, prefix: str = "p") -> list[Path]:
-    """Photos `p00.jpg`, `p01.jpg`, ... in `folder`."""
+def write_capture(
+    folder: Path, count: int = 6, prefix: str = "p", seeds: tuple[int, int] = (1, 2)
+) -> list[Path]:
+    """Photos `p00.jpg`, `p01.jpg`, ... in `folder`; walls of other seeds are another place."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for i, eye in enumerate(eyes(count)):
         path = folder / f"{prefix}{i:02d}.jpg"
-        pixels = render(eye, np.array([0.0, 0.0, 5.2]))
+        pixels = render(eye, np.array([0.0, 0.0, 5.2]), seeds)
         path.write_bytes(
             cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
         )

@@ -139,7 +139,7 @@ def test_pairs_of_a_large_capture_grow_with_its_length() -> None:
 
 def test_featureless_photos_are_unknown_not_an_error() -> None:
     got = compare_photos([photo_features(np.full((60, 80, 3), 90, np.uint8))] * 3)
-    assert np.isnan(got.offsets).all() and got.partners.tolist() == [0, 0, 0] and not got.matches
+    assert np.isnan(got.offsets).all() and got.covisible.tolist() == [0, 0, 0] and not got.matches
 
 
 def test_noise_of_a_grey_card_is_its_sigma() -> None:

@@ -3,7 +3,7 @@ import os
 
 import pytest
 
-from ambiguous_wild.builder.collect import collect, identical, natural_key, read_test_list
+from ambiguous_wild.builder.collect import collect, identical, natural_key
 from ambiguous_wild.core import AwError
 
 
@@ -20,16 +20,16 @@ def stems(capture):
 def test_natural_order_and_hashes(tmp_path):
     put(tmp_path, "IMG_10.jpg", "IMG_2.jpg", "img_1.JPG", "notes.txt", ".hidden.jpg")
     capture = collect(tmp_path)
-    assert [s.relative for s in capture.sources] == ["img_1.JPG", "IMG_2.jpg", "IMG_10.jpg"]
+    assert [s.source for s in capture.sources] == ["img_1.JPG", "IMG_2.jpg", "IMG_10.jpg"]
     assert capture.ignored == ("notes.txt",)
     assert capture.sources[0].sha256 == hashlib.sha256(b"img_1.JPG").hexdigest()
-    assert capture.sources[0].work_name == "img_1.jpg"
+    assert capture.sources[0].name == "img_1.png"
     assert sorted(["a10", "a9", "a"], key=natural_key) == ["a", "a9", "a10"]
 
 
 def test_photos_in_images_folder(tmp_path):
     put(tmp_path / "images", "a.jpg", "b.jpg", "c.jpg")
-    assert [s.relative for s in collect(tmp_path).sources] == ["images/a.jpg", "images/b.jpg", "images/c.jpg"]
+    assert [s.source for s in collect(tmp_path).sources] == ["images/a.jpg", "images/b.jpg", "images/c.jpg"]
 
 
 def test_train_and_test_folders_tell_equal_names_apart(tmp_path):
@@ -96,7 +96,7 @@ def test_several_folders_are_one_capture_and_equal_names_stay_apart(tmp_path, fi
     capture = collect(tmp_path if raw == "." else [tmp_path / r for r in raw])
     assert stems(capture) == expected
     assert len({s.path for s in capture.sources}) == len(expected)
-    assert all((capture.root / s.relative) == s.path for s in capture.sources)
+    assert all((capture.root / s.source) == s.path for s in capture.sources)
 
 
 def test_folders_that_are_left_out_are_named_and_none_is_read_twice(tmp_path):
@@ -116,19 +116,6 @@ def test_masks_beside_the_photos_are_no_photos_and_their_option_is_named(tmp_pat
     (note,) = capture.notes
     assert f"--keep-masks '{tmp_path / name}'" in note
     assert collect(tmp_path, masks=tmp_path / name).notes == ()
-
-
-def test_a_test_list_names_the_folder_where_two_photos_have_one_name(tmp_path):
-    put(tmp_path / "front", "0.jpg", "1.jpg")
-    put(tmp_path / "back", "0.jpg")
-    facts = [{"source": s.relative, "stem": s.stem} for s in collect(tmp_path).sources]
-    listed = tmp_path / "list.txt"
-    for name, expected in (("front/0.jpg", "front_0"), ("back/0", "back_0"), ("1.jpg", "front_1")):
-        listed.write_text(name)
-        assert read_test_list(listed, facts) == {expected}
-    listed.write_text("0.jpg")
-    with pytest.raises(AwError, match=r"'0\.jpg' is the name of several photos \(back_0, front_0\)"):
-        read_test_list(listed, facts)
 
 
 def test_one_side_alone_and_no_folder(tmp_path):

@@ -249,4 +249,4 @@ def test_the_capture_check_names_it_and_compares_the_rest(tmp_path: Path):
     check = fixed_to_camera(compared)
     assert check.state == "warning" and check.finding.startswith("the lower 2") and check.advice
     assert fixed_to_camera(plain).state == "ok" and plain.fixed == []
-    assert compared.partners.tolist() == plain.partners.tolist()
+    assert compared.covisible.tolist() == plain.covisible.tolist()

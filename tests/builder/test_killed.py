@@ -21,7 +21,7 @@ SETTINGS = BuildSettings(factor=2, max_features=500, name="walls")
 _DIE = "os.kill(os.getpid(), signal.SIGKILL)"
 KILLS = {
     "inside screening": f"S._lay_out = lambda *a: {_DIE}",
-    "between features and matches": f"T.match = lambda *a: {_DIE}",
+    "between features and matches": f"F.StructureFromMotion.match = lambda *a: {_DIE}",
     "while COLMAP matches": (
         "real = F.run_job\n"
         "def run(job, folder, watch):\n"
@@ -30,7 +30,7 @@ KILLS = {
         "F.run_job = run"
     ),
     "inside undistortion": (
-        "import ambiguous_wild.builder.undistort as U\n"
+        "import ambiguous_wild.builder.resample as U\n"
         "from pathlib import Path\n"
         "real = U.write_png\n"
         f"U.write_png = lambda path, image: {_DIE} if Path(path).stem == 'p02' else real(path, image)"
@@ -43,7 +43,7 @@ KILLS = {
 }  # fmt: skip
 _SCRIPT = """
 import os, signal, sys
-from ambiguous_wild.builder import pipeline as P, screen as S, sfm as F, stages as T
+from ambiguous_wild.builder import pipeline as P, screen as S, sfm as F
 from ambiguous_wild.builder.settings import BuildSettings
 {kill}
 P.build_scene(sys.argv[1], sys.argv[2], BuildSettings(factor=2, max_features=500, name="walls"), jobs=1)
@@ -62,7 +62,6 @@ REUSED = {
         "undistort",
         "motion",
         "map",
-        "downsample",
         "package",
     },
 }

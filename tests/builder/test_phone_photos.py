@@ -12,6 +12,7 @@ import pytest
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.screen import screen
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.io.photos import UnreadablePhoto, read_photo
@@ -94,7 +95,7 @@ def test_one_photo_in_two_formats_counts_once_and_bursts_are_told(tmp_path):
     assert any(
         "1 bursts of near-identical photos" in w and "p03.jpg and 1 more" in w for w in info["warnings"]
     )
-    kept = [photo["work_name"] for photo in info["photos"]]
+    kept = [ScreenedPhoto(**fields).name for fields in info["photos"]]
     assert len(kept) == 8 and sorted(p.name for p in (tmp_path / "photos").iterdir()) == sorted(kept)
 
 
@@ -109,8 +110,8 @@ def test_one_camera_a_device(tmp_path):
     database = next((tmp_path / ".scene.build").glob("features-*/database.db"))
     with closing(sqlite3.connect(database)) as db:
         cameras = dict(db.execute("SELECT name, camera_id FROM images").fetchall())
-    assert len({cameras[f"p{i:02d}.jpg"] for i in (0, 2, 4)}) == 1
-    assert cameras["p00.jpg"] != cameras["p01.jpg"]
+    assert len({cameras[f"p{i:02d}.png"] for i in (0, 2, 4)}) == 1
+    assert cameras["p00.png"] != cameras["p01.png"]
 
 
 def test_heic_photos_build(tmp_path):

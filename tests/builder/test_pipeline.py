@@ -163,7 +163,7 @@ def test_other_settings_are_refused_by_name_until_overwrite(built, raw, tmp_path
     other = replace(SETTINGS, factor=4)
     result = build_scene(raw, out, other, overwrite=True, keep_work=True)
     # Only what depends on the factor ran again.
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion", "map"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "motion", "map"}
     assert (out / "images_4").is_dir()
     assert not (out / "images_2").exists()
     # The scene deleted, the work kept: packaging runs again, nothing else.
@@ -243,6 +243,21 @@ def test_photos_of_different_places_fail_cleanly_with_the_figures(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
 
 
+def test_the_second_part_of_a_capture_is_built_on_demand(tmp_path):
+    """Two places, 6 and 4 photos: --part 2 builds the smaller one, with a warning that names both."""
+    write_capture(tmp_path / "raw", 6)
+    write_capture(tmp_path / "raw", 4, "q", seeds=(3, 4))
+    settings = BuildSettings(factor=1, max_features=500, sfm="fast", part=2)
+    info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
+    sources = {photo["source"] for photo in info["photos"].values() if photo["split"]}
+    assert sources == {f"q{k:02d}.jpg" for k in range(4)}
+    model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "0"))
+    assert {image.name[0] for image in model.images.values()} == {"q"} and model.num_points3D() > 40
+    assert {photo["reason"].partition(":")[0] for photo in info["lost"]} == {"in part 1"}
+    (warning,) = (text for text in info["warnings"] if "fall into 2 parts" in text)
+    assert "part 1 of 6 (p00.jpg" in warning and "part 2 of 4 (q00.jpg" in warning
+
+
 def test_identical_photos_fail_cleanly(tmp_path):
     path = write_capture(tmp_path / "raw", 1)[0]
     for level in (1, 9):  # the same pixels in other bytes: no copies that could be left out beforehand
@@ -255,21 +270,21 @@ def test_identical_photos_fail_cleanly(tmp_path):
 
 
 def test_a_full_disk_keeps_what_is_done_and_goes_on(built, raw, scene, tmp_path, monkeypatch):
-    from ambiguous_wild.builder import downsample
+    from ambiguous_wild.builder import resample
 
     def full(*args):
         raise OSError(errno.ENOSPC, "No space left on device", "/disk/p02.png")
 
     shutil.rmtree(copy_of(built, tmp_path / "scene"))  # its last stage went with it
-    (unfinished,) = (tmp_path / ".scene.build").glob("downsample-*")
+    (unfinished,) = (tmp_path / ".scene.build").glob("undistort-*")
     shutil.rmtree(unfinished)
     with monkeypatch.context() as patch:
-        patch.setattr(downsample, "write_png", full)
+        patch.setattr(resample, "write_png", full)
         with pytest.raises(AwError, match=r"No space left on device \(/disk/p02\.png\).*goes on"):
             build_scene(raw, tmp_path / "scene", SETTINGS)
     assert not (tmp_path / "scene").exists()
     result = build_scene(raw, tmp_path / "scene", SETTINGS)
-    assert set(result.reused) == {"screen", "features", "matches", "mapping", "undistort", "motion", "map"}
+    assert set(result.reused) == {"screen", "features", "matches", "mapping", "motion", "map"}
     assert hashes(result.scene) == hashes(scene)
 
 

@@ -8,7 +8,7 @@ import pytest
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.retrieval import (
     SIMILAR,
-    best_partners,
+    best_pairs,
     embed,
     most_similar,
     pairs_of_tests,
@@ -85,8 +85,8 @@ def test_pairs_are_those_that_share_features(count):
 
 def test_what_looks_like_chance_is_left_out():
     shared = {(0, 1): 50, (0, 2): 4, (0, 3): 3, (0, 4): 2, (0, 5): 1, (0, 6): 0, (1, 2): 9}
-    assert best_partners(shared, {0: 6}) == {(0, 1), (0, 2), (0, 3), (0, 4)}
-    assert best_partners(shared, {2: 1}) == {(1, 2)}
+    assert best_pairs(shared, {0: 6}) == {(0, 1), (0, 2), (0, 3), (0, 4)}
+    assert best_pairs(shared, {2: 1}) == {(1, 2)}
     assert shared_features({"a": np.zeros((1, 128), np.uint8)}.__getitem__, ["a", "a"], [(0, 1)], 1) == {
         (0, 1): 0
     }
@@ -94,8 +94,8 @@ def test_what_looks_like_chance_is_left_out():
 
 def test_some_partners_are_far_in_a_dense_capture():
     shared = {(a, b): max(100 - 2 * (b - a), 0) for a in range(90) for b in range(a + 1, 90)}
-    chain = [b - a for a, b in best_partners(shared, dict.fromkeys(range(90), 8))]
-    spread = [b - a for a, b in best_partners(shared, dict.fromkeys(range(90), 8), far=0.5)]
+    chain = [b - a for a, b in best_pairs(shared, dict.fromkeys(range(90), 8))]
+    spread = [b - a for a, b in best_pairs(shared, dict.fromkeys(range(90), 8), far=0.5)]
     assert max(chain) == 8 and max(spread) == 40  # of 20 matches: fewer are not trusted
     assert len(spread) <= 90 * 8 and spread.count(1) == 89  # the nearest are still partners
     vectors = np.array([[np.cos(k / 50), np.sin(k / 50)] for k in range(90)])

@@ -1,10 +1,12 @@
 import dataclasses
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
 from ambiguous_wild.builder import diagnosis
 from ambiguous_wild.builder.diagnosis import PairFacts, check_registered
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.scene_record import _lost_photos, _parallax_warnings, parallax_deg, part_lines
 from ambiguous_wild.core import AwError
 from tests.io.model_maker import make_model
@@ -19,12 +21,12 @@ def summary(images, points=None):
 
 
 def test_each_lost_photo_gets_its_reason():
-    facts = [{"work_name": f"{n}.jpg", "source": f"{n}.JPG"} for n in "abc"]
+    photos = [ScreenedPhoto(f"{n}.JPG", f"{n}.jpg") for n in "abc"]
     features = {"a.jpg": 900, "b.jpg": 12, "c.jpg": 900}
-    left_out = {"b.jpg": "no placed photo agrees", "c.jpg": "two places"}
-    assert _lost_photos(facts, left_out, features) == [
+    left_out = {"b.jpg": "no placed photo agrees", "c.jpg": "two poses"}
+    assert _lost_photos(photos, left_out, features) == [
         {"source": "b.JPG", "reason": "only 12 features"},
-        {"source": "c.JPG", "reason": "two places"},
+        {"source": "c.JPG", "reason": "two poses"},
     ]
 
 
@@ -43,30 +45,33 @@ def test_the_reason_follows_the_figures(change, reason):
     assert reason in dataclasses.replace(FACTS, **change).reason(10)
 
 
-def test_enough_photos_pass_and_the_share_counts(tmp_path):
-    check_registered(summary(3), 10, 0, tmp_path / "unused.db", {"pairs": 45})
-    check_registered(summary(3), 3, 0, tmp_path / "unused.db", {"pairs": 3})
-    import ambiguous_wild.builder.diagnosis as module
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "pair_facts", lambda *_: FACTS)
-        with pytest.raises(AwError, match=r"placed 8 of 29 photos;.*needs 9"):
-            check_registered(summary(8), 29, 0, tmp_path / "x.db", {"pairs": 45})
-        with pytest.raises(AwError, match=r"placed 0 of 4 photos, 2 were left out.*needs 3"):
-            check_registered(None, 4, 2, tmp_path / "x.db", {"pairs": 6})
+TURNED = dataclasses.replace(FACTS, verified=12, degenerate=1.0, angle_deg=0.3)
 
 
-def test_photos_placed_without_points_are_no_scene(tmp_path):
-    import ambiguous_wild.builder.diagnosis as module
-
-    turned = dataclasses.replace(FACTS, verified=12, degenerate=1.0, angle_deg=0.3)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "pair_facts", lambda *_: turned)
-        with pytest.raises(
-            AwError, match=r"placed 4 of 12 photos with 0 points.*needs 4 and 10 points.*only turned"
-        ):
-            check_registered(summary(4, 0), 12, 0, tmp_path / "x.db", {"pairs": 66})
-    check_registered(summary(4, 40), 12, 0, tmp_path / "unused.db", {"pairs": 66})
+@pytest.mark.parametrize(
+    ("model", "photos", "skipped", "part", "facts", "message"),
+    [
+        (summary(3), 10, 0, 1, FACTS, None),
+        (summary(3), 3, 0, 1, FACTS, None),
+        (summary(8), 29, 0, 1, FACTS, r"placed 8 of 29 photos;.*needs 9"),
+        (None, 4, 2, 1, FACTS, r"placed 0 of 4 photos, 2 were left out.*needs 3"),
+        (
+            summary(4, 0),
+            12,
+            0,
+            1,
+            TURNED,
+            r"placed 4 of 12 photos with 0 points.*needs 4 and 10.*turned",
+        ),
+        (summary(4, 40), 12, 0, 1, TURNED, None),
+        (summary(4, 400), 40, 0, 2, FACTS, None),  # the user asked for a small part
+        (summary(4, 400), 40, 0, 1, FACTS, "placed 4 of 40 photos"),  # the first part is most of the place
+    ],
+)
+def test_enough_photos_and_points_pass(tmp_path, monkeypatch, model, photos, skipped, part, facts, message):
+    monkeypatch.setattr(diagnosis, "pair_facts", lambda *_: facts)
+    with nullcontext() if message is None else pytest.raises(AwError, match=message):
+        check_registered(model, photos, skipped, tmp_path / "x.db", {}, part)
 
 
 def test_parallax_is_the_angle_under_which_points_are_seen():
@@ -100,11 +105,3 @@ def test_parts_are_named_with_the_option_that_builds_another():
     assert "--part 2 builds part 2" in line
     assert "--part 1 builds part 1" in part_lines([list("abcd"), list("efg")], sources, 2)[0]
     assert part_lines([list("abcd")], sources, 1) == []
-
-
-def test_a_part_that_the_user_asks_for_may_be_small(tmp_path, monkeypatch):
-    monkeypatch.setattr(diagnosis, "pair_facts", lambda *_: FACTS)
-    model = summary(4, 400)
-    check_registered(model, 40, 0, tmp_path / "unused.db", {}, 2)
-    with pytest.raises(AwError, match="placed 4 of 40 photos"):  # the first part is most of the place
-        check_registered(model, 40, 0, tmp_path / "unused.db", {}, 1)

@@ -9,40 +9,55 @@ from typing import Any
 
 import pytest
 
-from ambiguous_wild.builder import sfm, stages
+from ambiguous_wild.builder import stages
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
+from ambiguous_wild.builder.sfm import StructureFromMotion
 from ambiguous_wild.builder.stages import SfmStages, Stages
+from ambiguous_wild.core import AwError
 from tests.builder.capture_maker import write_capture
 
 
 def attempts(
-    monkeypatch: pytest.MonkeyPatch, placed: dict[str, int], photos: int, firm: dict[str, int] | None = None
+    monkeypatch: pytest.MonkeyPatch,
+    registered: dict[str, int],
+    photos: int,
+    reliable: dict[str, int] | None = None,
+    part: int = 1,
 ) -> tuple[list[str], Any]:
-    """The plans that were tried, and what was chosen, where each places so many photos."""
+    """The plans that were tried, and what was chosen, where each registers so many photos."""
     tried: list[str] = []
 
-    def attempt(self: Stages, work: Any, screened: Any, masks: Any, plan: Any, before: Any) -> SfmStages:
+    def attempt(
+        self: Stages, work: Any, screened: Any, photos: Any, masks: Any, plan: Any, before: Any
+    ) -> SfmStages:
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)
-        if plan.name not in placed:  # it places nothing
-            placed[plan.name] = 0
-        model = {"images": placed[plan.name], "points": 9999} if placed[plan.name] else None
-        facts = {"model": model, "plan": plan.name, "fixed": [], "firm": (firm or placed)[plan.name]}
-        facts["parts"] = [["p.jpg"] * placed[plan.name]]
+        if plan.name not in registered:  # it registers nothing
+            registered[plan.name] = 0
+        model = {"images": registered[plan.name], "points": 9999} if registered[plan.name] else None
+        components = [["p.jpg"] * registered[plan.name]]
+        facts = {"model": model, "plan": plan.name, "fixed": [], "components": components}
+        facts["reliable"] = (reliable or registered)[plan.name]
         part = SimpleNamespace(folder=Path("nowhere"), facts=facts)
         return SfmStages(part, part, part)
 
     monkeypatch.setattr(Stages, "_attempt", attempt)
-    one = {"width": 1000, "height": 800, "work_name": "p.jpg", "source": "p.jpg"}
-    facts = {"photos": [one] * photos, "skipped": []}
-    self = Stages(SimpleNamespace(), BuildSettings(), None, None, 1, Bar(enabled=False), False)
-    return tried, self._sfm(SimpleNamespace(), SimpleNamespace(facts=facts), None).mapping.facts["plan"]
+    screened = SimpleNamespace(facts={"skipped": []})
+    self = Stages(SimpleNamespace(), BuildSettings(part=part), None, None, 1, Bar(enabled=False), False)
+    one = ScreenedPhoto("p.jpg", "p.jpg", width=1000, height=800)
+    return tried, self._sfm(SimpleNamespace(), screened, [one] * photos, None).mapping.facts["plan"]
 
 
 def test_fast_is_enough_where_it_places_everything(monkeypatch):
     assert attempts(monkeypatch, {"fast": 30, "wider": 30}, 30) == (["fast"], "fast")
+
+
+def test_a_part_that_does_not_exist_is_refused(monkeypatch):
+    with pytest.raises(AwError, match=r"no part 2: the photos form one part; omit --part"):
+        attempts(monkeypatch, {"fast": 30}, 30, part=2)
 
 
 @pytest.mark.parametrize(
@@ -63,23 +78,24 @@ def test_the_attempt_that_places_more_is_kept(monkeypatch, fast, wider, thorough
 
 
 def test_photos_placed_without_doubt_count_first(monkeypatch):
-    placed, firm = {"fast": 20, "thorough": 23}, {"fast": 20, "thorough": 3}
-    assert attempts(monkeypatch, placed, 25, firm) == (["fast", "thorough"], "fast")
+    registered, reliable = {"fast": 20, "thorough": 23}, {"fast": 20, "thorough": 3}
+    assert attempts(monkeypatch, registered, 25, reliable) == (["fast", "thorough"], "fast")
 
 
 def test_nothing_is_mapped_where_pairs_connect_too_few_photos(tmp_path):
     plan = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4, worth=0.5)
-    settings, bar = BuildSettings(), Bar(enabled=False)
-    result = sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 4, settings, plan, 1, bar)
-    assert result["model"] is None and result["parts"] == [] and result["plan"] == "fast"
+    photos = [ScreenedPhoto(f"{k}.jpg", f"{k}.png") for k in range(9)]
+    attempt = StructureFromMotion(photos, tmp_path, BuildSettings(), plan, 1, Bar(enabled=False))
+    result = attempt.map(tmp_path, tmp_path, 4)
+    assert result["model"] is None and result["components"] == [] and result["plan"] == "fast"
     with pytest.raises(FileNotFoundError):  # five are enough to try, and there is no database here
-        sfm.map_scene(tmp_path, tmp_path, tmp_path, 9, 5, settings, plan, 1, bar)
+        attempt.map(tmp_path, tmp_path, 5)
 
 
 def test_all_pairs_of_many_photos_are_matched_only_if_less_than_half_is_placed(monkeypatch):
     assert attempts(monkeypatch, {"fast": 70, "wider": 70}, 120) == (["fast", "wider"], "wider")
-    placed = {"fast": 50, "wider": 50, "thorough": 90}
-    assert attempts(monkeypatch, placed, 120) == (["fast", "wider", "thorough"], "thorough")
+    registered = {"fast": 50, "wider": 50, "thorough": 90}
+    assert attempts(monkeypatch, registered, 120) == (["fast", "wider", "thorough"], "thorough")
 
 
 def test_few_photos_are_matched_thoroughly_at_once(monkeypatch):
@@ -87,21 +103,20 @@ def test_few_photos_are_matched_thoroughly_at_once(monkeypatch):
 
 
 def test_other_features_are_tried_where_the_careful_ones_leave_over_a_tenth_out(monkeypatch):
-    placed = {"fast": 8, "thorough": 13, "covariant": 16}
-    assert attempts(monkeypatch, placed, 16) == (["fast", "thorough", "covariant"], "covariant")
+    registered = {"fast": 8, "thorough": 13, "covariant": 16}
+    assert attempts(monkeypatch, registered, 16) == (["fast", "thorough", "covariant"], "covariant")
 
 
 def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):
     """COLMAP itself; fast looks at tiny photos here, and finds next to nothing."""
     write_capture(tmp_path / "raw", 8)
-    real = stages.extract_features
+    real = StructureFromMotion.extract_features
 
-    def blinded(folder: Path, photos: Path, facts: Any, settings: Any, plan: Any, *rest: Any) -> Any:
-        if plan.sift == "opencv":
-            settings = dataclasses.replace(settings, max_side=40)
-        return real(folder, photos, facts, settings, plan, *rest)
+    def blinded(self: StructureFromMotion, *words: Any) -> Any:
+        tiny = dataclasses.replace(self.settings, max_side=40)
+        return real(dataclasses.replace(self, settings=tiny) if self.plan.sift == "opencv" else self, *words)
 
-    monkeypatch.setattr(stages, "extract_features", blinded)
+    monkeypatch.setattr(StructureFromMotion, "extract_features", blinded)
     settings = BuildSettings(factor=2, max_features=800)
     info = build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2).info
     assert info["counts"]["registered"] == 8 and info["chosen"]["sfm"] == "thorough"
@@ -111,7 +126,7 @@ def test_photos_that_fast_loses_are_placed_by_thorough(monkeypatch, tmp_path):
 def test_photos_that_are_left_out_look_for_more_partners(monkeypatch, tmp_path):
     """Pairs that are matched already stay, and are not matched again."""
     write_capture(tmp_path / "raw", 8)
-    # a partner each: the photos do not chain
+    # a pair each: the photos do not chain
     fast = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 1, 0, 2.0, 1, 0.0, 1, 4)
     wider = dataclasses.replace(fast, name="wider", similar=7, continues=True)
     monkeypatch.setattr(stages, "plans", lambda photos, settings: [fast, wider])

@@ -1,59 +1,76 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
-from ambiguous_wild.builder.collect import read_test_list, split_photos
 from ambiguous_wild.builder.keep_masks import find_masks, lay_out_masks, mask_warnings
+from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.retrieval import sequential_pairs
 from ambiguous_wild.builder.settings import BuildSettings, plans
 from ambiguous_wild.builder.sfm import camera_groups, choose_camera
+from ambiguous_wild.builder.stages import read_test_list, split_photos
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, write_png
 
 
-def facts(count=10, sides=None):
+def photos_of(count=10, sides=None):
     return [
-        {
-            "source": f"images/p{i}.jpg", "work_name": f"p{i}.jpg", "stem": f"p{i}", "width": 12, "height": 8,
-            "side": sides[i] if sides else None, "camera": "C", "exif": {"focal_mm": 5.0},
-        }
+        ScreenedPhoto(
+            f"images/p{i}.jpg", f"p{i}.png", sides[i] if sides else None, width=12, height=8, camera="C",
+            exif={"focal_mm": 5.0},
+        )
         for i in range(count)
     ]  # fmt: skip
 
 
-ALL = {f"p{i}" for i in range(10)}
+ALL = {f"p{i}.png" for i in range(10)}
 
 
 def test_every_eighth_warns_that_it_measures_distractors_too():
-    train, test, how, warnings = split_photos(facts(), ALL, None)
-    assert test == ["p0.png", "p8.png"]
-    assert len(train) == 8
-    assert how == "every-8"
-    assert "distractors" in warnings[0]
+    split = split_photos(photos_of(), ALL, None)
+    assert (split.how, split.test, len(split.train)) == ("every-8", ["p0.png", "p8.png"], 8)
+    assert "distractors" in split.warnings[0]
 
 
 def test_folders_split_and_a_lost_test_photo_is_said():
     sides = ["test"] * 3 + ["train"] * 7
-    train, test, how, warnings = split_photos(facts(sides=sides), ALL - {"p1", "p9"}, None)
-    assert (how, test) == ("folders", ["p0.png", "p2.png"])
-    assert train == [f"p{i}.png" for i in range(3, 9)]
-    assert warnings == ["1 of 3 test photos are lost: scores cover 2"]
+    split = split_photos(photos_of(sides=sides), ALL - {"p1.png", "p9.png"}, None)
+    assert (split.how, split.test) == ("folders", ["p0.png", "p2.png"])
+    assert split.train == [f"p{i}.png" for i in range(3, 9)]
+    assert split.warnings == ["1 of 3 test photos are lost: scores cover 2"]
 
 
 def test_all_test_photos_lost_is_an_error():
     sides = ["test"] * 3 + ["train"] * 7
     with pytest.raises(AwError, match="none of the 3 test photos"):
-        split_photos(facts(sides=sides), ALL - {"p0", "p1", "p2"}, None)
+        split_photos(photos_of(sides=sides), ALL - {"p0.png", "p1.png", "p2.png"}, None)
     with pytest.raises(AwError, match="only 0 training"):
-        split_photos(facts(sides=["test"] * 10), ALL, None)
+        split_photos(photos_of(sides=["test"] * 10), ALL, None)
 
 
 def test_list_names_photos_in_any_of_its_ways(tmp_path):
     path = tmp_path / "t.txt"
     path.write_text("images/p1.jpg\np2.jpg\np3\np4.png\n\n")
-    tests = read_test_list(path, facts())
-    assert tests == {"p1", "p2", "p3", "p4"}
-    assert split_photos(facts(), ALL, tests)[1] == ["p1.png", "p2.png", "p3.png", "p4.png"]
+    tests = read_test_list(path, photos_of())
+    assert tests == {f"p{i}.png" for i in range(1, 5)}
+    assert split_photos(photos_of(), ALL, tests).test == ["p1.png", "p2.png", "p3.png", "p4.png"]
+
+
+def test_a_test_list_names_the_folder_where_two_photos_have_one_name(tmp_path):
+    names = {"back/0.jpg": "back_0.png", "front/0.jpg": "front_0.png", "front/1.jpg": "front_1.png"}
+    photos = [ScreenedPhoto(source, name) for source, name in names.items()]
+    listed = tmp_path / "list.txt"
+    for name, expected in (
+        ("front/0.jpg", "front_0.png"),
+        ("back/0", "back_0.png"),
+        ("1.jpg", "front_1.png"),
+    ):
+        listed.write_text(name)
+        assert read_test_list(listed, photos) == {expected}
+    listed.write_text("0.jpg")
+    with pytest.raises(AwError, match=r"'0\.jpg' is the name of several photos \(back_0, front_0\)"):
+        read_test_list(listed, photos)
 
 
 @pytest.mark.parametrize(
@@ -68,9 +85,9 @@ def test_list_names_photos_in_any_of_its_ways(tmp_path):
 def test_list_that_cannot_be(tmp_path, text, message):
     (tmp_path / "t.txt").write_text(text)
     with pytest.raises(AwError, match=message):
-        read_test_list(tmp_path / "t.txt", facts())
+        read_test_list(tmp_path / "t.txt", photos_of())
     with pytest.raises(AwError, match="cannot read the test list"):
-        read_test_list(tmp_path / "none.txt", facts())
+        read_test_list(tmp_path / "none.txt", photos_of())
 
 
 def test_masks_are_found_under_both_names(tmp_path):
@@ -78,12 +95,12 @@ def test_masks_are_found_under_both_names(tmp_path):
     write_png(tmp_path / "m" / "p0.png", white)
     write_png(tmp_path / "m" / "p1.jpg.png", white)
     write_png(tmp_path / "m" / "images" / "p2.png", np.zeros((8, 12), np.uint8))
-    found = find_masks(tmp_path / "m", facts(3), "error")
+    found = find_masks(tmp_path / "m", photos_of(3), "error")
     assert sorted(found) == ["p0", "p1", "p2"]
     (tmp_path / "out").mkdir()
-    shares = lay_out_masks(tmp_path / "out", found, facts(3), {})["kept_share"]
+    shares = lay_out_masks(tmp_path / "out", found, photos_of(3), tmp_path)["kept_share"]
     assert shares == {"p0": 1.0, "p1": 1.0, "p2": 0.0}
-    assert read_gray(tmp_path / "out" / "masks" / "p0.jpg.png").min() == 255  # 200 counts as white
+    assert read_gray(tmp_path / "out" / "masks" / "p0.png.png").min() == 255  # 200 counts as white
 
 
 def test_a_mask_is_turned_by_its_own_exif_as_viewers_show_it(tmp_path):
@@ -93,27 +110,27 @@ def test_a_mask_is_turned_by_its_own_exif_as_viewers_show_it(tmp_path):
     exif[0x0112] = 3
     (tmp_path / "m").mkdir()
     Image.fromarray(keep).rotate(180).save(tmp_path / "m" / "p0.png", exif=exif)
-    lay_out_masks(tmp_path, find_masks(tmp_path / "m", facts(1), "error"), facts(1), {})
-    assert np.array_equal(read_gray(tmp_path / "masks" / "p0.jpg.png"), keep)
+    lay_out_masks(tmp_path, find_masks(tmp_path / "m", photos_of(1), "error"), photos_of(1), tmp_path)
+    assert np.array_equal(read_gray(tmp_path / "masks" / "p0.png.png"), keep)
 
 
 def test_missing_masks_are_named_or_the_photo_is_kept_whole(tmp_path):
     write_png(tmp_path / "m" / "p0.png", np.zeros((8, 12), np.uint8))
     with pytest.raises(AwError, match=r"2 of 3 photos have no mask: images/p1\.jpg, images/p2\.jpg"):
-        find_masks(tmp_path / "m", facts(3), "error")
-    found = find_masks(tmp_path / "m", facts(3), "keep")
+        find_masks(tmp_path / "m", photos_of(3), "error")
+    found = find_masks(tmp_path / "m", photos_of(3), "keep")
     (tmp_path / "out").mkdir()
-    lay_out_masks(tmp_path / "out", found, facts(3), {})
-    assert read_gray(tmp_path / "out" / "masks" / "p2.jpg.png").min() == 255
+    lay_out_masks(tmp_path / "out", found, photos_of(3), tmp_path)
+    assert read_gray(tmp_path / "out" / "masks" / "p2.png.png").min() == 255
 
 
 def test_masks_of_the_wrong_size_are_named(tmp_path):
     for i in range(3):
         write_png(tmp_path / "m" / f"p{i}.png", np.zeros((8, 12 if i else 13), np.uint8))
     with pytest.raises(AwError, match=r"1 of 3 masks .* p0\.png is 13x8 but its photo 12x8"):
-        find_masks(tmp_path / "m", facts(3), "error")
+        find_masks(tmp_path / "m", photos_of(3), "error")
     with pytest.raises(AwError, match="does not exist"):
-        find_masks(tmp_path / "none", facts(3), "error")
+        find_masks(tmp_path / "none", photos_of(3), "error")
 
 
 def test_a_test_photo_meets_every_training_photo():
@@ -130,42 +147,35 @@ def test_a_test_photo_meets_every_training_photo():
 
 
 def test_one_camera_only_where_everything_agrees():
-    assert choose_camera(facts(3), "auto") == "single"
-    assert choose_camera(facts(3), "per-image") == "per-image"
+    assert choose_camera(photos_of(3), "auto") == "single"
+    assert choose_camera(photos_of(3), "per-image") == "per-image"
     for change in ({"width": 13}, {"camera": "D"}, {"exif": {"focal_mm": 6.0}}):
-        mixed = facts(3)
-        mixed[1].update(change)
+        mixed = photos_of(3)
+        mixed[1] = replace(mixed[1], **change)
         assert choose_camera(mixed, "auto") == "per-device"
         assert camera_groups(mixed) == [[0, 2], [1]]
         assert choose_camera(mixed, "single") == "single"
 
 
 def test_photos_without_exif_never_share_a_camera_with_others():
-    internet = facts(4)
-    for i, fact in enumerate(internet):
-        fact.update(width=100 + i % 2, camera=None, exif={})
+    internet = [replace(p, width=100 + i % 2, camera=None, exif={}) for i, p in enumerate(photos_of(4))]
     assert choose_camera(internet, "auto") == "per-image"
     assert camera_groups(internet) == [[0], [1], [2], [3]]
-    internet[1].update(camera="C", exif={"focal_mm": 5.0})
-    internet[3].update(camera="C", exif={"focal_mm": 5.0})
+    for k in (1, 3):
+        internet[k] = replace(internet[k], camera="C", exif={"focal_mm": 5.0})
     assert choose_camera(internet, "auto") == "per-device"
     assert camera_groups(internet) == [[0], [1, 3], [2]]
 
 
 def test_folders_have_cameras_of_their_own_unless_exif_says_that_they_are_one():
-    rig = facts(6)
-    for i, fact in enumerate(rig):
-        fact["source"] = f"{'front' if i % 2 else 'back'}/{i // 2}.jpg"
+    rig = [
+        replace(p, source=f"{'front' if i % 2 else 'back'}/{i // 2}.jpg") for i, p in enumerate(photos_of(6))
+    ]
     assert choose_camera(rig, "auto") == "single"
     assert camera_groups(rig, "per-folder") == [[0, 2, 4], [1, 3, 5]]
-    for fact in rig:
-        fact.update(camera=None, exif={})
+    rig = [replace(photo, camera=None, exif={}) for photo in rig]
     assert choose_camera(rig, "auto") == "per-device"
     assert camera_groups(rig) == [[0, 2, 4], [1, 3, 5]]
-
-
-def photos_of(count, side=1000):
-    return [{"width": side, "height": side // 2}] * count
 
 
 def test_fast_comes_before_thorough_and_each_may_be_asked_for():
@@ -200,9 +210,9 @@ def test_matcher_by_count(count, wanted, expected):
 
 def test_a_copy_in_a_test_list_stands_for_the_photo_that_is_used(tmp_path):
     (tmp_path / "t.txt").write_text("copy.jpg\n")
-    photos = facts()
-    photos[3]["copies"] = ["copy.jpg"]
-    assert read_test_list(tmp_path / "t.txt", photos) == {"p3"}
+    photos = photos_of()
+    photos[3] = replace(photos[3], copies=["copy.jpg"])
+    assert read_test_list(tmp_path / "t.txt", photos) == {"p3.png"}
 
 
 def test_masks_that_keep_little_are_suspected_to_be_inverted():

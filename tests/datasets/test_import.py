@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.downsample import downsample_photo
+from ambiguous_wild.builder.resample import downsample_photo
 from ambiguous_wild.cli import bench
 from ambiguous_wild.cli import datasets as import_dataset
 from ambiguous_wild.core import AwError

@@ -109,7 +109,7 @@ def test_what_was_converted_is_said(facts):
 
 
 def test_the_pixels_structure_from_motion_sees_are_those_of_the_photo(facts):
-    seen = {name: read_png_rgb(facts["folder"] / p["work_name"]) for name, p in by_source(facts).items()}
+    seen = {name: read_png_rgb(facts["folder"] / p["name"]) for name, p in by_source(facts).items()}
     assert np.array_equal(seen["deep.png"], picture(4))
     assert np.array_equal(seen["grey.png"], np.repeat(picture(5, channels=1), 3, axis=2))
     assert np.array_equal(seen["wrong.jpg"], picture(7))
@@ -126,12 +126,12 @@ def test_focal_length_is_what_the_file_says_or_absent(facts):
 
 
 def test_every_photo_has_a_name_of_its_own_that_any_file_system_holds(facts):
-    stems = [p["stem"] for p in facts["photos"]]
+    stems = [p["name"].removesuffix(".png") for p in facts["photos"]]
     assert len({s.casefold() for s in stems}) == len(stems) == len(facts["photos"])
     assert max(len(s.encode()) for s in stems) <= 120
     photos = by_source(facts)
-    assert photos["same.jpg"]["stem"] != photos["same.png"]["stem"]
-    assert photos["снимок é.png"]["stem"] == "снимок_é"
+    assert photos["same.jpg"]["name"] != photos["same.png"]["name"]
+    assert photos["снимок é.png"]["name"] == "снимок_é.png"
 
 
 def test_strict_refuses_the_capture_and_names_the_photos(raw, tmp_path):

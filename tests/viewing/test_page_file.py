@@ -19,11 +19,11 @@ from ambiguous_wild.harness.trained_models import Viewer, read_render_settings, 
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
-from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.scene_folder import MAP, load_scene
 from ambiguous_wild.io.spz import decode_spz
 from ambiguous_wild.viewing import page_file
 from ambiguous_wild.viewing.model import RenderSettings
-from ambiguous_wild.viewing.page_file import MAP, importance, reduced
+from ambiguous_wild.viewing.page_file import importance, reduced
 from tests.command_line import aw
 from tests.report.board_runs import change_result
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene

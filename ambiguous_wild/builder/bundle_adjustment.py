@@ -1,4 +1,4 @@
-"""How well the matches determine the poses of a model: COLMAP's covariance of a joint adjustment.
+"""COLMAP's options for bundle adjustment that gives the same bits each time, and the covariance of the poses.
 
 COLMAP's covariance is relative to the first photo, and to the distance of the second from it. An
 S-transformation (Baarda 1973, "S-transformations and criterion matrices") makes it relative to all photos.
@@ -12,12 +12,46 @@ from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
+DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 UNSURE = np.array([np.radians(0.4), 0.02])  # 2.5 of these are 1 degree, and 5 % of the path's radius
 ROUNDS = 20  # of weighting the photos anew, at most
 TRIES = 3  # adjustments at most
 SETTLED = 1e-3  # change of the standard deviations, relative to `UNSURE`, that ends the rounds
+
+
+def pipeline_options(seed: int) -> Any:
+    """Return COLMAP's options on one thread, because bundle adjustment sums in the order of its threads."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 10**9
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    return options
+
+
+def plausible(model: Any) -> bool:
+    """Tell whether the distortion is that of a lens: few or flat photos leave it undetermined."""
+    low, high = DISTORTIONS
+    return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
+
+
+def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
+    """Return options of a joint adjustment on one thread in which an outlier counts little."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = distorted
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.max_num_iterations = 50 if final else 10
+    options.ceres.solver_options.function_tolerance = 1e-6 if final else 1e-4
+    options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
+    if photos > FEW:
+        options.ceres.auto_select_solver_type = False
+        solver: Any = options.ceres.solver_options  # its enumerations take names
+        solver.linear_solver_type, solver.preconditioner_type = "ITERATIVE_SCHUR", "SCHUR_JACOBI"
+    return options
 
 
 @dataclass(frozen=True)
@@ -79,19 +113,19 @@ def _pose_deviations(covariance: Any, model: Any, photos: Sequence[int]) -> dict
         blocks = change[:, None] @ _blocks(covariance, photos, poses) @ change.transpose(0, 2, 1)
     if not np.isfinite(blocks).all():
         return {}
-    motions = np.zeros((len(photos), 6, 7))  # by a small similarity of the world
-    motions[:, 3:, :3] = np.eye(3)
-    motions[:, :3, 3:6], motions[:, 3:, 3:6] = -poses[:, :, :3], -_cross(centres / radius)
-    motions[:, 3:, 6] = centres / radius
-    joint, flat = blocks.transpose(0, 2, 1, 3).reshape((6 * len(photos),) * 2), motions.reshape(-1, 7)
+    similarities = np.zeros((len(photos), 6, 7))  # by a small similarity of the world
+    similarities[:, 3:, :3] = np.eye(3)
+    similarities[:, :3, 3:6], similarities[:, 3:, 3:6] = -poses[:, :, :3], -_cross(centres / radius)
+    similarities[:, 3:, 6] = centres / radius
+    joint, flat = blocks.transpose(0, 2, 1, 3).reshape((6 * len(photos),) * 2), similarities.reshape(-1, 7)
     own = blocks[np.arange(len(photos)), np.arange(len(photos))]
     deviations = _deviations(own)
     for _ in range(ROUNDS):
         weighted = np.repeat(1 / (UNSURE**2 + deviations**2), 3, axis=1).reshape(-1, 1) * flat
         fit = np.linalg.solve(flat.T @ weighted, weighted.T)  # [7, 6 N]: the similarity that errors cause
         moved = fit @ joint
-        shared = motions @ moved.reshape(7, len(photos), 6).transpose(1, 0, 2)
-        removed = motions @ (moved @ fit.T) @ motions.transpose(0, 2, 1)
+        shared = similarities @ moved.reshape(7, len(photos), 6).transpose(1, 0, 2)
+        removed = similarities @ (moved @ fit.T) @ similarities.transpose(0, 2, 1)
         before, deviations = deviations, _deviations(own - shared - shared.transpose(0, 2, 1) + removed)
         if (np.abs(deviations - before) < SETTLED * UNSURE).all():
             break
@@ -99,12 +133,12 @@ def _pose_deviations(covariance: Any, model: Any, photos: Sequence[int]) -> dict
 
 
 def _blocks(covariance: Any, photos: Sequence[int], poses: np.ndarray) -> np.ndarray:
-    """Return COLMAP's covariance [N, N, 6, 6] of the photos; what it holds has none."""
+    """Return COLMAP's covariance [N, N, 6, 6] of the photos; what it keeps constant has none."""
     own = [covariance.get_cam_cov_from_world(k) for k in photos]
     free = [list(range(6)) if block is not None else [] for block in own]
     for k, block in enumerate(own):
         if block is not None and len(block) < 6:
-            # COLMAP holds the coordinate of the second photo in which it is farthest from the first.
+            # COLMAP keeps constant the coordinate of the second photo in which it is farthest from the first.
             first = poses[free.index([])]
             between = first[:, 3] - first[:, :3] @ poses[k, :, :3].T @ poses[k, :, 3]
             free[k].remove(3 + int(np.argmax(np.abs(between))))

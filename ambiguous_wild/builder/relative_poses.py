@@ -1,12 +1,12 @@
-"""Find the motions between two photos, and which of them is that of the static scene.
+"""Estimate the relative poses of two photos, and which of them is that of the static scene.
 
-A pair of photos may show several rigid motions: that of the static scene, and one of every distractor in both
-photos, which may have most of the matches. But the static scene is consistent: the rotation from a photo to a
-second, and on to a third, equals that from the first to the third. A motion gets votes from the triplets of
-photos that it closes, each weighted by the votes of its other two motions.
+A pair of photos may show several rigid motions, each with a relative pose: that of the static scene, and one
+of every distractor in both photos, which may have most of the matches. But the static scene is consistent:
+the rotation from a photo to a second, and on to a third, equals that from the first to the third. A relative
+pose gets votes from the triplets that it closes, each weighted by the votes of the other two relative poses.
 
 Several motions a pair, made consistent over all pairs: Arrigoni and Pajdla, "Robust motion segmentation from
-pairwise matches" (ICCV 2019). They label points; here the motions place the photos.
+pairwise matches" (ICCV 2019). They label points; here the relative poses register the photos.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ import numpy as np
 
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-LEAST = 15  # smallest number of matches of a motion
-MOTIONS = 3  # largest number of motions of a pair
-MOST_POSES = 3  # poses that explain one motion: a plane allows two more
-ERROR_PX = 2.0  # largest distance of a match from its motion
-CLOSED_DEG = 4.0  # largest rotation left over around a closed triplet
+LEAST = 15  # smallest number of inliers of a relative pose
+MOST_RELATIVE_POSES = 3  # of a pair
+DECOMPOSITIONS = 3  # of a relative pose, at most: a plane allows two more
+ERROR_PX = 2.0  # largest epipolar error of an inlier
+CYCLE_DEG = 4.0  # largest rotation left over around a closed triplet
 ROUNDS = 4  # rounds of voting
-PRIOR = 0.1  # triplets that the share of its matches counts for in the vote on a motion
-AGREED_DEG = 5.0  # largest angle between a motion and the rotations of its photos
+PRIOR = 0.1  # triplets that the share of its matches counts for in the vote on a relative pose
+CONSISTENT_DEG = 5.0  # largest angle between a relative pose and the averaged rotations of its photos
 SWEEPS = 10  # largest number of sweeps over all photos
 CONFIDENCE, TRIALS = 0.9999, 1000  # of RANSAC
-PLANE_SHARE = 0.7  # share of a motion's matches on one plane above which its pose is ambiguous
+PLANE_SHARE = 0.7  # share of the inliers on one plane above which the pose is ambiguous
 FUNDAMENTAL_PX = 1.5  # largest distance of a match from its epipolar line
 FOCALS = 0.3 * 1.02 ** np.arange(116)  # over the longer side: 118 to 20 degrees of view
 FOCAL_USUAL = 0.8  # default; phones and drones have about 0.7, other cameras 0.8 to 1.4
@@ -45,31 +45,31 @@ _CHUNK = 20_000  # triplets voted on at a time
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A rigid motion that some matches of a pair agree on."""
+class RelativePose:
+    """A relative pose of a pair, with its inliers; where a plane leaves it open, all its decompositions."""
 
-    matches: np.ndarray  # [K] indices of the pair's matches
+    matches: np.ndarray  # [K] indices of the pair's matches, the inliers
     rotations: np.ndarray  # [W, 3, 3] second from first; several where a plane leaves the pose open
     translations: np.ndarray  # [W, 3] of unit length
 
 
 Pair = tuple[int, int]
 _End = tuple[int, np.ndarray, np.ndarray]  # other photo, rotations from it [K, 3, 3], their votes [K]
-Rays = Sequence[np.ndarray]  # of every photo: [N, 2] features as x / z and y / z in its camera
+NormalisedPoints = Sequence[np.ndarray]  # of every photo: [N, 2] features as x / z and y / z in its camera
 
 
-def motions_of_pairs(
-    rays: Rays,
+def relative_poses_of_pairs(
+    normalised: NormalisedPoints,
     focals_px: Sequence[float],
     matches: Mapping[Pair, np.ndarray],  # (a, b) -> [K, 2] indices of features
     jobs: int,
-) -> dict[Pair, list[Motion]]:
-    """Find the motions of every pair, the one with most matches first, for any number of jobs the same."""
+) -> dict[Pair, list[RelativePose]]:
+    """Estimate the relative poses of every pair, the one with most inliers first; the same for any `jobs`."""
 
-    def one(item: tuple[Pair, np.ndarray]) -> list[Motion]:
+    def one(item: tuple[Pair, np.ndarray]) -> list[RelativePose]:
         (a, b), rows = item
         error = ERROR_PX / float(np.sqrt(focals_px[a] * focals_px[b]))
-        return motions(rays[a][rows[:, 0]], rays[b][rows[:, 1]], error)
+        return estimate_relative_poses(normalised[a][rows[:, 0]], normalised[b][rows[:, 1]], error)
 
     cv2.setNumThreads(1)  # each thread works on one pair
     todo = sorted(matches.items(), key=lambda item: item[0])
@@ -77,17 +77,17 @@ def motions_of_pairs(
         return dict(zip((pair for pair, _ in todo), pool.map(one, todo)))
 
 
-def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]:
-    """Find the motions of matched features, one after another.
+def estimate_relative_poses(first: np.ndarray, second: np.ndarray, error: float) -> list[RelativePose]:
+    """Estimate the relative poses of matched features, one after another.
 
     Args:
-        first: [K, 2] rays in the first photo.
+        first: [K, 2] normalised coordinates in the first photo.
         second: [K, 2] their matches in the second.
-        error: largest distance of a match from its motion, in the same units.
+        error: largest epipolar error of an inlier, in the same units.
     """
     left = np.arange(len(first))
-    models: list[Motion] = []
-    while len(models) < MOTIONS and len(left) >= LEAST:
+    models: list[RelativePose] = []
+    while len(models) < MOST_RELATIVE_POSES and len(left) >= LEAST:
         a, b = first[left], second[left]
         try:
             essential, mask = cv2.findEssentialMat(
@@ -99,10 +99,10 @@ def motions(first: np.ndarray, second: np.ndarray, error: float) -> list[Motion]
             break
         inside = mask.ravel() > 0
         _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
-        poses = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:MOST_POSES]
+        poses = [(rotation, translation.ravel()), *_plane_poses(a[inside], b[inside], error)][:DECOMPOSITIONS]
         poses = [_refined(pose, a[inside], b[inside]) for pose in poses]
         models.append(
-            Motion(
+            RelativePose(
                 left[inside],
                 np.array([r for r, _ in poses]),
                 np.array([t for _, t in poses]),
@@ -136,12 +136,13 @@ def _plane_poses(a: np.ndarray, b: np.ndarray, error: float) -> list[tuple[np.nd
     if plane is None or np.count_nonzero(mask) < PLANE_SHARE * len(a):
         return []
     inside = mask.ravel() > 0
-    rays = np.column_stack([a[inside], np.ones(inside.sum())])
+    normalised = np.column_stack([a[inside], np.ones(inside.sum())])
     _, rotations, translations, normals = cv2.decomposeHomographyMat(plane, np.eye(3))
     poses = []
     for rotation, translation, normal in zip(rotations, translations, normals):
         length = float(np.linalg.norm(translation))
-        if length > 1e-6 and np.median(rays @ normal.ravel()) > 0:  # the plane lies in front of the camera
+        # The plane lies in front of the camera.
+        if length > 1e-6 and np.median(normalised @ normal.ravel()) > 0:
             poses.append((rotation, translation.ravel() / length))
     return poses
 
@@ -202,7 +203,7 @@ def _fundamentals(
         (a, b), rows = pair, matches[pair]
         first, second = features[a][rows[:, 0]], features[b][rows[:, 1]]
         fitted: list[tuple[Pair, np.ndarray, int]] = []
-        while len(fitted) < MOTIONS - 1 and len(first) >= LEAST:
+        while len(fitted) < MOST_RELATIVE_POSES - 1 and len(first) >= LEAST:
             try:
                 matrix, mask = cv2.findFundamentalMat(
                     first, second, cv2.USAC_MAGSAC, FUNDAMENTAL_PX, CONFIDENCE, TRIALS
@@ -239,22 +240,22 @@ def _inequality(matrices: np.ndarray, first: np.ndarray, second: np.ndarray) -> 
     return np.sqrt(np.maximum(total - 2 * product, 0.0) / np.maximum(total + 2 * product, 1e-30))
 
 
-def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray]:
-    """Return the share of triplets that each motion and way of a pair closes: (a, b) -> [M, W], 0 to 1.
+def cycle_votes(pairs: Mapping[Pair, Sequence[RelativePose]]) -> dict[Pair, np.ndarray]:
+    """Return the share of triplets that each relative pose closes, by decomposition: (a, b) -> [M, W].
 
-    Triplets are weighted by the votes of the other two motions. A pair in no triplet, the only link between
-    two parts of a capture perhaps, has the shares of its matches that are in each motion.
+    Triplets are weighted by the votes of the other two relative poses. A pair in no triplet, the only link
+    between two components perhaps, has the shares of its matches that are inliers of each.
     """
     connected = sorted(pair for pair, found in pairs.items() if found)
     at = {pair: k for k, pair in enumerate(connected)}
-    rotations = np.full((len(connected), MOTIONS * MOST_POSES, 3, 3), np.nan)
-    prior = np.zeros((len(connected), MOTIONS * MOST_POSES))
+    rotations = np.full((len(connected), MOST_RELATIVE_POSES * DECOMPOSITIONS, 3, 3), np.nan)
+    prior = np.zeros((len(connected), MOST_RELATIVE_POSES * DECOMPOSITIONS))
     for pair, k in at.items():
-        total = sum(len(motion.matches) for motion in pairs[pair])
-        for m, motion in enumerate(pairs[pair]):
-            columns = slice(m * MOST_POSES, m * MOST_POSES + len(motion.rotations))
-            rotations[k, columns] = motion.rotations
-            prior[k, columns] = len(motion.matches) / total
+        total = sum(len(relative.matches) for relative in pairs[pair])
+        for m, relative in enumerate(pairs[pair]):
+            columns = slice(m * DECOMPOSITIONS, m * DECOMPOSITIONS + len(relative.rotations))
+            rotations[k, columns] = relative.rotations
+            prior[k, columns] = len(relative.matches) / total
     exists = ~np.isnan(rotations[:, :, 0, 0])
     edges = _triplets(connected, at)
     closings = [_closed(rotations, edges, start) for start in range(0, len(edges), _CHUNK)]
@@ -262,7 +263,7 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[Motion]]) -> dict[Pair, np.ndarray
     votes = exists.astype(float)
     for _ in range(ROUNDS):
         votes = _vote(votes, prior, edges, rows)
-    return {pair: votes[k].reshape(MOTIONS, MOST_POSES) for pair, k in at.items()}
+    return {pair: votes[k].reshape(MOST_RELATIVE_POSES, DECOMPOSITIONS) for pair, k in at.items()}
 
 
 def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
@@ -275,12 +276,12 @@ def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:
 
 
 def _closed(rotations: np.ndarray, edges: np.ndarray, start: int) -> np.ndarray:
-    """Return the triplets whose rotations compose to the identity, [R, 4]: triplet, motion of each edge."""
+    """Return the triplets whose rotations compose to the identity, [R, 4]: triplet, relative pose by edge."""
     first, second, direct = rotations[edges[start : start + _CHUNK].T]
     around = np.einsum("tbxz,tazy->tabxy", second, first)
     trace = np.einsum("tabxy,tcxy->tabc", around, direct)
-    # Motions that do not exist are NaN, which is never larger.
-    return np.argwhere(trace > trace_of(CLOSED_DEG)) + np.array((start, 0, 0, 0))
+    # Relative poses that do not exist are NaN, which is never larger.
+    return np.argwhere(trace > trace_of(CYCLE_DEG)) + np.array((start, 0, 0, 0))
 
 
 def _vote(votes: np.ndarray, prior: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:
@@ -298,19 +299,21 @@ def _vote(votes: np.ndarray, prior: np.ndarray, edges: np.ndarray, closed: np.nd
     return (gained + PRIOR * prior) / (possible[:, None] + PRIOR)
 
 
-def agreed_motions(
-    pairs: Mapping[Pair, Sequence[Motion]],
+def consistent_relative_poses(
+    pairs: Mapping[Pair, Sequence[RelativePose]],
     votes: Mapping[Pair, np.ndarray],  # as `cycle_votes` returns them
 ) -> dict[Pair, tuple[int, int]]:
-    """Return of each pair the motion, and its decomposition, that is closest to the global rotations.
+    """Average the rotations; return of each pair the relative pose and decomposition that agree with them.
 
-    Rotations are chosen photo by photo, as most votes of the partners want it, until none changes. Every
-    partner counts once, however many matches it has. Pairs without such a motion are left out.
+    Rotations are chosen photo by photo, as most votes of the covisible photos want it, until none changes.
+    Each of them counts once, however many matches it has. Pairs without such a relative pose are left out.
     """
     ends: dict[int, list[_End]] = {}
     for (a, b), shares in votes.items():
         turns = [
-            (r, shares[m, w]) for m, motion in enumerate(pairs[a, b]) for w, r in enumerate(motion.rotations)
+            (r, shares[m, w])
+            for m, relative in enumerate(pairs[a, b])
+            for w, r in enumerate(relative.rotations)
         ]
         turns = [(r, vote) for r, vote in turns if vote > 0]
         if turns:
@@ -321,32 +324,34 @@ def agreed_motions(
     for start in sorted(ends, key=lambda k: -sum(weight.max() for _, _, weight in ends[k])):
         if start not in rotations:
             rotations[start] = np.eye(3)
-            _spread_rotations(start, ends, rotations)
+            _propagate_rotations(start, ends, rotations)
     for _ in range(SWEEPS):
         changed = 0
         for photo in ends:
             before = rotations[photo]
             rotations[photo] = _rotation(ends[photo], rotations, before)
-            changed += not _alike(before[None], rotations[photo], CLOSED_DEG)[0]
+            changed += not _alike(before[None], rotations[photo], CYCLE_DEG)[0]
         if not changed:
             break
-    agreed = {}
+    consistent = {}
     for (a, b), shares in votes.items():
         if a in rotations and b in rotations:
             wanted = rotations[b] @ rotations[a].T
-            fits = [
+            inlier = [
                 (shares[m, w], -m, -w)
-                for m, motion in enumerate(pairs[a, b])
-                for w in np.flatnonzero(_alike(motion.rotations, wanted, AGREED_DEG))
+                for m, relative in enumerate(pairs[a, b])
+                for w in np.flatnonzero(_alike(relative.rotations, wanted, CONSISTENT_DEG))
             ]
-            if fits:
-                _, m, w = max(fits)
-                agreed[a, b] = -m, -int(w)
-    return agreed
+            if inlier:
+                _, m, w = max(inlier)
+                consistent[a, b] = -m, -int(w)
+    return consistent
 
 
-def _spread_rotations(start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]) -> None:
-    """Choose the rotations of the photos that pairs connect with `start`, those with most votes first."""
+def _propagate_rotations(
+    start: int, ends: Mapping[int, list[_End]], rotations: dict[int, np.ndarray]
+) -> None:
+    """Initialise the rotations of the photos that pairs connect with `start`, those with most votes first."""
     gain: dict[int, float] = {}
     photo = start
     while True:
@@ -361,7 +366,7 @@ def _spread_rotations(start: int, ends: Mapping[int, list[_End]], rotations: dic
 
 
 def _rotation(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
-    """Return the rotation of a photo on which most partners agree; each partner counts with one motion."""
+    """Return the rotation of a photo on which most covisible photos agree, each with one relative pose."""
     turns, weights, owners = [], [], []
     for other, forth, weight in ends:
         if other in rotations:
@@ -372,7 +377,7 @@ def _rotation(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwi
         return otherwise
     stack, weight, owner = np.array(turns), np.array(weights), np.unique(owners, return_inverse=True)[1]
     flat = stack.reshape(-1, 9)
-    alike = flat @ flat.T > trace_of(AGREED_DEG)
+    alike = flat @ flat.T > trace_of(CONSISTENT_DEG)
     best = np.zeros((len(flat), owner.max() + 1))
     for column in range(best.shape[1]):
         mine = owner == column

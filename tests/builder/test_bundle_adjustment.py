@@ -1,10 +1,9 @@
-"""Standard deviations of poses are those of many noisy adjustments, whichever photo COLMAP holds."""
+"""Standard deviations of poses are those of many noisy adjustments, whichever photo COLMAP keeps constant."""
 
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.adjustment import adjustment_options
-from ambiguous_wild.builder.pose_covariance import UNSURE, joint_covariance
+from ambiguous_wild.builder.bundle_adjustment import UNSURE, adjustment_options, joint_covariance
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PHOTOS, WEAK, NOISE_PX = 6, 3, 0.3
@@ -43,7 +42,7 @@ def adjusted(order: list[int], seed: int):
     return found, np.array([found.deviations[1 + order.index(photo)] for photo in range(PHOTOS)])
 
 
-def test_deviations_do_not_depend_on_the_photos_that_colmap_holds():
+def test_deviations_do_not_depend_on_the_photos_that_colmap_keeps_constant():
     straight, turned = (adjusted(order, 0)[1] for order in ([0, 1, 2, 3, 4, 5], [3, 0, 5, 4, 2, 1]))
     assert np.allclose(straight, turned, rtol=1e-3)
     assert (straight.argmax(axis=0) == WEAK).all()
@@ -53,16 +52,18 @@ def test_deviations_are_those_of_many_adjustments():
     centres = np.array([-pose(k)[:, :3].T @ pose(k)[:, 3] for k in range(PHOTOS)])
     middle = centres.mean(axis=0)
     radius = np.linalg.norm(centres - middle, axis=1).max()
-    motions = np.zeros((PHOTOS, 6, 7))  # of poses by a small similarity, by differences
+    similarities = np.zeros((PHOTOS, 6, 7))  # of poses by a small similarity, by differences
     for column, step in enumerate(1e-3 * np.eye(7)):
         turn = cv2.Rodrigues(step[3:6])[0]
         for k in range(PHOTOS):
             moved = (1 + step[6]) * turn @ (centres[k] - middle) / radius + step[:3]
-            motions[k, :3, column] = cv2.Rodrigues(pose(k)[:, :3] @ turn.T @ pose(k)[:, :3].T)[0][:, 0] / 1e-3
-            motions[k, 3:, column] = (moved - (centres[k] - middle) / radius) / 1e-3
+            similarities[k, :3, column] = (
+                cv2.Rodrigues(pose(k)[:, :3] @ turn.T @ pose(k)[:, :3].T)[0][:, 0] / 1e-3
+            )
+            similarities[k, 3:, column] = (moved - (centres[k] - middle) / radius) / 1e-3
     predicted = adjusted(list(range(PHOTOS)), 0)[1]
     weights = np.repeat(1 / (UNSURE**2 + predicted**2), 3, axis=1).ravel()
-    flat, errors = motions.reshape(-1, 7), []
+    flat, errors = similarities.reshape(-1, 7), []
     for seed in range(200):
         model = adjusted(list(range(PHOTOS)), seed)[0].model
         error = np.zeros((PHOTOS, 6))

@@ -1,32 +1,54 @@
-"""Undistort photos, masks and truth to pinhole cameras, with one map a camera.
+"""Undistort photos, masks and truth to pinhole cameras, and downsample them, each file read once.
 
 COLMAP chooses the pinhole camera (no blank pixels). Resampling is our own, because masks (nearest pixel) and
 photos (bicubic, once, without another JPEG) need the same map.
+
+Photos are downsampled antialiased and in linear light: averaging sRGB values darkens fine bright detail (a
+black and white grid becomes 128 instead of 188), so pixels are decoded (IEC 61966-2-1), resampled by Pillow
+and encoded again. Away from the border the result equals OpenImageIO's to one level, six times as fast.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.records import ScreenedPhoto, UndistortResult
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.builder.records import ResampleResult, ScreenedPhoto
+from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.srgb import linear_to_srgb, srgb_to_linear
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.photos import MIN_SIDE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 TRUTH_PARTS = ("distractor", "clean")
 MOST_LOST = 0.9  # share of the photo that is kept, below which a message says so
 LEAST_SHARE, MOST_SHARE = 0.1, 1.1  # plausible shares of the photo that undistortion keeps
 NEGLIGIBLE_PX = 0.1  # distortion below this everywhere is ignored
+FACTORS = (1, 2, 4, 8)
+TARGET_SIDE = 480  # px; literature trains at about 504 x 378
+FILTER = Image.Resampling.BICUBIC  # antialiased: that of gsplat and NerfBaselines
+
+
+def _decode_table() -> np.ndarray:
+    return srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+
+
+def _encode_table() -> np.ndarray:
+    return np.round(255 * linear_to_srgb(np.arange(65536) / 65535.0)).astype(np.uint8)
+
+
+# 65536 steps of linear light are finer than the narrowest step of 8-bit sRGB (1 / 3294).
+_TO_LINEAR, _TO_SRGB = _decode_table(), _encode_table()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +76,8 @@ class Lens:
             return xys
         fx, fy, cx, cy = self.pinhole.pinhole()
         xys = xys - self.shear * (xys[:, 1:] - self.camera.principal_point_y) * [1, 0]
-        rays = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(xys)))
-        return rays * [fx, fy] + [cx, cy]
+        normalised = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(xys)))
+        return normalised * [fx, fy] + [cx, cy]
 
 
 def make_lens(camera: ModelCamera) -> Lens:
@@ -102,30 +124,75 @@ def _source_pixels(lens: Any, pinhole: ModelCamera, shear: float) -> tuple[np.nd
     return grid, source
 
 
-def undistort(
+def auto_factor(sizes: list[tuple[int, int]]) -> int:
+    """Return the largest of 1, 2, 4, 8 that leaves a median longer side of 480 px or more; else 1."""
+    side = float(np.median([max(size) for size in sizes]))
+    return max((f for f in FACTORS if side / f >= TARGET_SIDE), default=1)
+
+
+def downsampled_size(width: int, height: int, factor: int) -> tuple[int, int]:
+    """Return (width, height) / factor, rounded; the scene's intrinsics follow this size."""
+    return max(1, round(width / factor)), max(1, round(height / factor))
+
+
+def check_factor(factor: int, photos: Iterable[tuple[int, str]]) -> None:
+    """Raise AwError where a factor leaves a photo (shorter side in px, name) too small to train on."""
+    small = [f"{name} ({side / factor:.0f})" for side, name in photos if side / factor < MIN_SIDE]
+    if factor > 1 and small:
+        raise AwError(
+            f"--factor {factor} leaves less than {MIN_SIDE} px a side, too small to train on, of "
+            f"{shortlist(small, 3)}; choose a smaller factor, or take these photos away"
+        )
+
+
+def downsample_photo(
+    image: np.ndarray,  # [H, W, 3] uint8, sRGB
+    width: int,  # px
+    height: int,  # px
+) -> np.ndarray:  # [height, width, 3] uint8, sRGB
+    """Resample in linear light; the edges of both images coincide, so intrinsics scale exactly."""
+    linear = cv2.LUT(image, _TO_LINEAR)
+    bands = [Image.fromarray(linear[..., k]).resize((width, height), FILTER) for k in range(3)]
+    light = np.stack([np.asarray(band) for band in bands], axis=-1)
+    return _TO_SRGB[np.clip(light * 65535 + 0.5, 0, 65535).astype(np.uint16)]
+
+
+def downsample_mask(
+    mask: np.ndarray,  # [H, W] uint8
+    width: int,  # px
+    height: int,  # px
+) -> np.ndarray:  # [height, width] uint8 in {0, 255}
+    """Reduce a mask: a pixel is white where at least half of its area is."""
+    share = cv2.resize((mask >= 128).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return np.where(share >= 0.5, 255, 0).astype(np.uint8)
+
+
+def resample(
     folder: Path,
     model: ColmapModel,
-    facts: list[ScreenedPhoto],
-    read: Callable[[ScreenedPhoto], np.ndarray],
+    photos: Sequence[ScreenedPhoto],
+    pixels: Path,
     masks: Path | None,
     truth: Path | None,
+    factor: int,
     *,
     jobs: int,
     bar: Bar,
-) -> UndistortResult:
-    """Write `images/`, `masks/`, `truth/` at full size and `sparse/0` of the registered photos.
+) -> ResampleResult:
+    """Write the registered photos and `sparse/0`, undistorted, with masks and truth at the size of training.
 
     Args:
-        folder: folder of the stage, empty.
-        model: the chosen model, named by work names.
-        facts: screened photos.
-        read: gives a photo's pixels, [H, W, 3] uint8, upright.
-        masks: folder of `<work name>.png`, or None.
+        folder: folder of the stage, empty; gets images/, with a factor images_FACTOR/, masks/ and truth/.
+        model: the chosen model.
+        photos: of the capture.
+        pixels: folder of the photos as structure from motion got them.
+        masks: folder of `<name>.png`, or None.
         truth: the capture's truth folder, or None.
-        jobs: threads.
+        factor: of downsampling.
+        jobs: threads; each holds one photo.
         bar: progress.
     """
-    by_name = {f["work_name"]: f for f in facts}
+    by_name = {photo.name: photo for photo in photos}
     lenses: dict[int, Lens] = {}
     shared = len(model.cameras) < len(model.images)
     if shared:
@@ -133,17 +200,18 @@ def undistort(
     bar.start("undistorting", len(model.images))
 
     def one(image: ModelImage) -> tuple[ModelImage, ModelCamera, list[str]]:
-        fact = by_name[image.name]
+        photo, name = by_name[image.name], image.name
         lens = lenses[image.camera_id] if shared else make_lens(model.cameras[image.camera_id])
-        name = fact["stem"] + ".png"
-        write_png(folder / "images" / name, lens.remap(read(fact), nearest=False))
+        flat = lens.remap(read_png_rgb(pixels / name), nearest=False)
+        write_png(folder / "images" / name, flat)
+        if factor > 1:
+            write_png(folder / f"images_{factor}" / name, _reduced(flat, factor))
         if masks is not None:
-            mask = read_gray(masks / f"{image.name}.png")
-            write_png(folder / "masks" / name, lens.remap(mask, nearest=True))
-        parts = _truth(folder, lens, fact, truth) if truth is not None else []
+            mask = lens.remap(read_gray(masks / f"{name}.png"), nearest=True)
+            write_png(folder / "masks" / name, _reduced(mask, factor))
+        parts = _truth(folder, lens, photo, truth, factor) if truth is not None else []
         bar.step()
-        flat = dataclasses.replace(image, name=name, xys=lens.undistort_points(image.xys))
-        return flat, lens.pinhole, parts
+        return dataclasses.replace(image, xys=lens.undistort_points(image.xys)), lens.pinhole, parts
 
     with ThreadPoolExecutor(jobs) as pool:
         done = list(pool.map(one, model.images.values()))
@@ -153,12 +221,20 @@ def undistort(
     cameras, images = {c.camera_id: c for _, c, _ in done}, {image.image_id: image for image, _, _ in done}
     write_model(folder / "sparse" / "0", ColmapModel(cameras, images, model.points))
     photos_with = {part: sum(part in parts for _, _, parts in done) for part in TRUTH_PARTS}
-    return {"truth": photos_with if truth is not None else None}
+    return {"factor": factor, "truth": photos_with if truth is not None else None}
 
 
-def _truth(folder: Path, lens: Lens, fact: ScreenedPhoto, truth: Path) -> list[str]:
-    """Undistort the truth of one photo: the mask by nearest pixel, the clean photo like the photo."""
-    parts = PurePosixPath(fact["source"]).with_suffix("").parts
+def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
+    """Downsample a photo [H, W, 3] or a mask [H, W] by a factor."""
+    if factor == 1:
+        return image
+    size = downsampled_size(image.shape[1], image.shape[0], factor)
+    return downsample_photo(image, *size) if image.ndim == 3 else downsample_mask(image, *size)
+
+
+def _truth(folder: Path, lens: Lens, photo: ScreenedPhoto, truth: Path, factor: int) -> list[str]:
+    """Resample the truth of one photo: the mask like masks, the clean photo like the photo."""
+    parts = PurePosixPath(photo.source).with_suffix("").parts
     original = "/".join(parts[parts[0] in ("train", "test", "images") :])
     written = []
     for part in TRUTH_PARTS:
@@ -166,13 +242,13 @@ def _truth(folder: Path, lens: Lens, fact: ScreenedPhoto, truth: Path) -> list[s
         if not path.is_file():
             continue
         pixels = read_gray(path) if part == "distractor" else read_png_rgb(path)
-        if pixels.shape[:2] != (fact["height"], fact["width"]):
+        if pixels.shape[:2] != (photo.height, photo.width):
             raise AwError(
                 f"{path} is {pixels.shape[1]}x{pixels.shape[0]} but its photo "
-                f"{fact['width']}x{fact['height']}: the truth belongs to another capture; remove truth/ "
+                f"{photo.width}x{photo.height}: the truth belongs to another capture; remove truth/ "
                 "or make the capture again"
             )
         flat = lens.remap(pixels, nearest=part == "distractor")
-        write_png(folder / "truth" / part / f"{fact['stem']}.png", flat)
+        write_png(folder / "truth" / part / photo.name, _reduced(flat, factor))
         written.append(part)
     return written

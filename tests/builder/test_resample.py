@@ -1,10 +1,25 @@
+"""Undistorting and downsampling: against COLMAP, the textbook filter, and the pixels that went in."""
+
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ambiguous_wild.builder.progress import Bar
-from ambiguous_wild.builder.undistort import make_lens, undistort
+from ambiguous_wild.builder.records import ScreenedPhoto
+from ambiguous_wild.builder.resample import (
+    _TO_LINEAR,
+    _TO_SRGB,
+    auto_factor,
+    downsample_mask,
+    downsample_photo,
+    downsampled_size,
+    make_lens,
+    resample,
+)
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.imported_photos import resized
 from ambiguous_wild.io.colmap_model import read_model, write_model
@@ -23,8 +38,6 @@ def photo():
 
 def test_agrees_with_colmap_pixel_by_pixel():
     """pycolmap.undistort_image is the oracle; it is bilinear, so a smooth photo is compared."""
-    import cv2
-
     smooth = cv2.GaussianBlur(photo(), (0, 0), 3)
     theirs_in = pycolmap.Camera(model="SIMPLE_RADIAL", width=320, height=240, params=list(CAMERA.params))
     theirs, flat = pycolmap.undistort_image(
@@ -102,15 +115,17 @@ def test_without_distortion_nothing_moves():
     assert np.allclose(lens.undistort_points(xys), xys, atol=1e-3)
 
 
-def stage(tmp_path, truth=None, masks=None):
-    names = ["a.jpg", "b.jpg"]
+def stage(tmp_path, truth=None, masks=None, factor=1):
+    names = ["a.png", "b.png"]
     model = make_model(names, camera="SIMPLE_RADIAL")
-    facts = [{"work_name": n, "stem": n[0], "source": f"train/{n}", "width": 64, "height": 48} for n in names]
+    photos = [ScreenedPhoto(f"train/{n[0]}.jpg", n, width=64, height=48) for n in names]
     pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-    found = undistort(
-        tmp_path / "out", model, facts, lambda fact: pixels, masks, truth, jobs=2, bar=Bar(False)
+    for name in names:
+        write_png(tmp_path / "photos" / name, pixels)
+    done = resample(
+        tmp_path / "out", model, photos, tmp_path / "photos", masks, truth, factor, jobs=2, bar=Bar(False)
     )
-    return model, found
+    return model, done
 
 
 def test_the_model_becomes_pinhole_of_the_images_written(tmp_path):
@@ -119,7 +134,6 @@ def test_the_model_becomes_pinhole_of_the_images_written(tmp_path):
     assert [c.model for c in flat.cameras.values()] == ["PINHOLE"]
     camera = flat.cameras[7]
     for image in flat.images.values():
-        assert image.name.endswith(".png")
         assert read_png_rgb(tmp_path / "out" / "images" / image.name).shape[:2] == (
             camera.height,
             camera.width,
@@ -137,17 +151,78 @@ def test_the_model_becomes_pinhole_of_the_images_written(tmp_path):
 def test_masks_stay_black_and_white_and_truth_follows(tmp_path):
     rng = np.random.default_rng(1)
     for name in ("a", "b"):
-        write_png(tmp_path / "masks" / f"{name}.jpg.png", rng.integers(0, 2, (48, 64), dtype=np.uint8) * 255)
+        write_png(tmp_path / "masks" / f"{name}.png.png", rng.integers(0, 2, (48, 64), dtype=np.uint8) * 255)
     write_png(tmp_path / "truth" / "distractor" / "a.png", np.full((48, 64), 255, np.uint8))
     write_png(tmp_path / "truth" / "clean" / "b.png", np.full((48, 64, 3), 77, np.uint8))
     _, found = stage(tmp_path, tmp_path / "truth", tmp_path / "masks")
-    assert found == {"truth": {"distractor": 1, "clean": 1}}
+    assert found == {"factor": 1, "truth": {"distractor": 1, "clean": 1}}
     assert set(np.unique(read_gray(tmp_path / "out" / "masks" / "a.png"))) == {0, 255}
     assert read_gray(tmp_path / "out" / "truth" / "distractor" / "a.png").min() == 255
     assert set(np.unique(read_png_rgb(tmp_path / "out" / "truth" / "clean" / "b.png"))) == {77}
+
+
+def test_smaller_copies_are_those_of_the_undistorted_photos(tmp_path):
+    for name in ("a", "b"):
+        write_png(tmp_path / "masks" / f"{name}.png.png", np.full((48, 64), 255, np.uint8))
+    write_png(tmp_path / "truth" / "clean" / "a.png", np.full((48, 64, 3), 77, np.uint8))
+    stage(tmp_path, tmp_path / "truth", tmp_path / "masks", factor=2)
+    large = read_png_rgb(tmp_path / "out" / "images" / "a.png")
+    width, height = downsampled_size(large.shape[1], large.shape[0], 2)
+    small = read_png_rgb(tmp_path / "out" / "images_2" / "a.png")
+    assert np.array_equal(small, downsample_photo(large, width, height))
+    assert read_gray(tmp_path / "out" / "masks" / "a.png").shape == (height, width)
+    assert read_png_rgb(tmp_path / "out" / "truth" / "clean" / "a.png").shape == (height, width, 3)
 
 
 def test_truth_of_another_size_is_refused(tmp_path):
     write_png(tmp_path / "truth" / "clean" / "a.png", np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(AwError, match="belongs to another capture"):
         stage(tmp_path, tmp_path / "truth")
+
+
+def test_tables_invert_each_other():
+    values = np.arange(256)
+    assert np.array_equal(_TO_SRGB[np.round(_TO_LINEAR * 65535).astype(int)], values)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 255), st.integers(9, 40), st.integers(9, 40))
+def test_a_flat_photo_stays_flat(value, width, height):
+    flat = np.full((height, width, 3), value, np.uint8)
+    small = downsample_photo(flat, max(1, width // 3), max(1, height // 3))
+    assert np.abs(small.astype(int) - value).max() <= 1
+
+
+def test_masks_go_by_area():
+    mask = np.zeros((40, 40), np.uint8)
+    mask[:, :18] = 255  # columns 0-3 white, column 4 half white
+    assert np.array_equal(downsample_mask(mask, 10, 10)[0], [255] * 5 + [0] * 5)
+    assert set(np.unique(downsample_mask(mask, 7, 9))) == {0, 255}
+
+
+def catmull_rom(source: int, target: int) -> np.ndarray:
+    """[target, source] weights of the textbook cubic (a = -1/2), stretched by the scale; rows sum to 1."""
+    scale = source / target
+    x = np.abs((np.arange(source) + 0.5 - (np.arange(target)[:, None] + 0.5) * scale) / scale)
+    near, far = 1.5 * x**3 - 2.5 * x**2 + 1, -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2
+    weights = np.where(x < 1, near, np.where(x < 2, far, 0.0))
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("width", "height"), [(53, 41), (160, 120), (40, 30)])
+def test_it_is_the_antialiased_cubic_in_linear_light(width, height):
+    """Oracle: the textbook filter as matrices, with its edges and without aliasing; borders are left out."""
+    rng = np.random.default_rng(0)
+    photo = cv2.GaussianBlur(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8), (0, 0), 1.0)
+    light = _TO_LINEAR[photo].astype(np.float64)
+    expected = 255 * np.einsum(
+        "hr,rcx,wc->hwx", catmull_rom(240, height), light, catmull_rom(320, width), optimize=True
+    )
+    found = 255 * _TO_LINEAR[downsample_photo(photo, width, height)]
+    assert np.abs(found - expected)[4:-4, 4:-4].max() < 1.5  # of 255, the rounding to 8-bit sRGB
+
+
+def test_sizes_and_factors():
+    assert downsampled_size(4032, 3024, 8) == (504, 378)
+    assert downsampled_size(3, 3, 8) == (1, 1)
+    assert [auto_factor([(w, 9)]) for w in (300, 480, 959, 960, 1920, 4032, 12000)] == [1, 1, 1, 2, 4, 8, 8]

@@ -1,4 +1,4 @@
-"""Photos are placed right though a distractor has more matches than the place."""
+"""Photos are registered rightly though a distractor has more matches than the static scene."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder import sfm
-from ambiguous_wild.builder.adjustment import adjustment_options
-from ambiguous_wild.builder.matched import MAPPED_PARTNERS, Matched, _well_connected
-from ambiguous_wild.builder.motions import Motion, agreed_motions, cycle_votes, focal_votes, motions
-from ambiguous_wild.builder.photo_placement import Placement
+from ambiguous_wild.builder.bundle_adjustment import adjustment_options
+from ambiguous_wild.builder.matched import MAPPED_COVISIBLE, Matched, PointLookup, _well_connected
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.point_lookup import PointLookup
 from ambiguous_wild.builder.pose_hypothesis import PoseHypothesis, reason_against
+from ambiguous_wild.builder.registration import Registration
+from ambiguous_wild.builder.relative_poses import (
+    RelativePose,
+    consistent_relative_poses,
+    cycle_votes,
+    estimate_relative_poses,
+    focal_votes,
+)
 from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -47,12 +52,12 @@ def turned(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
 
 
 def seen(points: np.ndarray, rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """[N, 2] rays of points [N, 3]."""
+    """[N, 2] normalised coordinates of points [N, 3]."""
     local = (points - centre) @ rotation.T
     return local[:, :2] / local[:, 2:]
 
 
-def test_a_distractor_with_most_matches_does_not_place_its_photos(tmp_path):
+def test_a_distractor_with_most_matches_does_not_register_its_photos(tmp_path):
     """COLMAP's mapper alone turns the first photo by more than 20 degrees here."""
     count, size, corners = 8, (170, 190), {0: (40, 60), 5: (50, 70), 7: (40, 90)}
     paths = write_capture(tmp_path / "raw", count)
@@ -74,8 +79,8 @@ def test_a_distractor_with_most_matches_does_not_place_its_photos(tmp_path):
     assert model.points.rgb.mean() > 40  # else training starts black
     assert {p["source"] for p in info["lost"]} == {f"p{k:02d}.jpg" for k in set(true) - set(found)}
     assert info["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.03)
-    placed = [p for p in info["photos"].values() if p["split"]]
-    assert len(placed) == len(found) and all(p["partners"] >= 2 for p in placed)
+    registered = [p for p in info["photos"].values() if p["split"]]
+    assert len(registered) == len(found) and all(p["partners"] >= 2 for p in registered)
 
 
 @pytest.mark.slow
@@ -88,21 +93,21 @@ def test_outward_views_keep_the_focal_length_that_the_pairs_voted_for(tmp_path):
     assert info["cameras"][0]["focal_px"] == pytest.approx(true, rel=0.005)
 
 
-def test_a_pair_holds_the_motion_of_the_place_and_that_of_the_distractor():
+def test_a_pair_has_the_relative_poses_of_the_static_scene_and_of_the_distractor():
     rng = np.random.default_rng(0)
-    place = rng.uniform([-2, -2, 4], [2, 2, 8], (60, 3))
+    static = rng.uniform([-2, -2, 4], [2, 2, 8], (60, 3))
     mover = rng.uniform([-1, -1, 3], [1, 1, 4], (140, 3))
     eye, rotation = np.array([0.6, 0.1, 0.2]), turned((0, 1, 0), 6)
     other_eye, other = np.array([-0.2, 0.8, 0.1]), turned((0.2, 0.3, 1), 20)
-    first = np.concatenate([seen(place, np.eye(3), np.zeros(3)), seen(mover, np.eye(3), np.zeros(3))])
-    second = np.concatenate([seen(place, rotation, eye), seen(mover, other, other_eye)])
-    found = motions(first, second, 1e-3)
+    first = np.concatenate([seen(static, np.eye(3), np.zeros(3)), seen(mover, np.eye(3), np.zeros(3))])
+    second = np.concatenate([seen(static, rotation, eye), seen(mover, other, other_eye)])
+    found = estimate_relative_poses(first, second, 1e-3)
     assert len(found) >= 2
     assert angle_deg(found[0].rotations[0] @ other.T) < 0.5 and (found[0].matches >= 60).mean() > 0.95
     assert angle_deg(found[1].rotations[0] @ rotation.T) < 0.5 and (found[1].matches < 60).mean() > 0.95
 
 
-def test_a_plane_leaves_several_ways_and_the_right_one_is_among_them():
+def test_a_plane_leaves_several_decompositions_and_the_right_one_is_among_them():
     rng = np.random.default_rng(1)
     flat = np.column_stack([rng.uniform(-2, 2, (80, 2)), np.zeros(80)]) @ turned((1, 0.4, 0), 40).T + [
         0,
@@ -110,17 +115,17 @@ def test_a_plane_leaves_several_ways_and_the_right_one_is_among_them():
         6,
     ]
     eye, rotation = np.array([1.5, 0.2, 0.3]), turned((0, 1, 0.1), -12)
-    (found, *_) = motions(seen(flat, np.eye(3), np.zeros(3)), seen(flat, rotation, eye), 1e-3)
+    (found, *_) = estimate_relative_poses(seen(flat, np.eye(3), np.zeros(3)), seen(flat, rotation, eye), 1e-3)
     assert len(found.rotations) > 1
     assert min(angle_deg(r @ rotation.T) for r in found.rotations) < 0.5
 
 
-def _motion(rotation: np.ndarray, matches: int = 20) -> Motion:
-    return Motion(np.arange(matches), rotation[None], np.array([[1.0, 0.0, 0.0]]))
+def _motion(rotation: np.ndarray, matches: int = 20) -> RelativePose:
+    return RelativePose(np.arange(matches), rotation[None], np.array([[1.0, 0.0, 0.0]]))
 
 
 @pytest.mark.parametrize("photos", [6, 52])  # 52 have 22 100 triplets: more than are voted on at a time
-def test_the_motions_that_close_triplets_win_over_more_matches(photos):
+def test_relative_poses_that_close_triplets_win_over_more_matches(photos):
     true = [turned((0.1 * k, 1, 0), 9.0 * k) for k in range(photos)]
     rng = np.random.default_rng(2)
     pairs = {}
@@ -130,10 +135,10 @@ def test_the_motions_that_close_triplets_win_over_more_matches(photos):
             pairs[a, b] = [wrong, _motion(true[b] @ true[a].T)]
     votes = cycle_votes(pairs)
     assert all(v[1, 0] > 0.9 and v[0, 0] < 0.2 for v in votes.values())
-    assert agreed_motions(pairs, votes) == dict.fromkeys(pairs, (1, 0))
+    assert consistent_relative_poses(pairs, votes) == dict.fromkeys(pairs, (1, 0))
     pairs[0, 1] = pairs[0, 1][:1]  # of one pair only the distractor is left: it is dropped
     votes = cycle_votes(pairs)
-    assert set(agreed_motions(pairs, votes)) == set(pairs) - {(0, 1)}
+    assert set(consistent_relative_poses(pairs, votes)) == set(pairs) - {(0, 1)}
 
 
 def test_a_long_lens_still_tells_how_far_the_camera_turned():
@@ -147,7 +152,7 @@ def test_a_long_lens_still_tells_how_far_the_camera_turned():
         first = seen(points, np.eye(3), np.zeros(3)) + noise[0]
         second = seen(points, rotation, centre) + noise[1]
         second[:36] = rng.permutation(second[:36])  # wrong matches
-        found = motions(first, second, 2.0 / 2400)[0]
+        found = estimate_relative_poses(first, second, 2.0 / 2400)[0]
         off.append(angle_deg(found.rotations[0].T @ rotation))
     assert np.median(off) < 1.0
 
@@ -172,23 +177,23 @@ def test_focal_length_by_votes_of_pairs_among_wrong_ones(focal):
     assert focal_votes(photos, [side] * 6, [1] * 6, {1: 0.66}, flat, 1) == {1: 0.66}  # EXIF is all there is
 
 
-def test_a_photo_without_a_clear_place_is_named_with_the_reason():
-    def place(partners: int, area: float) -> PoseHypothesis:
-        return PoseHypothesis(np.eye(4)[:3], frozenset(range(partners)), area)
+def test_a_photo_without_a_clear_pose_is_named_with_the_reason():
+    def hypothesis(support: int, area: float) -> PoseHypothesis:
+        return PoseHypothesis(np.eye(4)[:3], frozenset(range(support)), area)
 
-    nowhere = place(0, 0)
-    assert reason_against(place(9, 0.6), place(7, 0.15), 2) is None
-    assert "two places: 6 photos agree on one, 5 on another" in str(
-        reason_against(place(6, 0.2), place(5, 0.19), 2)
+    nothing = hypothesis(0, 0)
+    assert reason_against(hypothesis(9, 0.6), hypothesis(7, 0.15), 2) is None
+    assert "two poses: 6 photos agree on one, 5 on another" in str(
+        reason_against(hypothesis(6, 0.2), hypothesis(5, 0.19), 2)
     )
-    assert "no placed photo" in str(reason_against(nowhere, nowhere, 2))
-    assert "only 2 placed photos" in str(reason_against(place(2, 0.4), nowhere, 3))
-    assert "small part" in str(reason_against(place(5, 0.07), nowhere, 2))
-    crowded = PoseHypothesis(
+    assert "no placed photo" in str(reason_against(nothing, nothing, 2))
+    assert "only 2 placed photos" in str(reason_against(hypothesis(2, 0.4), nothing, 3))
+    assert "small part" in str(reason_against(hypothesis(5, 0.07), nothing, 2))
+    clustered = PoseHypothesis(
         np.eye(4)[:3], frozenset(range(5)), 0.25, 0.2
     )  # as the matches of a distractor are
-    assert "small part" in str(reason_against(crowded, nowhere, 2))
-    assert reason_against(place(5, 0.25), nowhere, 2) is None
+    assert "small part" in str(reason_against(clustered, nothing, 2))
+    assert reason_against(hypothesis(5, 0.25), nothing, 2) is None
 
 
 def test_only_many_photos_are_adjusted_iteratively():
@@ -197,23 +202,26 @@ def test_only_many_photos_are_adjusted_iteratively():
     assert many.solver_options.linear_solver_type.name == "ITERATIVE_SCHUR"
 
 
-def test_motions_come_back_from_their_file(tmp_path):
+def test_relative_poses_come_back_from_their_file(tmp_path):
     matched = Matched(
         [1, 2, 3], ["a", "b", "c"], [], [], {(0, 1): np.zeros((30, 2)), (1, 2): np.zeros((9, 2))}
     )
-    matched.motions = {(0, 1): [_motion(turned((1, 0, 0), 5)), _motion(turned((0, 1, 0), 7), 4)], (1, 2): []}
-    matched.save_motions(tmp_path / "m.npz")
+    matched.relative_poses = {
+        (0, 1): [_motion(turned((1, 0, 0), 5)), _motion(turned((0, 1, 0), 7), 4)],
+        (1, 2): [],
+    }
+    matched.save_relative_poses(tmp_path / "m.npz")
     again = Matched(matched.ids, matched.names, [], [], matched.matches)
-    again.load_motions(tmp_path / "m.npz")
-    assert again.motions[1, 2] == [] and len(again.motions[0, 1]) == 2
-    for one, other in zip(matched.motions[0, 1], again.motions[0, 1]):
+    again.load_relative_poses(tmp_path / "m.npz")
+    assert again.relative_poses[1, 2] == [] and len(again.relative_poses[0, 1]) == 2
+    for one, other in zip(matched.relative_poses[0, 1], again.relative_poses[0, 1]):
         np.testing.assert_array_equal(one.matches, other.matches)
         np.testing.assert_array_equal(one.rotations, other.rotations)
 
 
 def set_in_worker(monkeypatch, statement: str) -> None:
     """Run a statement in COLMAP's process before its task."""
-    worker = "import sys; from ambiguous_wild.builder import matched, photo_placement, pose_hypothesis; "
+    worker = "import sys; from ambiguous_wild.builder import matched, registration, pose_hypothesis; "
     worker += "from ambiguous_wild.builder import sfm_worker; "
     worker += f"{statement}; sys.argv = ['worker', sys.argv[1]]; sfm_worker.main()"
     real = sfm.subprocess.Popen
@@ -224,17 +232,17 @@ def set_in_worker(monkeypatch, statement: str) -> None:
     monkeypatch.setattr(sfm.subprocess, "Popen", changed)
 
 
-def test_of_many_photos_the_mapper_gets_some_and_all_are_placed(tmp_path, monkeypatch):
+def test_of_many_photos_the_mapper_gets_some_and_all_are_registered(tmp_path, monkeypatch):
     ring = [(a, (a + step) % 300) for a in range(300) for step in range(1, 9)]
     chosen = _well_connected(ring)
-    partners = {k: {a + b - k for a, b in ring if k in (a, b)} for k in range(300)}
-    assert all(len(others & chosen) >= MAPPED_PARTNERS for others in partners.values())
+    support = {k: {a + b - k for a, b in ring if k in (a, b)} for k in range(300)}
+    assert all(len(others & chosen) >= MAPPED_COVISIBLE for others in support.values())
     assert len(chosen) < 150
-    ends = sorted(partners.keys() - chosen)[:3]  # of pairs between two places; 600 has few partners
+    ends = sorted(support.keys() - chosen)[:3]  # of pairs between two places; 600 has few partners
     ring += [(a + 300, b + 300) for a, b in ring] + [(k, k + 300) for k in ends] + [(20, 600), (21, 600)]
     assert {*ends, *(k + 300 for k in ends), 600} <= _well_connected(ring)
     write_capture(tmp_path / "raw", 12)
-    set_in_worker(monkeypatch, "matched.ALL_MAPPED, matched.MAPPED_PARTNERS = 6, 3")
+    set_in_worker(monkeypatch, "matched.ALL_MAPPED, matched.MAPPED_COVISIBLE = 6, 3")
     settings = BuildSettings(factor=1, max_features=800)
     build_scene(tmp_path / "raw", tmp_path / "scene", settings, jobs=2)
     model = read_model(tmp_path / "scene" / "sparse" / "0")
@@ -261,17 +269,19 @@ def test_the_change_of_focal_length_is_that_of_the_photos_the_mapper_got():
     assert matched.take_cameras(model) == pytest.approx(0.1)
 
 
-def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
-    """Of many photos few changes end placing, but not while an added photo may bring the next one in."""
+def test_photos_that_come_in_one_by_one_are_all_registered(monkeypatch):
+    """Of many photos few changes end the rounds, but not while an added photo may bring the next one in."""
 
-    class Path(Placement):
+    class Path(Registration):
         def __init__(self) -> None:
-            self.matched = SimpleNamespace(ids=range(1000), motions=defaultdict(lambda: [1]), rays=list)
+            self.matched = SimpleNamespace(
+                ids=range(1000), relative_poses=defaultdict(lambda: [1]), normalised=list
+            )
             self.pairs = [[(k - 1, k)] * (k > 0) + [(k, k + 1)] * (k < 999) for k in range(1000)]
             self.poses = dict.fromkeys(range(980), np.eye(3, 4))
-            self.split_off, self.joined = [], []
+            self.split_off, self.merged = [], []
 
-        def _best(self, photo, now, rays, points):
+        def _best(self, photo, now, normalised, points):
             pose = None if photo > len(self.poses) else np.eye(3, 4)
             none = PoseHypothesis(None, frozenset(), 0.0)
             return (none if pose is None else PoseHypothesis(pose, frozenset((1, 2, 3)), 1.0)), none
@@ -279,7 +289,7 @@ def test_photos_that_join_one_by_one_are_all_placed(monkeypatch):
         def _same(self, first, second):
             return second is not None
 
-        def links(self):
+        def find_links(self):
             return {pair: 1 for pairs in self.pairs for pair in pairs if set(pair) <= self.poses.keys()}
 
         def _triangulate_and_adjust(self, *, final, pairs=True):
@@ -296,7 +306,8 @@ def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypat
     """Photos are taken out until too few are left: one line, not a crash of COLMAP."""
     write_capture(tmp_path / "raw", 6)
     set_in_worker(
-        monkeypatch, "photo_placement.AGREE = photo_placement.AGREE_NEW = pose_hypothesis.LITTLE_AREA = 99"
+        monkeypatch,
+        "registration.LEAST_SUPPORT = registration.LEAST_SUPPORT_NEW = pose_hypothesis.LITTLE_AREA = 99",
     )
     with pytest.raises(AwError, match="placed 0 of 6 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500, sfm="fast"))

@@ -40,7 +40,7 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
         raise AwError(f"{photo} is trained at {width} x {height}: there is no pixel {column}, {row}")
     if not trainer.done:
         say(f"{run} is not finished: these are its masks after {trainer.iteration} iterations")
-    policy, own = trainer.parts.mask, trainer.data.user_keep[found[0]]
+    policy, own = trainer.hooks.mask, trainer.data.user_keep[found[0]]
     predicted = policy.predict(step)
     keep = trainer.combine_user_keep(step, predicted)
     kept = keep is None or bool(keep[row, column] > 0.5)

@@ -45,7 +45,7 @@ from ambiguous_wild.splat.pace import TrainConfig
 
 
 def try_recipes(cells: Sequence[Cell]) -> list[str]:
-    """Build the parts of every method once, so that a faulty last method is found before the first trains.
+    """Build the hooks of every method once, so that a faulty last method is found before the first trains.
 
     Returns:
         A line for each method and scene on the file that they start from (`--start`).
@@ -61,9 +61,9 @@ def try_recipes(cells: Sequence[Cell]) -> list[str]:
     lines = []
     for cell in different.values():
         try:
-            parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
+            hooks = with_effects(cell.method.build(cell.options), cell.chosen.effects)
             if cell.start is not None:
-                lines.append(start_line(cell.start, cell.method.name, parts, cell.train, cell.scene))
+                lines.append(start_line(cell.start, cell.method.name, hooks, cell.train, cell.scene))
         except AwError as error:
             raise AwError(f"{cell.method.name}: {error}") from error
         except (Exception, SystemExit):

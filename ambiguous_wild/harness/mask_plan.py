@@ -39,6 +39,7 @@ from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 
 LONGEST = 160  # px, longer side of the probe's photos
 ITERATIONS = 300
@@ -182,7 +183,7 @@ def occlusion(
         data = small_data(scene, Path(folder))
         config = TrainConfig(iterations=iterations, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(data, with_effects(MethodHooks(), effects), config, folder=Path(folder))
-        trainer.train(tick=lambda _: tick())
+        train(trainer, tick=lambda _: tick())
         patches, counted = [], []
         places = [i for i, v in enumerate(scene.views) if v.split == "train"]
         for view, photo in enumerate(data.photos):
@@ -324,10 +325,10 @@ class Pair:
         """
         policy = HeldBack(self.blocks, patches, masked)
         # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
-        parts = dataclasses.replace(MethodHooks(), mask=policy, density_config=FIXED, weighting="images")
+        hooks = dataclasses.replace(MethodHooks(), mask=policy, density_config=FIXED, weighting="images")
         config = TrainConfig(iterations=iterations, seed=SEED, probes=0, checkpoint_every_s=1e9)
-        trainer = Trainer(self.data, with_effects(parts, effects), config, folder=self.folder)
-        trainer.train(tick=lambda _: tick())
+        trainer = Trainer(self.data, with_effects(hooks, effects), config, folder=self.folder)
+        train(trainer, tick=lambda _: tick())
         names = [view.name for view in self.data.scene.train]
         return {names[view]: float(np.mean(dbs)) for view, dbs in sorted(policy.visits.items())}
 

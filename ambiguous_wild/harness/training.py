@@ -34,8 +34,8 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
-from ambiguous_wild.splat.run import Stopped
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import Stopped, train
 
 LOG = logging.getLogger(__name__)
 _PROC = Path("/proc/self")
@@ -192,9 +192,9 @@ def check_passes(cell: Cell) -> None:
         refuse_without_masks(cell.method.base, cell.method.build(cell.options))
 
 
-def refuse_without_masks(name: str, parts: MethodHooks) -> None:
+def refuse_without_masks(name: str, hooks: MethodHooks) -> None:
     """Raise AwError if the method's mask policy keeps every pixel."""
-    policy = parts.mask.mask if isinstance(parts.mask, GraftedPolicy) else parts.mask
+    policy = hooks.mask.mask if isinstance(hooks.mask, GraftedPolicy) else hooks.mask
     kind = type(policy)
     if kind.keep is MaskPolicy.keep and kind.predict is MaskPolicy.predict:
         raise AwError(
@@ -222,14 +222,14 @@ def first_pass(cell: Cell, folder: Path, cache_dir: Path, tick: Tick | None) -> 
 def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | None) -> None:
     trainer = _make_trainer(replace(cell, train=replace(cell.train, probes=0)), place, cache_dir)
     trainer.resume()
-    trainer.train(tick=tick)
+    train(trainer, tick=tick)
     cost = cost_of(cell, trainer)
     shutil.rmtree(place / MASKS, ignore_errors=True)
 
     def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for index, view in enumerate(cell.scene.train):
             step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
-            keep = trainer.parts.mask.predict(step)
+            keep = trainer.hooks.mask.predict(step)
             yield view, np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
 
     evaluate.write_keeps(cell.scene, keeps(), place / MASKS)
@@ -262,7 +262,7 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
                 call(trained)
 
         try:
-            trainer.train(tick=after_iteration)
+            train(trainer, tick=after_iteration)
         except Stopped:
             raise Stopped(_keep_stopped(cell, trainer, truth)) from None
         return _measure(cell, trainer, truth, recorder, first)
@@ -289,18 +289,18 @@ def _make_trainer(
     folder.mkdir(parents=True, exist_ok=True)
     device = torch.device(cell.device)
     data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
-    parts = started(
+    hooks = started(
         with_effects(cell.method.build(cell.options), cell.chosen.effects), cell.start, cell.scene
     )
     if first is not None:
-        parts = replace(parts, mask=FixedMasks(first.keeps))
+        hooks = replace(hooks, mask=FixedMasks(first.keeps))
 
     def probe(draw: Callable[[Camera], torch.Tensor]) -> float:
         return evaluate.mean_psnr(truth, lambda camera: draw(camera).cpu().numpy())
 
     LOG.info("finding start points" if "dense" in cell.chosen.effects else "setting up")
     before = time.perf_counter()
-    trainer = Trainer(data, parts, config_of_one_pass(cell), folder=folder, probe=probe if truth else None)
+    trainer = Trainer(data, hooks, config_of_one_pass(cell), folder=folder, probe=probe if truth else None)
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     trainer.meter = Meter.of(cell.device)
@@ -340,7 +340,7 @@ def _measure(
     masks = evaluate.write_masks(trainer, folder / "masks")
     if recorder is not None:
         pictures.draw_all(trainer, recorder, folder)
-    facts = trainer.parts.mask.facts() | {"skipped_views": trainer.skipped_views} | trainer.watchdog.facts()
+    facts = trainer.hooks.mask.facts() | {"skipped_views": trainer.skipped_views} | trainer.watchdog.facts()
     cost |= evaluate.frames_per_second(trainer)
     cost["model_mb"] = (folder / "point_cloud.ply").stat().st_size / 1e6
     return cell.result(

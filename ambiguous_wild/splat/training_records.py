@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -125,6 +125,25 @@ class GpuClock(Clock):
 def clock_for(device: torch.device, elapsed_s: float = 0.0, parts_s: dict[str, float] | None = None) -> Clock:
     """Return the clock for a run on this device."""
     return (GpuClock if device.type == "cuda" else Clock)(elapsed_s, parts_s)
+
+
+class RunObserver(Protocol):
+    """Watches the machine while a run trains; it is called with the run's clock stopped.
+
+    `harness.meter.Meter` is one; this package cannot import it.
+    """
+
+    def begin(self, trained_s: float) -> None: ...
+
+    def due(self, trained_s: float, progress: float) -> bool: ...
+
+    def look(self, trained_s: float) -> None: ...
+
+    def end(self, trained_s: float) -> None: ...
+
+    def state_dict(self) -> State: ...
+
+    def load_state_dict(self, state: State) -> None: ...
 
 
 Row = dict[str, float | None]  # one row of a timeline, see `Timeline.add`

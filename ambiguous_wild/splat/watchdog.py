@@ -183,7 +183,7 @@ class Watchdog:
             f"it again from the last good state; --on-nonfinite rollback leaves such a photo out and goes on",
         )
 
-    def keep(self, good: Path, error: NonFinite) -> Path:
+    def snapshot(self, good: Path, error: NonFinite) -> Path:
         """Store what reproduces a finding: a report, the last good checkpoint and what the step saw.
 
         Args:

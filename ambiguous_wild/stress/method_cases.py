@@ -91,8 +91,8 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
             "keep no state in a module or class"
         ]
     step = again.make_step(middle, 0)
-    again.parts.mask.predict(step)
-    again.parts.mask.panels(step)
+    again.hooks.mask.predict(step)
+    again.hooks.mask.panels(step)
     if changed := differing(before, _state(again)):
         return [f"predict(step) or panels(step) changes {changed}: they must learn and store nothing"]
     resumed = trainer("first")
@@ -114,15 +114,15 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
 
 def _parts(trainer: Trainer) -> list[Any]:
     effects = trainer.effects.effects
-    fields = () if trainer.parts.fields is None else (trainer.parts.fields,)
-    return [trainer.parts.mask, trainer.density, *effects, *fields]
+    fields = () if trainer.hooks.fields is None else (trainer.hooks.fields,)
+    return [trainer.hooks.mask, trainer.density, *effects, *fields]
 
 
 def _state(trainer: Trainer) -> State:
     """Save the run; return what it holds, without times."""
     trainer.save()
     held = checkpoint.load(trainer.checkpoint_path)
-    facts = copy.deepcopy(trainer.parts.mask.facts())
+    facts = copy.deepcopy(trainer.hooks.mask.facts())
     return {name: value for name, value in held.items() if name not in _CLOCKS} | {"facts": facts}
 
 

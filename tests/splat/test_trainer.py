@@ -24,6 +24,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, divisor_at
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
 
@@ -76,12 +77,13 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
 data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
 config = TrainConfig(iterations=400, checkpoint_every_s=0.05, probes=0)
 trainer = Trainer(data, MethodHooks(), config, folder=folder)
 trainer.resume()
-trainer.train()
+train(trainer)
 """
 
 
@@ -135,7 +137,7 @@ class FakeTime:
 @pytest.fixture
 def fake_time(monkeypatch):
     clock = FakeTime()
-    for module in ("run", "training_records"):
+    for module in ("training_loop", "training_records"):
         monkeypatch.setattr(f"ambiguous_wild.splat.{module}.time", clock)
     return clock
 
@@ -194,7 +196,7 @@ class _AllMasked(MaskPolicy):
 def test_photos_that_are_all_masked_teach_nothing_and_are_named(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, parts=MethodHooks(mask=_AllMasked()), iterations=12)
     before = bits(trainer)
-    trainer.train()
+    train(trainer)
     assert bits(trainer) == before
     assert trainer.skipped_views == [v.name for v in scene.train]
 

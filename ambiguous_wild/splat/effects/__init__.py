@@ -49,20 +49,20 @@ def check_effects(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in EFFECTS if name in wanted)
 
 
-def with_effects(parts: MethodHooks, names: Sequence[str]) -> MethodHooks:
-    """Add effects to a method's parts; without effects returns the same object."""
+def with_effects(hooks: MethodHooks, names: Sequence[str]) -> MethodHooks:
+    """Add effects to a method's hooks; without effects returns the same object."""
     if not names:
-        return parts
+        return hooks
     built: list[Effect] = []
-    present = {effect.name for effect in parts.effects}  # effects of the method are not added twice
+    present = {effect.name for effect in hooks.effects}  # effects of the method are not added twice
     for name in check_effects(names):
         if name in present:
             continue
         if name in DEGREES:
-            parts = dataclasses.replace(parts, sh_degree=min(parts.sh_degree, DEGREES[name]))
+            hooks = dataclasses.replace(hooks, sh_degree=min(hooks.sh_degree, DEGREES[name]))
             continue
         module, cls, _ = EFFECTS[name]
         effect = getattr(importlib.import_module(f"{__name__}.{module}"), cls)()
-        parts = parts.suited_to(effect)
+        hooks = hooks.suited_to(effect)
         built.append(effect)
-    return dataclasses.replace(parts, effects=(*parts.effects, *built))
+    return dataclasses.replace(hooks, effects=(*hooks.effects, *built))

@@ -34,7 +34,7 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
         raise unknown("train photo", photo, names)
     if len(found) > 1:
         raise AwError(f"{photo} names several photos: {', '.join(names[k] for k in found)}; name one in full")
-    step = trainer.make_step(max(trainer.iteration, 1), found[0], divisor=1)
+    step = trainer.make_step(max(trainer.iteration, 1), found[0], downsampling=1)
     height, width = step.photo.shape[:2]
     if column >= width or row >= height:
         raise AwError(f"{photo} is trained at {width} x {height}: there is no pixel {column}, {row}")

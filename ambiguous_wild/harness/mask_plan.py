@@ -30,9 +30,10 @@ from tqdm import tqdm
 from ambiguous_wild.core import Scene, SparsePoints
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan, answer, plan_effects
+from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
-from ambiguous_wild.splat.data import load_train_data, shrink_keep
+from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
@@ -88,14 +89,8 @@ def small_data(scene: Scene, folder: Path, seed: int = 0) -> TrainData:
         chw = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size=size, mode="area")
         photos.append(chw[0].permute(1, 2, 0).contiguous())
         cameras.append(camera.resized(size[1], size[0]))
-        keeps.append(None if keep is None else _smaller(keep, size))
+        keeps.append(None if keep is None else smaller_keep(keep, size, "any masked"))
     return dataclasses.replace(data, photos=photos, cameras=cameras, user_keep=keeps)
-
-
-def _smaller(keep: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    if tuple(keep.shape) == size:
-        return shrink_keep(keep, 1)
-    return -torch.nn.functional.adaptive_max_pool2d(-keep[None, None], size)[0, 0]
 
 
 def residual_mask(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -187,7 +182,7 @@ def occlusion(
         patches, counted = [], []
         places = [i for i, v in enumerate(scene.views) if v.split == "train"]
         for view, photo in enumerate(data.photos):
-            rendered = trainer.make_step(trainer.iteration, view, divisor=1).rendered
+            rendered = trainer.make_step(trainer.iteration, view, downsampling=1).rendered
             seen = rendered.alpha.numpy() > 0.5
             keep = data.user_keep[view]
             seen &= seen_by_others(scene, places[view], (photo.shape[0], photo.shape[1]))

@@ -88,7 +88,7 @@ def file_stem(trainer: Trainer, view: int) -> str:
 def strip(trainer: Trainer, view: int) -> np.ndarray:
     """Draw photo, render, error and the method's panels of a train view as one row, [h, w, 3] uint8."""
     spent = dict(trainer.clock.parts_s)
-    step = trainer.make_step(max(trainer.iteration, 1), view, divisor=1)
+    step = trainer.make_step(max(trainer.iteration, 1), view, downsampling=1)
     panels = trainer.hooks.mask.panels(step)
     trainer.clock.parts_s = spent  # drawing is not part of the training time
     photo, render = step.photo.cpu().numpy(), step.rendered.image.detach().cpu().numpy()

@@ -70,8 +70,8 @@ def replay(run: Path) -> Replay:
 def open_run(run: Path | str) -> Trainer:
     """Return the trainer of a run as it was when the run was last saved, to look into it.
 
-    `trainer.hooks.mask.predict(trainer.make_step(trainer.iteration, view, divisor=1))` is the keep map of a
-    train photo. Nothing is written to the run.
+    `trainer.hooks.mask.predict(trainer.make_step(trainer.iteration, view, 1))` is the keep map of a train
+    photo, at its own size. Nothing is written to the run.
 
     Raises:
         AwError: the folder is no run, its method or scene is gone, or a file is damaged.

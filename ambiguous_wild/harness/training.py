@@ -228,7 +228,7 @@ def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | Non
 
     def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for index, view in enumerate(cell.scene.train):
-            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
+            step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
             keep = trainer.hooks.mask.predict(step)
             yield view, np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
 

@@ -59,7 +59,7 @@ class TruthMask(MaskPolicy):
         self.keeps = [keep_outside(mask, self.config.dilation).to(data.device) for mask in masks]
 
     def keep(self, step: Step) -> Tensor | None:
-        return shrink_keep(self.keeps[step.view], step.divisor)
+        return shrink_keep(self.keeps[step.view], step.downsampling)
 
     def facts(self) -> Facts:
         return {"masked_share": float(np.mean([1.0 - float(keep.mean()) for keep in self.keeps]))}

@@ -82,7 +82,7 @@ class Trainer:
         self.hooks = hooks
         self.pyramid = Pyramid(data)
         self._compiled: set[frozenset[str]] = set()  # cotangents for which the backward pass is compiled
-        self._divisors: dict[int, int] = {}  # divisors of the steps since the device's check was last read
+        self._downsampling: dict[int, int] = {}  # factors of the steps since the device's check was last read
         # where reading a value makes the host wait, checks stay on the device and are read later
         views = len(data.photos)
         self.device_check = None if data.backend.reads_at_once else DeviceFiniteCheck(data.device, views)
@@ -91,7 +91,7 @@ class Trainer:
         room = Pace(config, hooks.schedule, data, start=0, most=most).most
         gaussians = hooks.first_gaussians(data, room)
         self.pace = Pace(config, hooks.schedule, data, start=len(gaussians), most=most)
-        sizes = self.pyramid.sizes(self.pace.divisors)
+        sizes = self.pyramid.sizes(self.pace.factors)
         data.backend.prepare_loss(data.device, sizes, hooks.lambda_dssim, hooks.weighting)
         self.effects = EffectPipeline(hooks.effects, data)
         attributes = self.effects.rows(gaussians)
@@ -277,18 +277,18 @@ class Trainer:
         photo, keep = photo.to(self.data.device), keep.to(self.data.device)
         return self.drawing.fit(self.gaussians, self.context(camera, fitting=True), photo, keep)
 
-    def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
+    def make_step(self, iteration: int, view: int, downsampling: int | None = None) -> Step:
         """Draw a train view as the loop does; also used to predict masks after the training."""
         progress = self.progress(iteration)
-        divisor = self.pace.divisor(progress) if divisor is None else divisor
+        downsampling = self.pace.downsampling(progress) if downsampling is None else downsampling
         context = ViewContext(
             iteration=iteration,
             nominal=progress * NOMINAL_ITERATIONS,
             progress=progress,
             view=view,
-            divisor=divisor,
-            photo=self.pyramid.photo(view, divisor),
-            camera=self.pyramid.camera(view, divisor),
+            downsampling=downsampling,
+            photo=self.pyramid.photo(view, downsampling),
+            camera=self.pyramid.camera(view, downsampling),
         )
         context = replace(context, camera=self.effects.camera(context))
         with self.clock.part("render"):
@@ -296,7 +296,7 @@ class Trainer:
         of_context = {f.name: getattr(context, f.name) for f in fields(ViewContext)}
         return Step(
             **of_context,
-            ceiling=self.pace.ceiling(divisor, progress),
+            ceiling=self.pace.ceiling(downsampling, progress),
             rendered=rendered,
             gaussians=self.gaussians,
             drawer=self.drawing.again,
@@ -321,7 +321,7 @@ class Trainer:
         user = self.data.user_keep[step.view]
         if user is None:
             return keep
-        user = shrink_keep(user, step.divisor)
+        user = shrink_keep(user, step.downsampling)
         return user if keep is None else keep * user
 
     def step(self) -> float | Tensor:
@@ -411,7 +411,7 @@ class Trainer:
         assert self.device_check is not None
         checked = list(self.watchdog.checked_gradients(gradients).values())
         value = torch.as_tensor(loss.value)
-        self._divisors[step.iteration] = step.divisor
+        self._downsampling[step.iteration] = step.downsampling
         return self.device_check.watch(step.iteration, step.view, value, checked, keep, method_cotangents)
 
     def _learn(
@@ -453,12 +453,12 @@ class Trainer:
             NonFinite: the finding that the step itself would have raised on the CPU.
         """
         broken = None if self.device_check is None else self.device_check.first_broken()
-        divisors, self._divisors = self._divisors, {}
+        factors, self._downsampling = self._downsampling, {}
         if broken is None:
             return
         # repeat at the step's own size: under a budget the schedule has moved on with the clock
-        view, divisor = self.pace.view(broken.iteration), divisors.get(broken.iteration)
-        step = self.make_step(broken.iteration, view, divisor)
+        view, downsampling = self.pace.view(broken.iteration), factors.get(broken.iteration)
+        step = self.make_step(broken.iteration, view, downsampling)
         keep = broken.keep
         loss = self._photometric(step, keep)
         self.watchdog.check_loss(step, keep, loss)

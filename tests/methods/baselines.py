@@ -52,15 +52,15 @@ def step_of(
 ) -> Step:
     """A step whose render is `image`; no Gaussians."""
     photo = data.photos[view]
-    divisor = photo.shape[0] // image.shape[0]
+    downsampling = photo.shape[0] // image.shape[0]
     rendered = SimpleNamespace(image=image, alpha=torch.ones(image.shape[:2]))
     return Step(
         iteration=iteration,
         nominal=nominal,
         view=view,
-        divisor=divisor,
+        downsampling=downsampling,
         ceiling=1000,
-        photo=photo[::divisor, ::divisor].contiguous(),
+        photo=photo[::downsampling, ::downsampling].contiguous(),
         camera=data.cameras[view].resized(image.shape[1], image.shape[0]),
         rendered=rendered,  # type: ignore[arg-type]
         gaussians=None,  # type: ignore[arg-type]

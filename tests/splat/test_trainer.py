@@ -22,7 +22,7 @@ from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, divisor_at
+from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, factor_at
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import bits, trained, trainer_for
@@ -316,12 +316,12 @@ def test_coarse_to_fine_follows_the_photos_spectrum():
     noise = rng.random((400, 400, 3))
     smooth = np.cumsum(np.cumsum(noise - 0.5, 0), 1)
     rough_levels, smooth_levels = coarse_to_fine([noise]), coarse_to_fine([smooth])
-    assert [level.divisor for level in rough_levels] == [4, 2, 1]
+    assert [level.factor for level in rough_levels] == [4, 2, 1]
     assert all(0 <= a.begin < b.begin <= 0.4 for a, b in pairwise(rough_levels))
-    assert [level.divisor for level in smooth_levels] == [4, 2, 1]
+    assert [level.factor for level in smooth_levels] == [4, 2, 1]
     assert coarse_to_fine([np.full((400, 400, 3), 0.5)]) == (Level(0.0, 1),)
     assert coarse_to_fine([noise[:80, :80]]) == (Level(0.0, 1),)
-    assert [divisor_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
+    assert [factor_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
 
 
 def test_the_count_ceiling_rises_with_the_resolution():

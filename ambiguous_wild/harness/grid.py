@@ -19,11 +19,9 @@ from ambiguous_wild.harness.cell import (
     scene_identity,
 )
 from ambiguous_wild.harness.cell_run import (
+    check_folder,
     left_alone,
-    made_anew,
     refuse_other_code,
-    refuse_other_config,
-    refuse_strange_folder,
     run_cell,
 )
 from ambiguous_wild.harness.chosen_effects import (
@@ -234,9 +232,7 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
     folders = [cell_folder(output, cell) for cell in cells]
     for cell, folder in zip(cells, folders):
         if folder.exists() and options.overwrite != "never":
-            refuse_strange_folder(folder)
-            if not made_anew(folder, options.overwrite, cell.config):
-                refuse_other_config(folder, cell)
+            check_folder(cell, folder, options.overwrite)
     kept = {folder for folder in folders if options.overwrite == "never" and folder.exists()}
     trained = {folder: cell for folder, cell in zip(folders, cells) if folder not in kept}
     methods = {folder.parent: cell for folder, cell in trained.items()}  # seeds share the method's file

@@ -79,9 +79,9 @@ class Occlusion:
     patches: tuple[np.ndarray, ...] = field(default=(), repr=False, compare=False)
 
 
-def small_data(scene: Scene, folder: Path, seed: int = 0) -> TrainData:
+def small_data(scene: Scene, folder: Path) -> TrainData:
     """Load the training data with photos of at most LONGEST px."""
-    data = load_train_data(scene, device=torch.device("cpu"), seed=seed, cache_dir=folder)
+    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
     photos, cameras, keeps = [], [], []
     for photo, camera, keep in zip(data.photos, data.cameras, data.user_keep):
         scale = min(1.0, LONGEST / max(photo.shape[:2]))

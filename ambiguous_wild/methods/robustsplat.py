@@ -30,8 +30,8 @@ from ambiguous_wild.methods.masking_common import (
     MaskNet,
     PausingMask,
     adam_of,
-    adam_state,
-    load_adam_state,
+    learner_state,
+    load_learner,
     resized,
 )
 from ambiguous_wild.splat.backend import backend_of
@@ -367,8 +367,7 @@ class RobustSplatMask(PausingMask):
 
     def state_dict(self) -> State:
         return {
-            "net": {name.replace(".", "_"): value for name, value in self.net.state_dict().items()},
-            "adam": adam_state(self.optimiser),
+            **learner_state(self.net, self.optimiser),
             "histogram": self.histogram,
             "distances": self.distances,
             "last_reset": self.last_reset,
@@ -377,9 +376,7 @@ class RobustSplatMask(PausingMask):
         }
 
     def load_state_dict(self, state: State) -> None:
-        names = list(self.net.state_dict())
-        self.net.load_state_dict({name: state["net"][name.replace(".", "_")] for name in names})
-        load_adam_state(self.optimiser, state["adam"])
+        load_learner(self.net, self.optimiser, state)
         self.histogram = state["histogram"].to(self.data.device)
         self.distances = [counts.to(self.data.device) for counts in state["distances"]]
         self.last_reset = int(state["last_reset"])

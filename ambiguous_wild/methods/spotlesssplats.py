@@ -23,11 +23,12 @@ from ambiguous_wild.methods.masking_common import (
     MaskedShares,
     MaskNet,
     adam_of,
-    adam_state,
     annealed,
     bound,
     enlarged,
-    load_adam_state,
+    initialise,
+    learner_state,
+    load_learner,
     nearest,
     percentile,
     residual,
@@ -106,10 +107,7 @@ class PruningDensity(SpotLessDensity):
     def _prune(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         gaussians = super()._prune(gaussians, optimiser)
         drop = self.mutable_rows(~(self.use_sum >= self.config.least_use), gaussians)
-        if not bool(drop.any()) or self.leaves_only_protected(drop, gaussians):
-            return gaussians
-        self.log.now.pruned += int(drop.sum())
-        return self.keep_rows(gaussians, optimiser, ~drop)
+        return self.drop_rows(gaussians, optimiser, drop)
 
 
 class PlacedNet(MaskNet):
@@ -119,10 +117,8 @@ class PlacedNet(MaskNet):
         super().__init__(mean, std, hidden, seed)
         self.place = nn.Linear(4 * OCTAVES, hidden, bias=False, device=mean.device)
         limit = (len(mean) + 4 * OCTAVES) ** -0.5  # features and position form the input of one layer
-        generator = torch.Generator().manual_seed(seed + 1)
+        initialise([(self.place, limit)], seed + 1)
         with torch.no_grad():
-            drawn = 2.0 * torch.rand(self.place.weight.shape, generator=generator) - 1.0
-            self.place.weight.copy_(drawn * limit)
             for values in (self.first.weight, self.first.bias):
                 values *= limit * len(mean) ** 0.5
 
@@ -254,13 +250,11 @@ class SpotLessMask(MaskPolicy):
     def state_dict(self) -> State:
         state: State = {"histogram": self.histogram, "seen": self.seen, "shares": self.shares.state_dict()}
         if self.config.mask == "mlp":
-            net = {name.replace(".", "_"): value for name, value in self.net.state_dict().items()}
-            state |= {"net": net, "adam": adam_state(self.optimiser)}
+            state |= learner_state(self.net, self.optimiser)
         return state
 
     def load_state_dict(self, state: State) -> None:
         self.histogram, self.seen = state["histogram"].to(self.histogram.device), int(state["seen"])
         self.shares = MaskedShares.from_state(state["shares"])
         if self.config.mask == "mlp":
-            self.net.load_state_dict({k: state["net"][k.replace(".", "_")] for k in self.net.state_dict()})
-            load_adam_state(self.optimiser, state["adam"])
+            load_learner(self.net, self.optimiser, state)

@@ -140,9 +140,7 @@ class WildAppearance(Learnt):
         return {"photo": Leaf(start, self.config.lr_photo, per_photo=True), **net}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
-        start = fourier(gaussians.means, self.points)
-        noise = 1e-4 * np.random.default_rng([self.seed, 0x36]).normal(size=tuple(start.shape))
-        start += torch.from_numpy(noise.astype(np.float32)).to(start.device)
+        start = noisy_fourier(gaussians.means, self.points, [self.seed, 0x36])
         return {"wild_embedding": GaussianAttribute(start, self.config.lr_gaussian)}
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
@@ -162,6 +160,13 @@ def fourier(means: Tensor, points: Tensor) -> Tensor:
     unit = 0.5 * (means - centre) / spread + 0.5
     angles = torch.cat([2.0 * torch.pi * 2.0**k * unit for k in range(OCTAVES)], dim=1)
     return torch.cat([angles.sin(), (angles + torch.pi / 2).sin()], dim=1)
+
+
+def noisy_fourier(means: Tensor, points: Tensor, seed: list[int]) -> Tensor:
+    """Return the start of an embedding of each Gaussian: `fourier` with a little noise, [N, 24]."""
+    start = fourier(means, points)
+    noise = 1e-4 * np.random.default_rng(seed).normal(size=tuple(start.shape))
+    return start + torch.from_numpy(noise.astype(np.float32)).to(start.device)
 
 
 class UncertaintyHead(nn.Module):

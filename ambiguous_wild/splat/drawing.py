@@ -73,10 +73,6 @@ class SceneRenderer:
         """Draw a picture in the colours of its photo, see `EffectPipeline.fit_view`."""
         return self.effects.fit_view(gaussians, context, photo, keep, self._draw)
 
-    def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
-        """Return the Gaussians as they are drawn when the picture belongs to no photo."""
-        return self.effects.neutral_model(gaussians, iteration)
-
     def _draw(self, gaussians: Gaussians, context: ViewContext, shade: Shade | None) -> Rendered:
         hooks = self.hooks
         return render(

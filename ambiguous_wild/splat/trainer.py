@@ -263,7 +263,7 @@ class Trainer:
 
     def neutral_model(self) -> Gaussians:
         """Return the Gaussians for viewers, changed as the effects change them for every camera."""
-        return self.drawing.neutral_model(self.gaussians, self.iteration)
+        return self.effects.neutral_model(self.gaussians, self.iteration)
 
     def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
         """Draw a test view [H, W, 3] after fitting the colour effects to a part of its photo.

@@ -21,7 +21,8 @@ from torch import Tensor
 from ambiguous_wild.core import AwError, Camera, View
 from ambiguous_wild.core.errors import counted
 from ambiguous_wild.harness import evaluate, pictures
-from ambiguous_wild.harness.cell import Cell, RunOptions, asked_length
+from ambiguous_wild.harness.cell import Cell, RunOptions
+from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.measures import ImageRow
 from ambiguous_wild.harness.meter import Meter
 from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult, TimeRecord
@@ -307,7 +308,7 @@ def _make_trainer(
     trainer.whose = {
         "hash": cell.identity,
         "about": f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}, "
-        + asked_length(cell.train),
+        + length_text(cell.train.iterations, cell.train.budget_s),
     }
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]

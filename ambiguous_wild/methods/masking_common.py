@@ -152,6 +152,13 @@ class PausingMask(WarmUpMask):
         """Return `reset_pause` in iterations of the run."""
         return self.config.reset_pause / (step.nominal / step.iteration)
 
+    def state_dict(self) -> State:
+        return {**super().state_dict(), "last_reset": self.last_reset}
+
+    def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
+        self.last_reset = int(state["last_reset"])
+
 
 class EffectMask(MaskPolicy):
     """A mask policy that reads an effect, which the run must have."""
@@ -195,9 +202,10 @@ class CountingMask(MaskPolicy):
         return {"masked_share": self.shares.mean()}
 
     def state_dict(self) -> State:
-        return {"shares": self.shares.state_dict()}
+        return {**super().state_dict(), "shares": self.shares.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
         self.shares = MaskedShares.from_state(state["shares"])
 
 

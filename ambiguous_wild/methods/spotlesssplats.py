@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.dronesplat import label_means
 from ambiguous_wild.methods.masking_common import (
+    CountingMask,
     MaskedShares,
     MaskNet,
     adam_of,
@@ -37,7 +38,7 @@ from ambiguous_wild.methods.masking_common import (
 )
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
@@ -172,7 +173,7 @@ def build(options: SpotLessSplatsConfig) -> MethodHooks:
     return MethodHooks(SpotLessMask(options), density, options.density, lambda_dssim=options.lambda_dssim)
 
 
-class SpotLessMask(MaskPolicy):
+class SpotLessMask(CountingMask):
     """Keep maps between a strict and a loose bound of the residual, at first drawn at random."""
 
     def __init__(self, config: SpotLessSplatsConfig) -> None:
@@ -245,16 +246,16 @@ class SpotLessMask(MaskPolicy):
 
     def facts(self) -> Facts:
         used = "none" if self.config.mask == "filter" else self.features.name
-        return {"masked_share": self.shares.mean(), "features": used}
+        return {**super().facts(), "features": used}
 
     def state_dict(self) -> State:
-        state: State = {"histogram": self.histogram, "seen": self.seen, "shares": self.shares.state_dict()}
+        state = {**super().state_dict(), "histogram": self.histogram, "seen": self.seen}
         if self.config.mask == "mlp":
             state |= learner_state(self.net, self.optimiser)
         return state
 
     def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
         self.histogram, self.seen = state["histogram"].to(self.histogram.device), int(state["seen"])
-        self.shares = MaskedShares.from_state(state["shares"])
         if self.config.mask == "mlp":
             load_learner(self.net, self.optimiser, state)

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.masking_common import (
+    CountingMask,
     MaskedShares,
     PausingMask,
     adam_of,
@@ -121,7 +122,7 @@ def _determinant(prediction: Tensor) -> Tensor:
     return (s1.square() * s2.square() * (1.0 - rho.square())).clamp(min=1e-6)
 
 
-class Divergence(PausingMask):
+class Divergence(CountingMask, PausingMask):
     """Masks by the head, which learns from the photo alone; after an opacity reset by the last mask."""
 
     config: T3dgsConfig
@@ -191,21 +192,20 @@ class Divergence(PausingMask):
         return Cotangents(alpha=pair[0], depth=pair[1])
 
     def facts(self) -> Facts:
-        return {"masked_share": self.shares.mean(), "features": self.features.name}
+        return {**super().facts(), "features": self.features.name}
 
     def state_dict(self) -> State:
         return {
+            **super().state_dict(),
             **learner_state(self.head, self.optimiser),
             "bank": {str(view): mask for view, mask in self.bank.items()},
-            "last_reset": self.last_reset,
-            "shares": self.shares.state_dict(),
         }
 
     def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
         load_learner(self.head, self.optimiser, state)
         device = next(self.head.parameters()).device
         self.bank = {int(view): mask.bool().to(device) for view, mask in state["bank"].items()}
-        self.last_reset, self.shares = int(state["last_reset"]), MaskedShares.from_state(state["shares"])
 
 
 def inverse_depth(alpha: Tensor, depth: Tensor) -> Tensor:

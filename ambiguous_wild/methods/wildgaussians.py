@@ -28,13 +28,14 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.masking_common import (
+    CountingMask,
     MaskedShares,
     PausingMask,
     adam_of,
-    adam_state,
     calibrated,
     hashed_uniform,
-    load_adam_state,
+    learner_state,
+    load_learner,
     resized,
 )
 from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
@@ -200,7 +201,7 @@ def uncertainty_loss(sigma: Tensor, distance: Tensor, prior: float) -> Tensor:
     return (distance * 0.5 / sigma.square()).mean() + prior * sigma.log().mean()
 
 
-class Uncertainty(PausingMask):
+class Uncertainty(CountingMask, PausingMask):
     """Keeps pixels with 1 / (2 sigma^2) > 1; the head learns in every step, but not after opacity resets."""
 
     config: WildGaussiansConfig
@@ -247,16 +248,11 @@ class Uncertainty(PausingMask):
         self.optimiser.step()
 
     def facts(self) -> Facts:
-        return {"masked_share": self.shares.mean(), "features": self.distance.name}
+        return {**super().facts(), "features": self.distance.name}
 
     def state_dict(self) -> State:
-        net = {"weight": self.head.weight.detach(), "bias": self.head.bias.detach()}
-        return {
-            "net": net, "adam": adam_state(self.optimiser), "last_reset": self.last_reset,
-            "shares": self.shares.state_dict(),
-        }  # fmt: skip
+        return {**super().state_dict(), **learner_state(self.head, self.optimiser)}
 
     def load_state_dict(self, state: State) -> None:
-        self.head.load_state_dict(state["net"])
-        load_adam_state(self.optimiser, state["adam"])
-        self.last_reset, self.shares = int(state["last_reset"]), MaskedShares.from_state(state["shares"])
+        super().load_state_dict(state)
+        load_learner(self.head, self.optimiser, state)

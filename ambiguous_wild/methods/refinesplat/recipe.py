@@ -280,17 +280,17 @@ class RefineSplatMask(PausingMask):
     def state_dict(self) -> State:
         psi = self.inputs.semantics.psi if self.inputs.has_semantics else None
         return {
+            **super().state_dict(),
             **self.masks.state_dict(),
             "visits": {str(view): count for view, count in self.visits.items()},
-            "last_reset": self.last_reset,
             # saved, because the last bits of psi's training may differ on another machine
             "psi": None if psi is None else dict(psi.state_dict()),
         }
 
     def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
         self.masks.load_state_dict(state)
         self.visits = {int(v): int(count) for v, count in state["visits"].items()}
-        self.last_reset = int(state["last_reset"])
         if state["psi"] is not None and self.inputs.semantics.psi is not None:
             self.inputs.semantics.psi.load_state_dict(state["psi"])
 

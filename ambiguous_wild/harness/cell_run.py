@@ -42,7 +42,7 @@ from ambiguous_wild.harness.training import STOPPED, Tick, train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
 from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
-from ambiguous_wild.methods.references import place_of
+from ambiguous_wild.methods.references import error_location
 from ambiguous_wild.splat.watchdog import FOLDER as NONFINITE
 
 ENVIRONMENT = "env.json"
@@ -106,7 +106,7 @@ def error_line(error: BaseException) -> str:
         return str(error)
     if isinstance(error, OSError):
         return disk_line(error)
-    return f"{type(error).__name__}: {error}{place_of(error)}"
+    return f"{type(error).__name__}: {error}{error_location(error)}"
 
 
 def check_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:

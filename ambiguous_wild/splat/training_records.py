@@ -192,7 +192,7 @@ class Timeline:
 
 
 @dataclass
-class Places:
+class SampledPositions:
     """Positions [n, 3] in the world, thinned evenly to at most `MOST` without random numbers."""
 
     xyz: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
@@ -226,8 +226,8 @@ class DensityLog:
     """Rounds of growth in order, and positions of the Gaussians that they made."""
 
     rounds: list[Round] = field(default_factory=list)
-    added: Places = field(default_factory=Places)  # Gaussians added by cloning and splitting
-    merged: Places = field(default_factory=Places)  # Gaussians that replaced merged ones
+    added: SampledPositions = field(default_factory=SampledPositions)  # by cloning and splitting
+    merged: SampledPositions = field(default_factory=SampledPositions)  # in place of merged Gaussians
 
     def begin(self, iteration: int) -> None:
         """Start a round."""
@@ -259,4 +259,4 @@ class DensityLog:
 
     def load_state_dict(self, state: State) -> None:
         self.rounds = [Round(*row) for row in state["rounds"]]
-        self.added, self.merged = Places(**state["added"]), Places(**state["merged"])
+        self.added, self.merged = SampledPositions(**state["added"]), SampledPositions(**state["merged"])

@@ -20,7 +20,7 @@ from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.config import State
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.methods.entry import MethodEntry
-from ambiguous_wild.methods.references import place_of
+from ambiguous_wild.methods.references import error_location
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.pace import TrainConfig
@@ -53,10 +53,10 @@ def case_of(entry: MethodEntry) -> Case:
             with tempfile.TemporaryDirectory(prefix="aw-stress-") as folder:
                 wrong = _faults(entry, Path(folder), torch.device(device))
         except Exception as error:
-            if isinstance(error, AwError) or not place_of(error):
+            if isinstance(error, AwError) or not error_location(error):
                 raise
             why = " ".join(f"{type(error).__name__}: {error}".split())
-            raise AwError(why + place_of(error)) from error
+            raise AwError(why + error_location(error)) from error
         return CaseResult(
             float(len(wrong)), 0.0, "; ".join(wrong) or "exact", "same bits when repeated, resumed"
         )

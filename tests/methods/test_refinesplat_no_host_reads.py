@@ -76,11 +76,10 @@ def moved(policy: RefineSplatMask) -> RefineSplatMask:
     policy.data = dataclasses.replace(
         policy.data, device=META, photos=[photo.to(META) for photo in policy.data.photos]
     )
-    inputs = policy.inputs
+    inputs, readable = policy.inputs, dataclasses.replace(policy.data, photos=photos)
     policy.masks = MaskStore(
-        policy.config, photos, policy.data.cameras, surfaces, policy.looks, inputs.labels, inputs.static,
-        META, policy.compare,
-    )  # fmt: skip
+        policy.config, readable, surfaces, policy.looks, inputs.labels, inputs.static, policy.compare
+    )
     policy.masks.pixels.photos = policy.data.photos
     policy.first = {view: first.to(META) for view, first in policy.first.items()}
     return policy

@@ -17,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_by
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
@@ -28,7 +27,7 @@ from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshol
 from ambiguous_wild.splat.backend import backend_of
 
 if TYPE_CHECKING:
-    from ambiguous_wild.splat.step import Step
+    from ambiguous_wild.splat.step import Step, TrainData
 
 PRICE = 3.0  # cost of a masked pixel, in MADs above the median distance, if `disagree` is off
 
@@ -214,16 +213,15 @@ class MaskStore:
     def __init__(
         self,
         config: RefineSplatConfig,
-        photos: Sequence[Tensor],  # [H, W, 3] float32 in [0, 1] on `device`
-        cameras: Sequence[Camera],
+        data: TrainData,
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points
         looks: Mapping[int, InitialMaskPrior],
         labels: Sequence[np.ndarray],  # [H, W] int32 instances, 0 = none
         static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
-        device: torch.device | str,
         compare: Callable[[Step], Maps],  # on the feature grid; called only if the statistic needs it
     ) -> None:
         self.config, self.compare = config, compare
+        photos, cameras, device = data.photos, data.cameras, data.device
         self.pixels = PixelEvidence(photos, cameras, surfaces, config.mask, device)
         structure = config.mask.statistic == "structure"
         # features are judged on their whole grid

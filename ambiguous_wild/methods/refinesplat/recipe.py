@@ -139,10 +139,8 @@ class RefineSplatMask(PausingMask):
             photos = (photo.cpu().numpy() for photo in data.photos)  # one at a time: all may not fit
             looks = first_look(data.cameras, photos, surfaces, config.first_look, moving)
             self.looks = {view: look for view, look in enumerate(looks) if look is not None}
-        self.masks = MaskStore(
-            config, data.photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
-            data.device, self.compare,
-        )  # fmt: skip
+        labels, static = self.inputs.labels, self.inputs.static
+        self.masks = MaskStore(config, data, surfaces, self.looks, labels, static, self.compare)
         # view -> its keep map before masks begin, [H, W] float32; absent if everything is kept
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)

@@ -30,7 +30,7 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import environment
 from ambiguous_wild.harness.evaluate import frames_per_second, load_test_photos, mean_psnr
-from ambiguous_wild.harness.training import peak_memory, reset_peak
+from ambiguous_wild.harness.run_cost import peak_memory, reset_peak
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method

@@ -38,11 +38,12 @@ from ambiguous_wild.harness.result_file import (
 )
 from ambiguous_wild.harness.store import CONFIG, read_config
 from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
-from ambiguous_wild.harness.training import STOPPED, Tick, train_and_measure
+from ambiguous_wild.harness.training import STOPPED, train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
 from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
 from ambiguous_wild.methods.references import error_location
+from ambiguous_wild.splat.training_loop import Tick
 from ambiguous_wild.splat.watchdog import FOLDER as NONFINITE
 
 ENVIRONMENT = "env.json"

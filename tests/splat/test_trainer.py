@@ -247,6 +247,14 @@ def test_what_a_policy_must_not_do_is_refused(scene, tmp_path, place, fault, mes
         trainer_for(scene, tmp_path, parts=MethodHooks(mask=mask)).step()
 
 
+def test_an_old_name_says_the_new_one(scene, tmp_path):
+    trainer = trainer_for(scene, tmp_path)
+    with pytest.raises(AwError, match=r"trainer\.hooks"):
+        _ = trainer.parts
+    with pytest.raises(AwError, match=r"step\.downsampling"):
+        _ = trainer.make_step(1, 0).divisor
+
+
 def test_a_method_gets_no_test_photo(scene, tmp_path):
     given = []
 

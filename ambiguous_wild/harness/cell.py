@@ -46,6 +46,9 @@ from ambiguous_wild.methods.references import reference_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.pace import TrainConfig
 
+Overwrite = Literal["never", "missing", "changed", "always"]
+Protocol = Literal["full", "half"]
+Outcome = Literal["trained", "kept", "skipped", "failed"]
 PACKAGES = ("numpy", "numba", "torch", "opencv-contrib-python-headless", "scipy", "gsplat", "transformers")
 # Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
 # values that are not finite (the result says so where there were any), where the scene lies.
@@ -153,11 +156,6 @@ def _digest(path: Path) -> str:
 @lru_cache(maxsize=16_384)
 def _digest_of(path: Path, size: int, mtime_ns: int) -> str:
     return sha256_file(path)
-
-
-Overwrite = Literal["never", "missing", "changed", "always"]
-Protocol = Literal["full", "half"]
-Outcome = Literal["trained", "kept", "skipped", "failed"]
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from ambiguous_wild.harness.timing import LEAST, MOST, expected_s, slowness
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
-from ambiguous_wild.splat.effects import ALL, check_effects
+from ambiguous_wild.splat.effects import check_effects
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -322,7 +322,7 @@ def choose(
             f"photos have changed): run 'aw plan {scene.root}'"
         )
     if wanted != "auto":
-        asked = Chosen(ALL if wanted == "all" else named, "" if wanted == "none" else wanted)
+        asked = Chosen(named, "" if wanted == "none" else wanted)
         return {m.name: asked if takes_effects(m) else Chosen() for m in methods}
     if not any(map(takes_effects, methods)):
         return {m.name: Chosen() for m in methods}

@@ -116,14 +116,14 @@ def check_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
     Raises:
         AwError: the folder holds foreign files, or a run of another configuration.
     """
-    _refuse_strange_folder(folder)
+    _refuse_foreign_folder(folder)
     anew = made_anew(folder, overwrite, cell.config)
     if not anew:
         refuse_other_config(folder, cell)
     return anew
 
 
-def _refuse_strange_folder(folder: Path) -> None:
+def _refuse_foreign_folder(folder: Path) -> None:
     """Raise AwError if the folder holds files but no run of this package."""
     if not folder.is_dir():
         raise AwError(f"{folder} is a file, not a run folder; choose another -o")

@@ -127,7 +127,7 @@ def _make_trainer(
     # Frozen inputs, instance masks and identities are part of what a method costs.
     trainer.setup_s = time.perf_counter() - before
     trainer.meter = Meter.of(cell.device)
-    trainer.whose = {
+    trainer.run_identity = {
         "hash": cell.identity,
         "about": f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}, "
         + length_text(cell.train.iterations, cell.train.budget_s),

@@ -74,7 +74,7 @@ class Trainer:
         self.marks: tuple[int, int] | None = None  # probes and timeline rows due after the last step
         self.setup_s = 0.0  # seconds before the first step, in the process that began the run
         # "hash" of the run's configuration and "about", its name; empty = unknown
-        self.whose: dict[str, str] = {}
+        self.run_identity: dict[str, str] = {}
         self.iteration = 0
         self.timeline = Timeline()
         self._skipped: set[int] = set()  # views that were fully masked at some step
@@ -127,7 +127,7 @@ class Trainer:
         rollbacks = self.watchdog.state_dict()
         others, effects = self.drawing.state_dict(), self.effects.state_dict()
         return {
-            **({"run": dict(self.whose)} if self.whose else {}),
+            **({"run": dict(self.run_identity)} if self.run_identity else {}),
             "iteration": self.iteration,
             "elapsed_s": self.clock.now(),
             "setup_s": self.setup_s,
@@ -186,12 +186,12 @@ class Trainer:
         if not path.exists():
             return False
         state = checkpoint.load(path)
-        other = state.get("run", self.whose)  # checkpoints of earlier versions do not hold it
-        if self.whose and other != self.whose:
+        other = state.get("run", self.run_identity)  # checkpoints of earlier versions do not hold it
+        if self.run_identity and other != self.run_identity:
             raise AwError(
                 f"checkpoint {path} is of another run ({other.get('about')}, configuration "
-                f"{str(other.get('hash'))[:12]}), this one is {self.whose['about']}, configuration "
-                f"{self.whose['hash'][:12]}; delete it, or train again with --overwrite always"
+                f"{str(other.get('hash'))[:12]}), this one is {self.run_identity['about']}, configuration "
+                f"{self.run_identity['hash'][:12]}; delete it, or train again with --overwrite always"
             )
         try:
             self.load_state(state)
@@ -378,7 +378,7 @@ class Trainer:
             self.pyramid.prefetch(self.pace.view(iteration + 1))
         if events or self.watchdog.due(iteration):
             with part("watchdog"):
-                self._look_back()
+                self._read_device_check()
                 self.watchdog.check_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
@@ -446,7 +446,7 @@ class Trainer:
                 self.effects.after_step(step, self.gaussians)
         return events
 
-    def _look_back(self) -> None:
+    def _read_device_check(self) -> None:
         """Read the device's check; if a step was not finite since the last one, repeat it to find the values.
 
         Raises:
@@ -468,7 +468,7 @@ class Trainer:
 
     def check_parameters(self) -> None:
         """Raise NonFinite for the last step if a parameter is not finite."""
-        self._look_back()
+        self._read_device_check()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.check_parameters(self.iteration, view, self.gaussians)
 

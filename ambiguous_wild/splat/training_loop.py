@@ -138,7 +138,7 @@ def _roll_back(trainer: Trainer, error: NonFinite) -> None:
     """
     watchdog = trainer.watchdog
     where = watchdog.snapshot(trainer.checkpoint_path, error)
-    if not watchdog.undoes:
+    if not watchdog.rolls_back:
         raise watchdog.final(error, where)
     spent, rollbacks = trainer.clock, list(watchdog.rollbacks)
     trainer.resume()

@@ -30,11 +30,11 @@ from torch import Tensor
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import environment
 from ambiguous_wild.harness.evaluate import frames_per_second, load_test_photos, mean_psnr
-from ambiguous_wild.harness.training import peak_memory, reset_peak
+from ambiguous_wild.harness.run_cost import peak_memory, reset_peak
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
-from ambiguous_wild.splat import readiness
+from ambiguous_wild.splat import readiness, training_loop
 from ambiguous_wild.splat.backend import wait
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -143,7 +143,7 @@ def train(args: argparse.Namespace, method: str) -> tuple[Trainer, dict[str, Any
     reset_peak(args.device)
     trainer = trainer_of(args, method, args.iterations)
     trainer.resume()
-    trainer.train()
+    training_loop.train(trainer)
     trainer.clock.settle()
     truth = load_test_photos(trainer.data.scene)
     row = {

@@ -34,13 +34,13 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
         raise unknown("train photo", photo, names)
     if len(found) > 1:
         raise AwError(f"{photo} names several photos: {', '.join(names[k] for k in found)}; name one in full")
-    step = trainer.make_step(max(trainer.iteration, 1), found[0], divisor=1)
+    step = trainer.make_step(max(trainer.iteration, 1), found[0], downsampling=1)
     height, width = step.photo.shape[:2]
     if column >= width or row >= height:
         raise AwError(f"{photo} is trained at {width} x {height}: there is no pixel {column}, {row}")
     if not trainer.done:
         say(f"{run} is not finished: these are its masks after {trainer.iteration} iterations")
-    policy, own = trainer.parts.mask, trainer.data.user_keep[found[0]]
+    policy, own = trainer.hooks.mask, trainer.data.user_keep[found[0]]
     predicted = policy.predict(step)
     keep = trainer.combine_user_keep(step, predicted)
     kept = keep is None or bool(keep[row, column] > 0.5)

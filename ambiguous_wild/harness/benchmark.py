@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.trained_models import Viewer
     from ambiguous_wild.methods.entry import MethodEntry
 
-Place = Literal["mask", "density", "regulariser"]
-Words = str | Path
+GraftSlot = Literal["mask", "density", "regulariser"]
+PathLike = str | Path
 _BETWEEN_METHODS = re.compile(r",(?!\s*\w*\s*=)")
 
 
@@ -137,29 +137,29 @@ class BenchReport:
 
 def bench(
     methods: str | Sequence[str],
-    scenes: Words | Sequence[Words],
+    scenes: PathLike | Sequence[PathLike],
     *,
-    output: Words = "runs",
+    output: PathLike = "runs",
     seeds: Sequence[int] = (0,),
     iterations: int | None = None,
     budgets_s: Sequence[float] = (),
     effects: str | Sequence[str] = "auto",
-    plan: EffectsPlan | Words | None = None,
+    plan: EffectsPlan | PathLike | None = None,
     settings: Sequence[str] = (),
-    parts: Mapping[Place, str] | None = None,
+    parts: Mapping[GraftSlot, str] | None = None,
     passes: int = 1,
     train: TrainSettings | None = None,
-    plugins: Sequence[Words] = (),
-    metrics: Words | Sequence[Words] = (),
+    plugins: Sequence[PathLike] = (),
+    metrics: PathLike | Sequence[PathLike] = (),
     device: Literal["auto", "cpu", "cuda"] = "auto",
     threads: int | None = None,
     jobs: int | None = None,
     engine: Engine | None = None,
     factor: int | None = None,
     protocol: Protocol | None = None,
-    start: Words | None = None,
+    start: PathLike | None = None,
     overwrite: Overwrite = "missing",
-    cache: Words | None = None,
+    cache: PathLike | None = None,
     pictures: bool = True,
     callbacks: Callbacks | None = None,
 ) -> BenchReport:
@@ -291,7 +291,7 @@ def bench(
 
 
 def find_methods(
-    methods: Sequence[str], plugins: Sequence[Words], parts: Mapping[Place, str], passes: int
+    methods: Sequence[str], plugins: Sequence[PathLike], parts: Mapping[GraftSlot, str], passes: int
 ) -> dict[str, MethodEntry]:
     """Return the methods, with the parts they take, by the name that finds them again in another process.
 
@@ -319,7 +319,7 @@ def find_methods(
 
 def _check_effects(
     choices: Sequence[str],
-    plan: EffectsPlan | Words | None,
+    plan: EffectsPlan | PathLike | None,
     scenes: Sequence[Path],
     methods: Collection[MethodEntry],
 ) -> None:
@@ -359,7 +359,7 @@ def _remarks(cells: Sequence[Cell]) -> list[str]:
     return lines
 
 
-def _rescore_hint(report: BenchReport, metrics: Sequence[Words] = ()) -> str:
+def _rescore_hint(report: BenchReport, metrics: Sequence[PathLike] = ()) -> str:
     """Return a line with the metrics that `aw rescore` could add to kept runs; empty where there are none."""
     kept = [r.result for r in report.runs if r.outcome in ("kept", "skipped") and r.result is not None]
     if not metrics and not any(result["missing"] for result in kept):

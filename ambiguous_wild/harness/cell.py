@@ -24,6 +24,7 @@ from ambiguous_wild.core import UNMOVED, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.core.errors import installed
 from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
+from ambiguous_wild.harness.command_lines import bench_command, length_options, length_text, option_text
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
     SCHEMA,
@@ -45,6 +46,9 @@ from ambiguous_wild.methods.references import reference_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.pace import TrainConfig
 
+Overwrite = Literal["never", "missing", "changed", "always"]
+Protocol = Literal["full", "half"]
+Outcome = Literal["trained", "kept", "skipped", "failed"]
 PACKAGES = ("numpy", "numba", "torch", "opencv-contrib-python-headless", "scipy", "gsplat", "transformers")
 # Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
 # values that are not finite (the result says so where there were any), where the scene lies.
@@ -129,11 +133,6 @@ def scene_identity(scene: Scene) -> str:
     return config_hash({"files": hashes, "split": split, **moved})
 
 
-def asked_length(train: TrainConfig) -> str:
-    """Return the length that was asked for, "60 s" or "2000 iterations"."""
-    return f"{train.iterations} iterations" if train.budget_s is None else f"{train.budget_s:g} s"
-
-
 def _contents(scene: Scene) -> dict[str, object]:
     """Return cameras, points and photos of a plain COLMAP scene, which lists no hashes of its files."""
     cameras = [v.camera for v in scene.views]
@@ -157,11 +156,6 @@ def _digest(path: Path) -> str:
 @lru_cache(maxsize=16_384)
 def _digest_of(path: Path, size: int, mtime_ns: int) -> str:
     return sha256_file(path)
-
-
-Overwrite = Literal["never", "missing", "changed", "always"]
-Protocol = Literal["full", "half"]
-Outcome = Literal["trained", "kept", "skipped", "failed"]
 
 
 @dataclass(frozen=True)
@@ -234,7 +228,10 @@ class Cell:
             facts: what the method, its effects and the watchdog report.
             cost: time, memory and size.
         """
-        all_facts: RunFacts = {**(facts or {}), "length": asked_length(self.train)}
+        all_facts: RunFacts = {
+            **(facts or {}),
+            "length": length_text(self.train.iterations, self.train.budget_s),
+        }
         if mixed := mixed_tests(self.scene):
             all_facts["test_photos"] = mixed
         if self.start is not None:
@@ -308,25 +305,19 @@ def reproduce(cell: Cell) -> str:
     method, train = cell.method, cell.train
     name = _base(method).name
     given = method.given_as or name
-    words = ["aw", "bench", "--method", given, "--scene", str(cell.scene.root.resolve())]
-    words += ["--seed", str(train.seed), *_length(train), "--device", cell.device.partition(":")[0]]
-    words += ["--resolution", train.resolution, "--effects", ",".join(cell.chosen.effects) or "none"]
-    factor = cell.scene.info.get("loaded_factor")
-    words += ["--factor", str(factor)] if factor else []
-    words += ["--start", str(cell.start.path)] if cell.start is not None else []
-    words += ["--max-gaussians", str(train.max_gaussians)] if train.max_gaussians is not None else []
-    words += ["--protocol", cell.protocol] if cell.protocol != scene_protocol(cell.scene) else []
-    for setting in _settings(method, name, cell.options):
-        words += ["--set", setting]
-    for plugin in _plugins(method):
-        words += ["--plugin", str(plugin)]
-    return shlex.join(words)
-
-
-def _length(train: TrainConfig) -> list[str]:
-    if train.budget_s is None:
-        return ["--iterations", str(train.iterations)]
-    return ["--budget", f"{train.budget_s:.6f}".rstrip("0").rstrip(".") + "s"]
+    options: list[tuple[str, object]] = [
+        ("--device", cell.device.partition(":")[0]),
+        ("--resolution", train.resolution),
+        ("--effects", ",".join(cell.chosen.effects) or "none"),
+        ("--factor", cell.scene.info.get("loaded_factor") or None),
+        ("--start", cell.start and cell.start.path),
+        ("--max-gaussians", train.max_gaussians),
+        ("--protocol", None if cell.protocol == scene_protocol(cell.scene) else cell.protocol),
+        *(("--set", setting) for setting in _settings(method, name, cell.options)),
+        *(("--plugin", plugin) for plugin in _plugins(method)),
+    ]
+    scene, length = str(cell.scene.root.resolve()), length_options(train.iterations, train.budget_s)
+    return shlex.join(bench_command(("--method", given), scene, train.seed, length, options))
 
 
 def _base(method: MethodEntry) -> MethodEntry:
@@ -352,13 +343,6 @@ def _settings(method: MethodEntry, name: str, options: Any) -> list[str]:
             owner = dict(method.places)[place]
         settings.append(f"{owner}.{rest}={option_text(value)}")
     return list(dict.fromkeys(settings))
-
-
-def option_text(value: Any) -> str:
-    """Return the value of an option as `--set` reads it."""
-    if isinstance(value, (list, tuple)):
-        return ",".join(map(option_text, value))
-    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _plugins(method: MethodEntry) -> list[Path]:

@@ -38,11 +38,12 @@ from ambiguous_wild.harness.result_file import (
 )
 from ambiguous_wild.harness.store import CONFIG, read_config
 from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
-from ambiguous_wild.harness.training import STOPPED, Tick, train_and_measure
+from ambiguous_wild.harness.training import STOPPED, train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
 from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
-from ambiguous_wild.methods.references import place_of
+from ambiguous_wild.methods.references import error_location
+from ambiguous_wild.splat.training_loop import Tick
 from ambiguous_wild.splat.watchdog import FOLDER as NONFINITE
 
 ENVIRONMENT = "env.json"
@@ -106,10 +107,23 @@ def error_line(error: BaseException) -> str:
         return str(error)
     if isinstance(error, OSError):
         return disk_line(error)
-    return f"{type(error).__name__}: {error}{place_of(error)}"
+    return f"{type(error).__name__}: {error}{error_location(error)}"
 
 
-def refuse_strange_folder(folder: Path) -> None:
+def check_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
+    """Return whether an earlier run in an existing folder is replaced.
+
+    Raises:
+        AwError: the folder holds foreign files, or a run of another configuration.
+    """
+    _refuse_foreign_folder(folder)
+    anew = made_anew(folder, overwrite, cell.config)
+    if not anew:
+        refuse_other_config(folder, cell)
+    return anew
+
+
+def _refuse_foreign_folder(folder: Path) -> None:
     """Raise AwError if the folder holds files but no run of this package."""
     if not folder.is_dir():
         raise AwError(f"{folder} is a file, not a run folder; choose another -o")
@@ -239,14 +253,11 @@ def _log_file(path: Path) -> logging.Handler:
 def _prepare_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
     """Check or empty the folder and write the settings; False where it holds the finished run already."""
     if folder.exists():
-        refuse_strange_folder(folder)
-        if made_anew(folder, overwrite, cell.config):
+        if check_folder(cell, folder, overwrite):
             for name in OURS:  # what a user put beside them stays
                 remove(folder / name)
-        else:
-            refuse_other_config(folder, cell)
-            if is_finished(folder):
-                return False
+        elif is_finished(folder):
+            return False
     folder.mkdir(parents=True, exist_ok=True)
     sweep(folder)
     for name in (FAILED, TRACEBACK):

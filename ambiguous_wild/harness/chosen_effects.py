@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.methods.registry import MethodEntry
-from ambiguous_wild.splat.effects import check_effects
+from ambiguous_wild.splat.effects import ALL, check_effects
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.effects_plan import EffectsPlan
@@ -84,13 +84,13 @@ class Chosen:
 
 
 def check_wanted(wanted: str) -> tuple[str, ...]:
-    """Return the effects in a list, in the order in which they act; empty for a word such as "auto".
+    """Return the effects that the text names, in the order in which they act; none for "auto" and "none".
 
     Raises:
         AwError: the text is neither such a word nor a list of effects.
     """
     if wanted in WORDS:
-        return ()
+        return ALL if wanted == "all" else ()
     names = [name.strip() for name in wanted.split(",") if name.strip()]
     if not names:
         raise AwError("--effects is empty: write auto, none, all, or names with commas (docs/effects.md)")

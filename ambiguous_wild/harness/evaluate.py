@@ -141,8 +141,8 @@ def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
 
     def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for index, view in enumerate(trainer.data.scene.train):
-            step = trainer.make_step(max(trainer.iteration, 1), index, divisor=1)
-            keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
+            step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
+            keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
             if keep is not None:
                 yield view, (keep > 0.5).cpu().numpy()
 

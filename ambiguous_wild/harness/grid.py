@@ -19,11 +19,9 @@ from ambiguous_wild.harness.cell import (
     scene_identity,
 )
 from ambiguous_wild.harness.cell_run import (
+    check_folder,
     left_alone,
-    made_anew,
     refuse_other_code,
-    refuse_other_config,
-    refuse_strange_folder,
     run_cell,
 )
 from ambiguous_wild.harness.chosen_effects import (
@@ -39,13 +37,13 @@ from ambiguous_wild.harness.timing import LEAST, MOST, expected_s, slowness
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
-from ambiguous_wild.splat.effects import ALL, check_effects
+from ambiguous_wild.splat.effects import check_effects
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 
 
 def try_recipes(cells: Sequence[Cell]) -> list[str]:
-    """Build the parts of every method once, so that a faulty last method is found before the first trains.
+    """Build the hooks of every method once, so that a faulty last method is found before the first trains.
 
     Returns:
         A line for each method and scene on the file that they start from (`--start`).
@@ -61,9 +59,9 @@ def try_recipes(cells: Sequence[Cell]) -> list[str]:
     lines = []
     for cell in different.values():
         try:
-            parts = with_effects(cell.method.build(cell.options), cell.chosen.effects)
+            hooks = with_effects(cell.method.build(cell.options), cell.chosen.effects)
             if cell.start is not None:
-                lines.append(start_line(cell.start, cell.method.name, parts, cell.train, cell.scene))
+                lines.append(start_line(cell.start, cell.method.name, hooks, cell.train, cell.scene))
         except AwError as error:
             raise AwError(f"{cell.method.name}: {error}") from error
         except (Exception, SystemExit):
@@ -234,9 +232,7 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
     folders = [cell_folder(output, cell) for cell in cells]
     for cell, folder in zip(cells, folders):
         if folder.exists() and options.overwrite != "never":
-            refuse_strange_folder(folder)
-            if not made_anew(folder, options.overwrite, cell.config):
-                refuse_other_config(folder, cell)
+            check_folder(cell, folder, options.overwrite)
     kept = {folder for folder in folders if options.overwrite == "never" and folder.exists()}
     trained = {folder: cell for folder, cell in zip(folders, cells) if folder not in kept}
     methods = {folder.parent: cell for folder, cell in trained.items()}  # seeds share the method's file
@@ -326,7 +322,7 @@ def choose(
             f"photos have changed): run 'aw plan {scene.root}'"
         )
     if wanted != "auto":
-        asked = Chosen(ALL if wanted == "all" else named, "" if wanted == "none" else wanted)
+        asked = Chosen(named, "" if wanted == "none" else wanted)
         return {m.name: asked if takes_effects(m) else Chosen() for m in methods}
     if not any(map(takes_effects, methods)):
         return {m.name: Chosen() for m in methods}

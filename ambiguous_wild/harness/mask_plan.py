@@ -30,15 +30,17 @@ from tqdm import tqdm
 from ambiguous_wild.core import Scene, SparsePoints
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan, answer, plan_effects
+from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
-from ambiguous_wild.splat.data import load_train_data, shrink_keep
+from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 
 LONGEST = 160  # px, longer side of the probe's photos
 ITERATIONS = 300
@@ -77,9 +79,9 @@ class Occlusion:
     patches: tuple[np.ndarray, ...] = field(default=(), repr=False, compare=False)
 
 
-def small_data(scene: Scene, folder: Path, seed: int = 0) -> TrainData:
+def small_data(scene: Scene, folder: Path) -> TrainData:
     """Load the training data with photos of at most LONGEST px."""
-    data = load_train_data(scene, device=torch.device("cpu"), seed=seed, cache_dir=folder)
+    data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
     photos, cameras, keeps = [], [], []
     for photo, camera, keep in zip(data.photos, data.cameras, data.user_keep):
         scale = min(1.0, LONGEST / max(photo.shape[:2]))
@@ -87,14 +89,8 @@ def small_data(scene: Scene, folder: Path, seed: int = 0) -> TrainData:
         chw = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size=size, mode="area")
         photos.append(chw[0].permute(1, 2, 0).contiguous())
         cameras.append(camera.resized(size[1], size[0]))
-        keeps.append(None if keep is None else _smaller(keep, size))
+        keeps.append(None if keep is None else smaller_keep(keep, size, "any masked"))
     return dataclasses.replace(data, photos=photos, cameras=cameras, user_keep=keeps)
-
-
-def _smaller(keep: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    if tuple(keep.shape) == size:
-        return shrink_keep(keep, 1)
-    return -torch.nn.functional.adaptive_max_pool2d(-keep[None, None], size)[0, 0]
 
 
 def residual_mask(photo: np.ndarray, render: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -182,11 +178,11 @@ def occlusion(
         data = small_data(scene, Path(folder))
         config = TrainConfig(iterations=iterations, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(data, with_effects(MethodHooks(), effects), config, folder=Path(folder))
-        trainer.train(tick=lambda _: tick())
+        train(trainer, tick=lambda _: tick())
         patches, counted = [], []
         places = [i for i, v in enumerate(scene.views) if v.split == "train"]
         for view, photo in enumerate(data.photos):
-            rendered = trainer.make_step(trainer.iteration, view, divisor=1).rendered
+            rendered = trainer.make_step(trainer.iteration, view, downsampling=1).rendered
             seen = rendered.alpha.numpy() > 0.5
             keep = data.user_keep[view]
             seen &= seen_by_others(scene, places[view], (photo.shape[0], photo.shape[1]))
@@ -324,10 +320,10 @@ class Pair:
         """
         policy = HeldBack(self.blocks, patches, masked)
         # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
-        parts = dataclasses.replace(MethodHooks(), mask=policy, density_config=FIXED, weighting="images")
+        hooks = dataclasses.replace(MethodHooks(), mask=policy, density_config=FIXED, weighting="images")
         config = TrainConfig(iterations=iterations, seed=SEED, probes=0, checkpoint_every_s=1e9)
-        trainer = Trainer(self.data, with_effects(parts, effects), config, folder=self.folder)
-        trainer.train(tick=lambda _: tick())
+        trainer = Trainer(self.data, with_effects(hooks, effects), config, folder=self.folder)
+        train(trainer, tick=lambda _: tick())
         names = [view.name for view in self.data.scene.train]
         return {names[view]: float(np.mean(dbs)) for view, dbs in sorted(policy.visits.items())}
 

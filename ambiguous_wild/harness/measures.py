@@ -21,7 +21,7 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods.entry import resolve
-from ambiguous_wild.methods.references import import_file, place_of
+from ambiguous_wild.methods.references import error_location, import_file
 
 if TYPE_CHECKING:
     from ambiguous_wild.core import Scene, View
@@ -84,7 +84,7 @@ class Metric(Measure):
         except Exception as error:
             if isinstance(self.function, str) or isinstance(error, AwError):
                 raise
-            raise AwError(f"{type(error).__name__}: {error}{place_of(error)}") from error
+            raise AwError(f"{type(error).__name__}: {error}{error_location(error)}") from error
 
 
 def _psnr(key: str, label: str, function: str, **more: Any) -> Metric:

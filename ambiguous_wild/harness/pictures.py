@@ -88,8 +88,8 @@ def file_stem(trainer: Trainer, view: int) -> str:
 def strip(trainer: Trainer, view: int) -> np.ndarray:
     """Draw photo, render, error and the method's panels of a train view as one row, [h, w, 3] uint8."""
     spent = dict(trainer.clock.parts_s)
-    step = trainer.make_step(max(trainer.iteration, 1), view, divisor=1)
-    panels = trainer.parts.mask.panels(step)
+    step = trainer.make_step(max(trainer.iteration, 1), view, downsampling=1)
+    panels = trainer.hooks.mask.panels(step)
     trainer.clock.parts_s = spent  # drawing is not part of the training time
     photo, render = step.photo.cpu().numpy(), step.rendered.image.detach().cpu().numpy()
     error = np.abs(photo - np.clip(render, 0.0, 1.0)).mean(axis=2)
@@ -112,7 +112,7 @@ def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
     """
     pictures = folder / "pictures"
     written = recorder.finish(trainer)
-    written += trainer.parts.mask.draw(pictures)
+    written += trainer.hooks.mask.draw(pictures)
     written += draw_density(trainer, pictures / "density.png")
     written += sheets.write_contact(trainer.data.scene, folder / "masks", pictures / "masks.jpg")
     return written

@@ -70,8 +70,8 @@ def replay(run: Path) -> Replay:
 def open_run(run: Path | str) -> Trainer:
     """Return the trainer of a run as it was when the run was last saved, to look into it.
 
-    `trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view, divisor=1))` is the keep map of a
-    train photo. Nothing is written to the run.
+    `trainer.hooks.mask.predict(trainer.make_step(trainer.iteration, view, 1))` is the keep map of a train
+    photo, at its own size. Nothing is written to the run.
 
     Raises:
         AwError: the folder is no run, its method or scene is gone, or a file is damaged.
@@ -101,13 +101,13 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
         raise AwError(
             f"{run} was trained twice, the second time with the masks in {run / 'masks'}: look there"
         )
-    parts = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
-    parts = with_effects(parts, tuple(config.get("effects", ())))
+    hooks = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
+    hooks = with_effects(hooks, tuple(config.get("effects", ())))
     settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
     scene = load_scene(path, factor=factor)
     data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
-    parts = started(parts, recorded_start(config.get("start")), scene)
-    trainer = Trainer(data, parts, settings, folder=folder)
+    hooks = started(hooks, recorded_start(config.get("start")), scene)
+    trainer = Trainer(data, hooks, settings, folder=folder)
     if saved.is_file():
         trainer.checkpoint_path.parent.mkdir(parents=True)
         shutil.copyfile(saved, trainer.checkpoint_path)

@@ -22,6 +22,7 @@ from ambiguous_wild.io.palette import ADDED, MASKED, tint
 from ambiguous_wild.metrics.image import psnr
 
 Item = TypeVar("Item")
+QUALITY = 90  # of JPEG
 GAP, BAR = 6, 20  # px between cells; height of a caption
 FONT, SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 NAME = "sheet.jpg"
@@ -80,9 +81,9 @@ def spread(items: Sequence[Item], count: int) -> list[Item]:
     return [items[i] for i in index]
 
 
-def write_jpeg(path: Path, image: np.ndarray, quality: int = 90) -> None:
+def write_jpeg(path: Path, image: np.ndarray) -> None:
     """Write [H, W, 3] uint8 RGB atomically."""
-    data = jpeg_bytes(image, quality)
+    data = jpeg_bytes(image, QUALITY)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 

@@ -49,14 +49,14 @@ def start_file(path: Path) -> StartFile:
     return StartFile(path.resolve(), sha256_file(path), count, "splats" if is_splats else "points")
 
 
-def started(parts: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
-    """Return the parts of a method with the content of the file to start from.
+def started(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
+    """Return the hooks of a method with the content of the file to start from.
 
     Raises:
         AwError: the file has changed, or no train camera of the scene sees its content.
     """
     if start is None:
-        return parts
+        return hooks
     from ambiguous_wild.viewing.model import gaussians_of, moved
 
     content, place = _read(start.path), scene.place
@@ -65,19 +65,19 @@ def started(parts: MethodHooks, start: StartFile | None, scene: Scene) -> Method
     if isinstance(content, SplatFile):
         arrays = moved(content.gaussians, content.place, place)
         _refuse_unseen(start.path, arrays["means"], scene)
-        return replace(parts, given=gaussians_of(arrays))
+        return replace(hooks, given=gaussians_of(arrays))
     xyz = (content[0] - place.centre) * place.scale
     _refuse_unseen(start.path, xyz, scene)
-    return replace(parts, given=(xyz, content[1]))
+    return replace(hooks, given=(xyz, content[1]))
 
 
-def start_line(start: StartFile, method: str, parts: MethodHooks, train: TrainConfig, scene: Scene) -> str:
+def start_line(start: StartFile, method: str, hooks: MethodHooks, train: TrainConfig, scene: Scene) -> str:
     """Return a line that says how many splats or points of the file a run starts from."""
     from ambiguous_wild.splat.method_hooks import thinned
     from ambiguous_wild.splat.pace import room
 
     sizes = [(view.camera.height, view.camera.width) for view in scene.train]
-    most = room(train, parts.schedule, sizes, parts.density_config.max_gaussians)
+    most = room(train, hooks.schedule, sizes, hooks.density_config.max_gaussians)
     kept = len(thinned(start.count, most))
     thin = (
         f", chosen at random: it may have {most:,} Gaussians (--max-gaussians)" if kept < start.count else ""

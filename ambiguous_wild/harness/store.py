@@ -15,6 +15,7 @@ import pandas as pd
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.core.errors import counted, unknown
+from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, own
 from ambiguous_wild.harness.result_file import (
     FAILED,
@@ -311,11 +312,9 @@ def effects_of(facts: RunFacts) -> str:
 
 
 def _length(config: ReadConfig) -> str:
-    """Return `asked_length` from config.yaml, for results of earlier versions; empty if it is not there."""
+    """Return `length_text` of config.yaml, for results of earlier versions; empty if it is not there."""
     settings = section(config, "train")
-    if settings.get("budget_s") is not None:
-        return f"{settings['budget_s']:g} s"
-    return f"{settings['iterations']} iterations" if "iterations" in settings else ""
+    return length_text(settings.get("iterations"), settings.get("budget_s"))
 
 
 def _training(config: ReadConfig) -> str:

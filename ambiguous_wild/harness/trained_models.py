@@ -211,12 +211,12 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         if entry.program is not None:
             return RenderSettings(), ""
         chosen = from_plain(type(entry.options()), section(config, "options"), "options")
-        parts = entry.build(chosen)
+        hooks = entry.build(chosen)
     except AwError:
         advice = "it is drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
         return RenderSettings(), f"{name} is an unknown method: {advice}"
-    antialias = parts.antialias or "antialias" in (config.get("effects") or ())
-    return RenderSettings(parts.sh_degree, antialias, parts.blur, parts.background), ""
+    antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
+    return RenderSettings(hooks.sh_degree, antialias, hooks.blur, hooks.background), ""
 
 
 def _with_labels(trained: list[TrainedModel]) -> list[TrainedModel]:

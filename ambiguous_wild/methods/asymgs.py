@@ -224,24 +224,24 @@ class SecondModel(Fields):
         cotangent = apart.sign() * (weight / apart.numel())
         second = -cotangent
         if self._second is not None and context.camera is self._second[1]:
-            second = second + self._photometric(self._second[0], frames[TWIN].image, context.divisor)
+            second = second + self._photometric(self._second[0], frames[TWIN].image, context.downsampling)
         return {STATIC: Cotangents(image=cotangent), TWIN: Cotangents(image=second)}
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
         """Return gradients of both models in the second view, which is drawn with replacement."""
         view = int(np.random.default_rng((self.data.seed, step.iteration)).integers(len(self.data.cameras)))
-        camera = shrink_camera(self.data.cameras[view], step.divisor)
+        camera = shrink_camera(self.data.cameras[view], step.downsampling)
         self._second = view, camera
         rendered = step.draw(camera=camera)
         gradients = rendered.backward(Cotangents(image=torch.zeros_like(rendered.image)))
         self._second = None
         return {STATIC: gradients}  # those of the second model are in `fields`
 
-    def _photometric(self, view: int, image: Tensor, divisor: int) -> Tensor:
+    def _photometric(self, view: int, image: Tensor, factor: int) -> Tensor:
         """Return dL/dimage of the second model under the learnt mask of its photo; the mask learns too."""
         keep, user = self.masks.soft_keep(view, image.shape[:2]), self.data.user_keep[view]
         if user is not None:
-            keep = keep * shrink_keep(user, divisor)
+            keep = keep * shrink_keep(user, factor)
         self.masks.learn_soft(view, image)
-        photo = shrink(self.data.photos[view], divisor)
+        photo = shrink(self.data.photos[view], factor)
         return photometric(image, photo, keep).d_image

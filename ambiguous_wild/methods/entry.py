@@ -118,7 +118,7 @@ class MethodEntry:
         return tuple(resolve(self.ablations))
 
     def build(self, options: Any) -> MethodHooks:
-        """Call the recipe; returns the parts that fill the training loop.
+        """Call the recipe; returns the hooks that fill the training loop.
 
         Raises:
             AwError: the recipe returned something else, or takes more than the options.
@@ -132,11 +132,11 @@ class MethodEntry:
                 f"the recipe of {self.name} takes {', '.join(p.name for p in needed)}: it must take nothing, "
                 "or one argument whose type is a dataclass of options"
             )
-        parts = recipe(options) if needed or self.config else recipe()
-        if not isinstance(parts, MethodHooks):
-            what = "None" if parts is None else type(parts).__name__
+        hooks = recipe(options) if needed or self.config else recipe()
+        if not isinstance(hooks, MethodHooks):
+            what = "None" if hooks is None else type(hooks).__name__
             raise AwError(f"{self.name} returned {what}, it must return MethodHooks (see docs/extend.md)")
-        return parts
+        return hooks
 
 
 @dataclass(frozen=True)

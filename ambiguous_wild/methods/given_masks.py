@@ -31,7 +31,7 @@ class FixedMasks(MaskPolicy):
         self.keeps = [keep.to(data.device, torch.float32) for keep in self.keeps]
 
     def keep(self, step: Step) -> Tensor:
-        return shrink_keep(self.keeps[step.view], step.divisor)
+        return shrink_keep(self.keeps[step.view], step.downsampling)
 
     def facts(self) -> Facts:
         shares = [1.0 - float(keep.mean()) for keep in self.keeps]

@@ -142,7 +142,7 @@ class Graft:
 
 
 def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> MethodHooks:
-    """Return the host's parts with those of the donors in their places.
+    """Return the host's hooks with those of the donors in their places.
 
     A method that fills two places with the same options is built once, so its frozen inputs are prepared
     once, and a method grafted onto itself is unchanged.
@@ -156,11 +156,11 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Method
 
     host_member, donors = _members(name, entries, options)
     check_members(host_member, donors)
-    host = host_member.parts
-    mask, regulariser = (donors.get(place, host_member).parts.mask for place in ("mask", "regulariser"))
+    host = host_member.hooks
+    mask, regulariser = (donors.get(place, host_member).hooks.mask for place in ("mask", "regulariser"))
     host = dataclasses.replace(host, mask=compose(mask, regulariser))
     if "density" in donors:
-        density = donors["density"].parts
+        density = donors["density"].hooks
         host = dataclasses.replace(
             host,
             density=density.density,
@@ -172,7 +172,7 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Method
         )
     if "effects" not in donors:
         return host
-    effects = donors["effects"].parts.effects
+    effects = donors["effects"].hooks.effects
     for effect in effects:
         host = host.suited_to(effect)
     return dataclasses.replace(host, effects=effects)
@@ -183,14 +183,14 @@ def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tup
     from ambiguous_wild.methods.graft_checks import Member
 
     typed, members = dict(_pairs(name)), {}
-    built: list[tuple[str, Any, MethodHooks]] = []  # method, options, parts
+    built: list[tuple[str, Any, MethodHooks]] = []  # method, options, hooks
     for place, entry in entries.items():
         own = getattr(options, place)
-        parts = next((parts for method, set_, parts in built if method == entry.name and set_ == own), None)
-        if parts is None:
-            parts = entry.build(own)
-            built.append((entry.name, own, parts))
-        members[place] = Member(typed.get(place, entry.name), parts)
+        hooks = next((hooks for method, set_, hooks in built if method == entry.name and set_ == own), None)
+        if hooks is None:
+            hooks = entry.build(own)
+            built.append((entry.name, own, hooks))
+        members[place] = Member(typed.get(place, entry.name), hooks)
     return members.pop("host"), members
 
 
@@ -223,7 +223,7 @@ def check_graft(method: MethodEntry, options: Any) -> list[str]:
         return []
     check_members(host, donors)
     warnings, losses = left_out(host, donors), donors.get("regulariser")
-    if losses is not None and losses.name not in NOTHING and not losses.parts.mask.regularises():
+    if losses is not None and losses.name not in NOTHING and not losses.hooks.mask.regularises():
         warnings.append(
             f"{losses.name} adds no loss on the render with these options; "
             f"switch it on with --set {losses.name}.KEY=VALUE, or leave the regulariser out"

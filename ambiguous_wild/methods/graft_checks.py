@@ -19,7 +19,7 @@ class Member:
     """The host or a donor of a graft."""
 
     name: str  # as in the name of the graft
-    parts: MethodHooks
+    hooks: MethodHooks
 
 
 def check_members(host: Member, donors: Mapping[str, Member]) -> None:
@@ -46,12 +46,12 @@ def left_out(host: Member, donors: Mapping[str, Member]) -> list[str]:
     """Return warnings about effects of donors of masks or losses that the graft lacks."""
     if "effects" in donors:
         return []
-    own, warnings = {name_of(effect) for effect in host.parts.effects}, {}
+    own, warnings = {name_of(effect) for effect in host.hooks.effects}, {}
     for place in ("mask", "regulariser"):
         donor = donors.get(place)
-        if donor is None or (place == "regulariser" and not donor.parts.mask.regularises()):
+        if donor is None or (place == "regulariser" and not donor.hooks.mask.regularises()):
             continue
-        names = [name for name in map(name_of, donor.parts.effects) if name not in own]
+        names = [name for name in map(name_of, donor.hooks.effects) if name not in own]
         if names:
             warnings[donor.name] = (
                 f"leaves out {donor.name}'s effects ({', '.join(names)}): add effects={donor.name} to the "
@@ -61,15 +61,15 @@ def left_out(host: Member, donors: Mapping[str, Member]) -> list[str]:
     return list(warnings.values())
 
 
-def has_masks(parts: MethodHooks) -> bool:
+def has_masks(hooks: MethodHooks) -> bool:
     """Whether another method can take this method's masks."""
-    return type(parts.mask).keep is not MaskPolicy.keep
+    return type(hooks.mask).keep is not MaskPolicy.keep
 
 
-def masks_of_fields(parts: MethodHooks) -> bool:
+def masks_of_fields(hooks: MethodHooks) -> bool:
     """Whether the method's masks only show what its own fields have learnt, and weight no loss."""
-    shown = type(parts.mask).predict is not MaskPolicy.predict
-    return parts.fields is not None and shown and not has_masks(parts)
+    shown = type(hooks.mask).predict is not MaskPolicy.predict
+    return hooks.fields is not None and shown and not has_masks(hooks)
 
 
 def name_of(effect: Effect) -> str:
@@ -77,7 +77,7 @@ def name_of(effect: Effect) -> str:
 
 
 def _check_mask(host: Member, donor: Member) -> None:
-    if donor.parts is not host.parts and masks_of_fields(donor.parts):
+    if donor.hooks is not host.hooks and masks_of_fields(donor.hooks):
         raise AwError(
             f"mask={donor.name} would mask nothing: the masks of {donor.name} come from its own fields, "
             f"which a graft does not take; use {donor.name} as the host, or take the masks of another method"
@@ -85,9 +85,9 @@ def _check_mask(host: Member, donor: Member) -> None:
 
 
 def _check_regulariser(donor: Member) -> None:
-    own = type(donor.parts.mask)
-    hooks = ("loss", "cotangent", "gradients")
-    losses = any(getattr(own, n) is not getattr(MaskPolicy, n) for n in hooks)
+    own = type(donor.hooks.mask)
+    names = ("loss", "cotangent", "gradients")
+    losses = any(getattr(own, n) is not getattr(MaskPolicy, n) for n in names)
     if donor.name not in NOTHING and (own.learns_by_gradients or not losses):
         raise AwError(
             f"regulariser={donor.name} would add nothing: {donor.name} has no loss of this kind; name a "
@@ -97,8 +97,8 @@ def _check_regulariser(donor: Member) -> None:
 
 def _check_effects(host: Member, donors: Mapping[str, Member]) -> None:
     donor = donors["effects"]
-    effects, mask = donor.parts.effects, donors.get("mask", host).parts.mask
-    if not effects or donor.parts is host.parts:
+    effects, mask = donor.hooks.effects, donors.get("mask", host).hooks.mask
+    if not effects or donor.hooks is host.hooks:
         return
     if not any(effect is mask.required_effect() or any(map(effect.acts, _VISIBLE)) for effect in effects):
         raise AwError(
@@ -108,21 +108,21 @@ def _check_effects(host: Member, donors: Mapping[str, Member]) -> None:
 
 
 def _check_required_effects(host: Member, donors: Mapping[str, Member]) -> None:
-    taken = donors.get("effects", host).parts.effects
+    taken = donors.get("effects", host).hooks.effects
 
     def lacks(effect: Effect | None) -> bool:
         return effect is not None and not any(effect is other for other in taken)
 
-    if host.parts.fields is not None and lacks(host.parts.fields.required_effect()):
+    if host.hooks.fields is not None and lacks(host.hooks.fields.required_effect()):
         raise AwError(
             f"the fields of {host.name} need its effects, which effects={donors['effects'].name} replaces: "
             f"leave effects={donors['effects'].name} out"
         )
     unfit = {}  # place -> method whose masks or losses need effects that the graft lacks
     masking, losing = donors.get("mask", host), donors.get("regulariser", host)
-    if lacks(masking.parts.mask.required_effect()):
+    if lacks(masking.hooks.mask.required_effect()):
         unfit["mask"] = masking
-    if losing.parts.mask.regularises() and lacks(losing.parts.mask.loss_effect()):
+    if losing.hooks.mask.regularises() and lacks(losing.hooks.mask.loss_effect()):
         unfit["regulariser"] = losing
     for place, owner in unfit.items():
         what = "masks" if place == "mask" else "losses"
@@ -139,7 +139,7 @@ def _host_lacks_effects(what: str, host: Member, effects: Member, places: list[s
     """Return the message for a host whose masks or losses need the effects that a donor replaces."""
     empty = ",".join(f"{place}=none" for place in places)
     ways = [empty]
-    if places[0] == "mask" and has_masks(effects.parts):
+    if places[0] == "mask" and has_masks(effects.hooks):
         ways.insert(0, empty.replace("mask=none", f"mask={effects.name}"))
     return (
         f"the {what} of {host.name} need its own effects, which effects={effects.name} replaces: "

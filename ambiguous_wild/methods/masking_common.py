@@ -6,6 +6,7 @@ Targets and loss of RobustSplat's mask net are pure functions. Maps are [H, W] f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import Protocol
 
@@ -151,6 +152,13 @@ class PausingMask(WarmUpMask):
         """Return `reset_pause` in iterations of the run."""
         return self.config.reset_pause / (step.nominal / step.iteration)
 
+    def state_dict(self) -> State:
+        return {**super().state_dict(), "last_reset": self.last_reset}
+
+    def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
+        self.last_reset = int(state["last_reset"])
+
 
 class EffectMask(MaskPolicy):
     """A mask policy that reads an effect, which the run must have."""
@@ -194,9 +202,10 @@ class CountingMask(MaskPolicy):
         return {"masked_share": self.shares.mean()}
 
     def state_dict(self) -> State:
-        return {"shares": self.shares.state_dict()}
+        return {**super().state_dict(), "shares": self.shares.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
         self.shares = MaskedShares.from_state(state["shares"])
 
 
@@ -246,6 +255,18 @@ def annealed(step: Step, rate: float) -> float:
     return math.exp(-rate * math.floor((1.0 + s) / 1.5))
 
 
+def initialise(layers: Sequence[tuple[nn.Module, float]], seed: int) -> None:
+    """Draw weights and biases of each layer from -limit to limit, with numbers from the host.
+
+    They are the same on every device.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for layer, limit in layers:
+            for values in layer.parameters():
+                values.copy_((2.0 * torch.rand(values.shape, generator=generator) - 1.0) * limit)
+
+
 class MaskNet(nn.Module):
     """A net for each pixel, Linear - ReLU - Linear - sigmoid: features [h, w, C] to a static map [H, W].
 
@@ -267,12 +288,7 @@ class MaskNet(nn.Module):
         self.register_buffer("std", std.clone())
         self.first = nn.Linear(len(mean), hidden, device=mean.device)
         self.last = nn.Linear(hidden, 1, device=mean.device)
-        generator = torch.Generator().manual_seed(seed)
-        with torch.no_grad():
-            for layer in (self.first, self.last):
-                limit = layer.in_features**-0.5
-                for values in (layer.weight, layer.bias):
-                    values.copy_((2.0 * torch.rand(values.shape, generator=generator) - 1.0) * limit)
+        initialise([(layer, layer.in_features**-0.5) for layer in (self.first, self.last)], seed)
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
         """Return the map [height, width].
@@ -314,6 +330,18 @@ def _weights(size: int, to: int, dtype: torch.dtype, device: torch.device) -> Te
 def adam_of(net: nn.Module, lr: float, device: torch.device) -> torch.optim.Adam:
     """Return Adam for the net's parameters, see `Backend.adam`."""
     return backend_of(device).adam(net.parameters(), lr)
+
+
+def learner_state(net: nn.Module, optimiser: torch.optim.Adam) -> State:
+    """Return the state of a net and its Adam for a checkpoint."""
+    values = {name.replace(".", "_"): value for name, value in net.state_dict().items()}
+    return {"net": values, "adam": adam_state(optimiser)}
+
+
+def load_learner(net: nn.Module, optimiser: torch.optim.Adam, state: State) -> None:
+    """Restore what `learner_state` returned."""
+    net.load_state_dict({name: state["net"][name.replace(".", "_")] for name in net.state_dict()})
+    load_adam_state(optimiser, state["adam"])
 
 
 def adam_state(optimiser: torch.optim.Adam) -> list[State]:

@@ -31,7 +31,7 @@ from ambiguous_wild.methods.masking_common import (
     WarmUpMask,
     hashed_uniform,
 )
-from ambiguous_wild.methods.wildgaussians import FeatureDistance, fourier
+from ambiguous_wild.methods.wildgaussians import FeatureDistance, noisy_fourier
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
@@ -117,9 +117,7 @@ class Codes(Learnt):
         return photos | {name: replace(leaf, made_for=NOMINAL_ITERATIONS) for name, leaf in nets.items()}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
-        light = fourier(gaussians.means, self.points)
-        noise = 1e-4 * np.random.default_rng([self.seed, 0x4E]).normal(size=tuple(light.shape))
-        light = light + torch.from_numpy(noise.astype(np.float32)).to(light.device)
+        light = noisy_fourier(gaussians.means, self.points, [self.seed, 0x4E])
         doubt = torch.zeros(len(gaussians), CODE, device=gaussians.device)
         return {
             "nexus_light": GaussianAttribute(light, self.config.lr_light),

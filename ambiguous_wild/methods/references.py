@@ -60,7 +60,7 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
     except SyntaxError as error:
         raise AwError(f"plugin {path}, line {error.lineno}: {error.msg}") from None
     except (Exception, SystemExit) as error:
-        why = f"{type(error).__name__}: {error}{place_of(error)}"
+        why = f"{type(error).__name__}: {error}{error_location(error)}"
         if "splat.parts" in why:
             why += "; Parts is MethodHooks of ambiguous_wild.splat.method_hooks now"
         raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
@@ -83,7 +83,7 @@ def _file_of(name: str) -> Path | None:
     return file if file.is_file() and not foreign else None
 
 
-def place_of(error: BaseException) -> str:
+def error_location(error: BaseException) -> str:
     """Return the last place of an error in a loaded file, such as " (my_method.py, line 7)"; else ""."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _loaded]
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""

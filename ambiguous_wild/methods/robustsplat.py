@@ -26,12 +26,13 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.palette import MASKED, faded, ramp, tint
 from ambiguous_wild.methods import masking_common
 from ambiguous_wild.methods.masking_common import (
+    CountingMask,
     MaskedShares,
     MaskNet,
     PausingMask,
     adam_of,
-    adam_state,
-    load_adam_state,
+    learner_state,
+    load_learner,
     resized,
 )
 from ambiguous_wild.splat.backend import backend_of
@@ -178,7 +179,7 @@ def mask_loss(
     return agreement + config.lambda_residual * bounds + pull * (1.0 - mask).mean()
 
 
-class RobustSplatMask(PausingMask):
+class RobustSplatMask(CountingMask, PausingMask):
     """The net learns every iteration from mask_start on; its map, thresholded and eroded, is the keep map."""
 
     config: RobustSplatConfig
@@ -231,7 +232,7 @@ class RobustSplatMask(PausingMask):
 
     def facts(self) -> Facts:
         return {
-            "masked_share": self.shares.mean(),
+            **super().facts(),
             "mask_loss_mean": float(self.loss_sum) / self.loss_count if self.loss_count else None,
             "features": self.fine.name,
         }
@@ -367,23 +368,18 @@ class RobustSplatMask(PausingMask):
 
     def state_dict(self) -> State:
         return {
-            "net": {name.replace(".", "_"): value for name, value in self.net.state_dict().items()},
-            "adam": adam_state(self.optimiser),
+            **super().state_dict(),
+            **learner_state(self.net, self.optimiser),
             "histogram": self.histogram,
             "distances": self.distances,
-            "last_reset": self.last_reset,
-            "shares": self.shares.state_dict(),
             "losses": [float(self.loss_sum), self.loss_count],
         }
 
     def load_state_dict(self, state: State) -> None:
-        names = list(self.net.state_dict())
-        self.net.load_state_dict({name: state["net"][name.replace(".", "_")] for name in names})
-        load_adam_state(self.optimiser, state["adam"])
+        super().load_state_dict(state)
+        load_learner(self.net, self.optimiser, state)
         self.histogram = state["histogram"].to(self.data.device)
         self.distances = [counts.to(self.data.device) for counts in state["distances"]]
-        self.last_reset = int(state["last_reset"])
-        self.shares = MaskedShares.from_state(state["shares"])
         self.loss_sum, self.loss_count = state["losses"]
 
 

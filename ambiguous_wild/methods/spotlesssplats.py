@@ -20,14 +20,16 @@ from torch import Tensor, nn
 from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.dronesplat import label_means
 from ambiguous_wild.methods.masking_common import (
+    CountingMask,
     MaskedShares,
     MaskNet,
     adam_of,
-    adam_state,
     annealed,
     bound,
     enlarged,
-    load_adam_state,
+    initialise,
+    learner_state,
+    load_learner,
     nearest,
     percentile,
     residual,
@@ -36,7 +38,7 @@ from ambiguous_wild.methods.masking_common import (
 )
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
-from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
@@ -106,10 +108,7 @@ class PruningDensity(SpotLessDensity):
     def _prune(self, gaussians: Gaussians, optimiser: SplatAdam) -> Gaussians:
         gaussians = super()._prune(gaussians, optimiser)
         drop = self.mutable_rows(~(self.use_sum >= self.config.least_use), gaussians)
-        if not bool(drop.any()) or self.leaves_only_protected(drop, gaussians):
-            return gaussians
-        self.log.now.pruned += int(drop.sum())
-        return self.keep_rows(gaussians, optimiser, ~drop)
+        return self.drop_rows(gaussians, optimiser, drop)
 
 
 class PlacedNet(MaskNet):
@@ -119,10 +118,8 @@ class PlacedNet(MaskNet):
         super().__init__(mean, std, hidden, seed)
         self.place = nn.Linear(4 * OCTAVES, hidden, bias=False, device=mean.device)
         limit = (len(mean) + 4 * OCTAVES) ** -0.5  # features and position form the input of one layer
-        generator = torch.Generator().manual_seed(seed + 1)
+        initialise([(self.place, limit)], seed + 1)
         with torch.no_grad():
-            drawn = 2.0 * torch.rand(self.place.weight.shape, generator=generator) - 1.0
-            self.place.weight.copy_(drawn * limit)
             for values in (self.first.weight, self.first.bias):
                 values *= limit * len(mean) ** 0.5
 
@@ -176,7 +173,7 @@ def build(options: SpotLessSplatsConfig) -> MethodHooks:
     return MethodHooks(SpotLessMask(options), density, options.density, lambda_dssim=options.lambda_dssim)
 
 
-class SpotLessMask(MaskPolicy):
+class SpotLessMask(CountingMask):
     """Keep maps between a strict and a loose bound of the residual, at first drawn at random."""
 
     def __init__(self, config: SpotLessSplatsConfig) -> None:
@@ -249,18 +246,16 @@ class SpotLessMask(MaskPolicy):
 
     def facts(self) -> Facts:
         used = "none" if self.config.mask == "filter" else self.features.name
-        return {"masked_share": self.shares.mean(), "features": used}
+        return {**super().facts(), "features": used}
 
     def state_dict(self) -> State:
-        state: State = {"histogram": self.histogram, "seen": self.seen, "shares": self.shares.state_dict()}
+        state = {**super().state_dict(), "histogram": self.histogram, "seen": self.seen}
         if self.config.mask == "mlp":
-            net = {name.replace(".", "_"): value for name, value in self.net.state_dict().items()}
-            state |= {"net": net, "adam": adam_state(self.optimiser)}
+            state |= learner_state(self.net, self.optimiser)
         return state
 
     def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
         self.histogram, self.seen = state["histogram"].to(self.histogram.device), int(state["seen"])
-        self.shares = MaskedShares.from_state(state["shares"])
         if self.config.mask == "mlp":
-            self.net.load_state_dict({k: state["net"][k.replace(".", "_")] for k in self.net.state_dict()})
-            load_adam_state(self.optimiser, state["adam"])
+            load_learner(self.net, self.optimiser, state)

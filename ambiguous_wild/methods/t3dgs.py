@@ -20,13 +20,15 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.masking_common import (
+    CountingMask,
     MaskedShares,
     PausingMask,
     adam_of,
-    adam_state,
     annealed,
     calibrated,
-    load_adam_state,
+    initialise,
+    learner_state,
+    load_learner,
     resized,
     sampled,
 )
@@ -81,12 +83,8 @@ class TwoErrorHead(nn.Module):
         self.convs = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairs[:-1])
         self.last = nn.Conv2d(widths[3], 3, 1)
         self.norms = nn.ModuleList(nn.GroupNorm(1, width) for width in widths[1:])
-        generator = torch.Generator().manual_seed(seed)
-        with torch.no_grad():
-            for conv in (*self.convs, self.last):
-                limit = (conv.in_channels * conv.kernel_size[0] ** 2) ** -0.5
-                for values in (conv.weight, conv.bias):
-                    values.copy_((2.0 * torch.rand(values.shape, generator=generator) - 1.0) * limit)
+        convs = (*self.convs, self.last)
+        initialise([(c, (c.in_channels * c.kernel_size[0] ** 2) ** -0.5) for c in convs], seed)
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
         x = self._doubled(self.convs[0](features.permute(0, 3, 1, 2)), 0)
@@ -124,7 +122,7 @@ def _determinant(prediction: Tensor) -> Tensor:
     return (s1.square() * s2.square() * (1.0 - rho.square())).clamp(min=1e-6)
 
 
-class Divergence(PausingMask):
+class Divergence(CountingMask, PausingMask):
     """Masks by the head, which learns from the photo alone; after an opacity reset by the last mask."""
 
     config: T3dgsConfig
@@ -194,20 +192,20 @@ class Divergence(PausingMask):
         return Cotangents(alpha=pair[0], depth=pair[1])
 
     def facts(self) -> Facts:
-        return {"masked_share": self.shares.mean(), "features": self.features.name}
+        return {**super().facts(), "features": self.features.name}
 
     def state_dict(self) -> State:
-        net = {name.replace(".", "_"): value for name, value in self.head.state_dict().items()}
-        bank = {str(view): mask for view, mask in self.bank.items()}
-        shares, adam = self.shares.state_dict(), adam_state(self.optimiser)
-        return {"net": net, "adam": adam, "bank": bank, "last_reset": self.last_reset, "shares": shares}
+        return {
+            **super().state_dict(),
+            **learner_state(self.head, self.optimiser),
+            "bank": {str(view): mask for view, mask in self.bank.items()},
+        }
 
     def load_state_dict(self, state: State) -> None:
-        self.head.load_state_dict({k: state["net"][k.replace(".", "_")] for k in self.head.state_dict()})
-        load_adam_state(self.optimiser, state["adam"])
+        super().load_state_dict(state)
+        load_learner(self.head, self.optimiser, state)
         device = next(self.head.parameters()).device
         self.bank = {int(view): mask.bool().to(device) for view, mask in state["bank"].items()}
-        self.last_reset, self.shares = int(state["last_reset"]), MaskedShares.from_state(state["shares"])
 
 
 def inverse_depth(alpha: Tensor, depth: Tensor) -> Tensor:

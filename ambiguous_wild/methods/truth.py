@@ -20,9 +20,10 @@ from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.splat.data import read_photos, shrink_keep
-from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.methods.given_masks import FixedMasks
+from ambiguous_wild.splat.data import read_photos
+from ambiguous_wild.splat.method_hooks import MethodHooks
+from ambiguous_wild.splat.step import TrainData
 
 
 @dataclass(frozen=True)
@@ -46,20 +47,18 @@ def build_clean(options: NoOptions) -> MethodHooks:
     return MethodHooks(train_data=clean_data)
 
 
-class TruthMask(MaskPolicy):
+class TruthMask(FixedMasks):
     """Keeps everything outside of the exact masks, from the first step on."""
 
     def __init__(self, config: TruthConfig) -> None:
+        super().__init__([])
         self.config = config
-        self.keeps: list[Tensor] = []
 
     def setup(self, data: TrainData) -> None:
         masks = [read_gray(path) >= 128 for path in truth_files(data.scene, "distractor")]
         _check_sizes(data.scene, masks)
-        self.keeps = [keep_outside(mask, self.config.dilation).to(data.device) for mask in masks]
-
-    def keep(self, step: Step) -> Tensor | None:
-        return shrink_keep(self.keeps[step.view], step.divisor)
+        self.keeps = [keep_outside(mask, self.config.dilation) for mask in masks]
+        super().setup(data)
 
     def facts(self) -> Facts:
         return {"masked_share": float(np.mean([1.0 - float(keep.mean()) for keep in self.keeps]))}

@@ -28,13 +28,14 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State, check_limits
 from ambiguous_wild.methods.masking_common import (
+    CountingMask,
     MaskedShares,
     PausingMask,
     adam_of,
-    adam_state,
     calibrated,
     hashed_uniform,
-    load_adam_state,
+    learner_state,
+    load_learner,
     resized,
 )
 from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
@@ -140,9 +141,7 @@ class WildAppearance(Learnt):
         return {"photo": Leaf(start, self.config.lr_photo, per_photo=True), **net}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
-        start = fourier(gaussians.means, self.points)
-        noise = 1e-4 * np.random.default_rng([self.seed, 0x36]).normal(size=tuple(start.shape))
-        start += torch.from_numpy(noise.astype(np.float32)).to(start.device)
+        start = noisy_fourier(gaussians.means, self.points, [self.seed, 0x36])
         return {"wild_embedding": GaussianAttribute(start, self.config.lr_gaussian)}
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
@@ -162,6 +161,13 @@ def fourier(means: Tensor, points: Tensor) -> Tensor:
     unit = 0.5 * (means - centre) / spread + 0.5
     angles = torch.cat([2.0 * torch.pi * 2.0**k * unit for k in range(OCTAVES)], dim=1)
     return torch.cat([angles.sin(), (angles + torch.pi / 2).sin()], dim=1)
+
+
+def noisy_fourier(means: Tensor, points: Tensor, seed: list[int]) -> Tensor:
+    """Return the start of an embedding of each Gaussian: `fourier` with a little noise, [N, 24]."""
+    start = fourier(means, points)
+    noise = 1e-4 * np.random.default_rng(seed).normal(size=tuple(start.shape))
+    return start + torch.from_numpy(noise.astype(np.float32)).to(start.device)
 
 
 class UncertaintyHead(nn.Module):
@@ -195,7 +201,7 @@ def uncertainty_loss(sigma: Tensor, distance: Tensor, prior: float) -> Tensor:
     return (distance * 0.5 / sigma.square()).mean() + prior * sigma.log().mean()
 
 
-class Uncertainty(PausingMask):
+class Uncertainty(CountingMask, PausingMask):
     """Keeps pixels with 1 / (2 sigma^2) > 1; the head learns in every step, but not after opacity resets."""
 
     config: WildGaussiansConfig
@@ -242,16 +248,11 @@ class Uncertainty(PausingMask):
         self.optimiser.step()
 
     def facts(self) -> Facts:
-        return {"masked_share": self.shares.mean(), "features": self.distance.name}
+        return {**super().facts(), "features": self.distance.name}
 
     def state_dict(self) -> State:
-        net = {"weight": self.head.weight.detach(), "bias": self.head.bias.detach()}
-        return {
-            "net": net, "adam": adam_state(self.optimiser), "last_reset": self.last_reset,
-            "shares": self.shares.state_dict(),
-        }  # fmt: skip
+        return {**super().state_dict(), **learner_state(self.head, self.optimiser)}
 
     def load_state_dict(self, state: State) -> None:
-        self.head.load_state_dict(state["net"])
-        load_adam_state(self.optimiser, state["adam"])
-        self.last_reset, self.shares = int(state["last_reset"]), MaskedShares.from_state(state["shares"])
+        super().load_state_dict(state)
+        load_learner(self.head, self.optimiser, state)

@@ -14,7 +14,7 @@ from pathlib import Path
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
-from ambiguous_wild.harness.cell import option_text
+from ambiguous_wild.harness.command_lines import option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import own_json

@@ -14,13 +14,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol, overload
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.io.images import as_float, load_image_codes, read_alpha, read_keep_map
+from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.splat.step import TrainData
 
 RESIDENT = 0.25  # share of the memory; Gaussians, their moments, masks and gsplat's lists need the rest
@@ -96,7 +96,7 @@ def load_keep(
         return None if alpha is None else (alpha > 0).astype(np.float32)
     keep = read_keep_map(view.keep_path)
     if keep.shape[0] > size[0] and abs(keep.shape[0] * size[1] - keep.shape[1] * size[0]) <= 2 * max(size):
-        keep = (cv2.resize(keep, size[::-1], interpolation=cv2.INTER_AREA) >= 0.5).astype(np.float32)
+        keep = smaller_keep(keep, size, "majority")
     if keep.shape != size:
         raise AwError(
             f"mask {view.keep_path} is {keep.shape[1]}x{keep.shape[0]} px, its photo is {size[1]}x{size[0]} "
@@ -105,27 +105,26 @@ def load_keep(
     return keep if alpha is None else np.where(alpha > 0, keep, np.float32(0))
 
 
-def shrink(image: Tensor, divisor: int) -> Tensor:
-    """Average [H, W, 3] over areas to [H // divisor, W // divisor, 3]; divisor 1 returns it unchanged."""
-    if divisor == 1:
+def shrink(image: Tensor, factor: int) -> Tensor:
+    """Average [H, W, 3] over areas to [H // factor, W // factor, 3]; 1 returns it unchanged."""
+    if factor == 1:
         return image
-    height, width = image.shape[0] // divisor, image.shape[1] // divisor
+    height, width = image.shape[0] // factor, image.shape[1] // factor
     chw = image.permute(2, 0, 1)[None]
     small = torch.nn.functional.interpolate(chw, size=(height, width), mode="area")
     return small[0].permute(1, 2, 0).contiguous()
 
 
-def shrink_keep(keep: Tensor, divisor: int) -> Tensor:
-    """Reduce [H, W] to [H // divisor, W // divisor]: kept only where every pixel below is kept."""
-    if divisor == 1:
+def shrink_keep(keep: Tensor, factor: int) -> Tensor:
+    """Reduce [H, W] to [H // factor, W // factor]: kept only where every pixel below is kept."""
+    if factor == 1:
         return keep
-    height, width = keep.shape[0] // divisor, keep.shape[1] // divisor
-    return -torch.nn.functional.adaptive_max_pool2d(-keep[None, None], (height, width))[0, 0]
+    return smaller_keep(keep, (keep.shape[0] // factor, keep.shape[1] // factor), "any masked")
 
 
-def shrink_camera(camera: Camera, divisor: int) -> Camera:
+def shrink_camera(camera: Camera, factor: int) -> Camera:
     """Return the camera of an image that `shrink` made."""
-    return camera if divisor == 1 else camera.resized(camera.width // divisor, camera.height // divisor)
+    return camera if factor == 1 else camera.resized(camera.width // factor, camera.height // factor)
 
 
 class Pyramid:
@@ -138,26 +137,26 @@ class Pyramid:
         # copies the next photo to the device while a step runs; None = all photos fit on it
         self.prefetch = getattr(data.photos, "prefetch", None)
 
-    def sizes(self, divisors: Iterable[int]) -> frozenset[tuple[int, int]]:
-        """Return the heights and widths of all photos at these divisors."""
+    def sizes(self, factors: Iterable[int]) -> frozenset[tuple[int, int]]:
+        """Return the heights and widths of all photos at these downsampling factors."""
         full = {(camera.height, camera.width) for camera in self._data.cameras}
-        return frozenset((h // d, w // d) for h, w in full for d in divisors)
+        return frozenset((h // d, w // d) for h, w in full for d in factors)
 
-    def photo(self, view: int, divisor: int) -> Tensor:
-        """Return a train photo at this size, [H // divisor, W // divisor, 3]."""
-        if divisor == 1:
+    def photo(self, view: int, factor: int) -> Tensor:
+        """Return a train photo at this size, [H // factor, W // factor, 3]."""
+        if factor == 1:
             return self._data.photos[view]
         if self.prefetch is not None:  # the device has no room for photos, so none for smaller copies either
-            return shrink(self._data.photos[view], divisor)
-        if (view, divisor) not in self._photos:
-            self._photos[view, divisor] = shrink(self._data.photos[view], divisor)
-        return self._photos[view, divisor]
+            return shrink(self._data.photos[view], factor)
+        if (view, factor) not in self._photos:
+            self._photos[view, factor] = shrink(self._data.photos[view], factor)
+        return self._photos[view, factor]
 
-    def camera(self, view: int, divisor: int) -> Camera:
+    def camera(self, view: int, factor: int) -> Camera:
         """Return the camera of `photo`, always the same object: back ends remember cameras by identity."""
-        if (view, divisor) not in self._cameras:
-            self._cameras[view, divisor] = shrink_camera(self._data.cameras[view], divisor)
-        return self._cameras[view, divisor]
+        if (view, factor) not in self._cameras:
+            self._cameras[view, factor] = shrink_camera(self._data.cameras[view], factor)
+        return self._cameras[view, factor]
 
 
 class Copies(Protocol):

@@ -276,6 +276,10 @@ class DensityControl:
         if self.last_reset:
             drop |= gaussians.log_scales.exp().amax(dim=1) > config.prune_scale * self.extent
         drop = self.mutable_rows(drop, gaussians) | ~torch.isfinite(gaussians.means).all(dim=1)
+        return self.drop_rows(gaussians, optimiser, drop)
+
+    def drop_rows(self, gaussians: Gaussians, optimiser: SplatAdam, drop: Tensor) -> Gaussians:
+        """Prune these rows [N] bool, unless they are none or only protected ones would remain."""
         if not bool(drop.any()) or self.leaves_only_protected(drop, gaussians):
             return gaussians
         self.log.now.pruned += int(drop.sum())

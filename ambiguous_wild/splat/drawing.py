@@ -23,22 +23,22 @@ from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 class SceneRenderer:
     """Draws the pictures of one run, and holds its fields beside the static one."""
 
-    def __init__(self, data: TrainData, parts: MethodHooks, static: Field, effects: EffectPipeline) -> None:
+    def __init__(self, data: TrainData, hooks: MethodHooks, static: Field, effects: EffectPipeline) -> None:
         """
         Args:
             data: the training side.
-            parts: the method.
+            hooks: the method.
             static: the first field.
             effects: the run's effects.
 
         Raises:
             AwError: a field has the name of the static one.
         """
-        self.parts, self.effects, self.static = parts, effects, static
+        self.hooks, self.effects, self.static = hooks, effects, static
         self.others: dict[str, Field] = {}
         self._most: dict[str, int | None] = {}
-        if parts.fields is not None:
-            for name, start in parts.fields.setup(data, static.gaussians, self._static_rates).items():
+        if hooks.fields is not None:
+            for name, start in hooks.fields.setup(data, static.gaussians, self._static_rates).items():
                 self._add(name, start, data)
 
     def _static_rates(self, progress: float) -> dict[str, float]:
@@ -73,27 +73,23 @@ class SceneRenderer:
         """Draw a picture in the colours of its photo, see `EffectPipeline.fit_view`."""
         return self.effects.fit_view(gaussians, context, photo, keep, self._draw)
 
-    def neutral_model(self, gaussians: Gaussians, iteration: int) -> Gaussians:
-        """Return the Gaussians as they are drawn when the picture belongs to no photo."""
-        return self.effects.neutral_model(gaussians, iteration)
-
     def _draw(self, gaussians: Gaussians, context: ViewContext, shade: Shade | None) -> Rendered:
-        parts = self.parts
+        hooks = self.hooks
         return render(
             gaussians,
             context.camera,
             sh_degree=min(
-                int(context.nominal // parts.schedule.sh_every), parts.sh_degree, gaussians.sh_degree
+                int(context.nominal // hooks.schedule.sh_every), hooks.sh_degree, gaussians.sh_degree
             ),
-            background=parts.background,
-            antialias=parts.antialias,
-            blur=parts.blur,
+            background=hooks.background,
+            antialias=hooks.antialias,
+            blur=hooks.blur,
             shade=shade,
         )
 
     def _compose(self, gaussians: Gaussians, context: ViewContext, shade: Shade | None) -> Rendered:
         rendered = self._draw(gaussians, context, shade)
-        fields = self.parts.fields
+        fields = self.hooks.fields
         if fields is None or context.view is None:
             return rendered
         names = fields.drawn(context)
@@ -110,9 +106,9 @@ class SceneRenderer:
 
     def with_other_pictures(self, step: Step, keep: Tensor | None, gradients: Gradients) -> Gradients:
         """Add the gradients of pictures that the fields drew themselves to the step's gradients."""
-        if self.parts.fields is None:
+        if self.hooks.fields is None:
             return gradients
-        more = dict(self.parts.fields.gradients(step, keep))
+        more = dict(self.hooks.fields.gradients(step, keep))
         static = more.pop(STATIC, None)
         if static is not None:
             gradients = gradients + static

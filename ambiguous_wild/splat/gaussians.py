@@ -36,7 +36,7 @@ class PendingSteps:
             self._make(rows)
 
     def end(self) -> None:
-        """Make all updates; from now on the optimiser puts off no update of these rows."""
+        """Make all updates; from now on the optimiser leaves none of these rows pending."""
         self.make()
         self._make = None
 

@@ -258,6 +258,51 @@ class MethodHooks:
         return replace(gaussians, log_scales=gaussians.log_scales + math.log(self.start_scale))
 
 
+def check_keep(keep: object, *, read: bool) -> None:
+    """Raise AwError if `keep` of a mask policy returned no map, or values out of range.
+
+    Args:
+        keep: what it returned.
+        read: whether its values are read; on an accelerator the host would wait.
+    """
+    if keep is None:
+        return
+    if not isinstance(keep, Tensor):
+        raise AwError(
+            f"keep(step) of the method's mask policy gave a {type(keep).__name__}; it must give a torch "
+            "tensor [H, W], or None (docs/extend.md)"
+        )
+    if read:
+        low, high = keep.min().item(), keep.max().item()
+        if low < -0.01 or high > 1.01:  # rounding may leave the range
+            raise AwError(
+                f"keep(step) of the method's mask policy gave values from {low:.3g} to {high:.3g}: "
+                "weights of pixels lie between 0, masked, and 1, kept"
+            )
+
+
+def check_cotangents(value: object, step: Step) -> None:
+    """Raise AwError if `cotangent` of a mask policy returned a loss, or a gradient of another shape."""
+    if value is None:
+        return
+    shape = list(step.rendered.image.shape)
+    if isinstance(value, Cotangents):
+        for name, size in {"image": shape, "extra": shape, "alpha": shape[:2], "depth": shape[:2]}.items():
+            tensor = getattr(value, name)
+            if tensor is not None and list(tensor.shape) != size:
+                raise AwError(
+                    f"cotangent(step, keep) of the method's mask policy gave {name} {list(tensor.shape)}; it "
+                    f"must be {size}"
+                )
+        return
+    if not isinstance(value, Tensor) or list(value.shape) != shape:
+        what = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+        raise AwError(
+            f"cotangent(step, keep) of the method's mask policy gave {what}; it must give a gradient, "
+            f"{shape}; return a loss from loss(render, step, keep) instead (docs/extend.md)"
+        )
+
+
 def thinned(count: int, most: int) -> np.ndarray:
     """Return the rows of `count` points that a run of at most `most` Gaussians starts from; 0 = all."""
     if not most or count <= most:

@@ -27,17 +27,17 @@ SMALLEST_SIDE = 96  # px; smaller photos are too small for SSIM's 11-tap window 
 
 @dataclass(frozen=True)
 class Level:
-    """From `begin` (share of the run) on, photos are trained at 1/`divisor` of their size."""
+    """From `begin` (share of the run) on, photos are trained at 1/`factor` of their width and height."""
 
     begin: float
-    divisor: int
+    factor: int
 
 
 FULL = (Level(0.0, 1),)
 
 
 def coarse_to_fine(photos: list[np.ndarray]) -> tuple[Level, ...]:
-    """Choose when divisors 4, 2 and 1 begin, from the photos' mean spectrum.
+    """Choose when the downsampling factors 4, 2 and 1 begin, from the photos' mean spectrum.
 
     Args:
         photos: a sample of the training photos, [H, W, 3] float.
@@ -46,49 +46,49 @@ def coarse_to_fine(photos: list[np.ndarray]) -> tuple[Level, ...]:
         Levels by rising begin; the first begins at 0.
     """
     side = min(min(photo.shape[:2]) for photo in photos)
-    divisors = [d for d in (4, 2, 1) if side // d >= SMALLEST_SIDE] or [1]
-    if divisors == [1]:
+    factors = [d for d in (4, 2, 1) if side // d >= SMALLEST_SIDE] or [1]
+    if factors == [1]:
         return FULL
-    energies = {d: float(np.mean([_spectrum_share(photo, d) for photo in photos])) for d in divisors}
-    start = energies[divisors[0]]
+    energies = {d: float(np.mean([_spectrum_share(photo, d) for photo in photos])) for d in factors}
+    start = energies[factors[0]]
     total = energies[1]
     if not 0.0 < start < total:
         return FULL  # flat photos carry no frequencies to wait for
-    levels = [Level(0.0, divisors[0])]
-    for previous, divisor in itertools.pairwise(divisors):
+    levels = [Level(0.0, factors[0])]
+    for previous, factor in itertools.pairwise(factors):
         # Dash: begin = COARSE_UNTIL * ln(E / E_min) / ln(E_total / E_min), with E of the level that ends.
-        share = np.log(energies[divisor] / start) / np.log(total / start)
+        share = np.log(energies[factor] / start) / np.log(total / start)
         before = np.log(energies[previous] / start) / np.log(total / start)
-        levels.append(Level(float(COARSE_UNTIL * (before + share) / 2), divisor))
+        levels.append(Level(float(COARSE_UNTIL * (before + share) / 2), factor))
     return tuple(levels)
 
 
-def divisor_at(levels: tuple[Level, ...], progress: float) -> int:
-    """Return the divisor at this share of the run."""
-    current = levels[0].divisor
+def factor_at(levels: tuple[Level, ...], progress: float) -> int:
+    """Return the downsampling factor at this share of the run."""
+    current = levels[0].factor
     for level in levels:
         if progress >= level.begin:
-            current = level.divisor
+            current = level.factor
     return current
 
 
-def ceiling_at(start: int, most: int, divisor: int, progress: float) -> int:
+def ceiling_at(start: int, most: int, factor: int, progress: float) -> int:
     """Return how many Gaussians the current resolution can use (Dash's count schedule).
 
     This is N0 + (Nmax - N0) / r^(2 - progress / COARSE_UNTIL); at full resolution Nmax.
     """
-    if divisor == 1 or start >= most:
+    if factor == 1 or start >= most:
         return most
     power = 2.0 - min(progress / COARSE_UNTIL, 1.0)
-    return int(start + (most - start) / divisor**power)
+    return int(start + (most - start) / factor**power)
 
 
-def _spectrum_share(photo: np.ndarray, divisor: int) -> float:
-    """Sum the magnitudes of the frequencies that an image `divisor` times smaller can hold."""
+def _spectrum_share(photo: np.ndarray, factor: int) -> float:
+    """Sum the magnitudes of the frequencies that an image `factor` times smaller can hold."""
     grey = photo.mean(axis=2)
     spectrum = np.abs(np.fft.fftshift(np.fft.fft2(grey - grey.mean())))
     height, width = spectrum.shape
-    h, w = max(height // (2 * divisor), 1), max(width // (2 * divisor), 1)
+    h, w = max(height // (2 * factor), 1), max(width // (2 * factor), 1)
     return float(spectrum[height // 2 - h : height // 2 + h, width // 2 - w : width // 2 + w].sum())
 
 
@@ -160,18 +160,18 @@ class Pace:
             return int(self.progress(iteration, elapsed_s) * count)
         return min(iteration, self.config.iterations) * count // self.config.iterations
 
-    def divisor(self, progress: float) -> int:
-        """Return the divisor of the photos' size at this share of the run."""
-        return divisor_at(self.levels, progress)
+    def downsampling(self, progress: float) -> int:
+        """Return the downsampling factor at this share of the run."""
+        return factor_at(self.levels, progress)
 
     @property
-    def divisors(self) -> tuple[int, ...]:
-        """Every resolution divisor that the run uses."""
-        return tuple(sorted({level.divisor for level in self.levels}))
+    def factors(self) -> tuple[int, ...]:
+        """Every downsampling factor that the run uses."""
+        return tuple(sorted({level.factor for level in self.levels}))
 
-    def ceiling(self, divisor: int, progress: float) -> int:
+    def ceiling(self, factor: int, progress: float) -> int:
         """Return the number of Gaussians at which growth stops now."""
-        return ceiling_at(self.start, self.most, divisor, progress)
+        return ceiling_at(self.start, self.most, factor, progress)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         """Return the learning rate of every tensor at this share of the run."""

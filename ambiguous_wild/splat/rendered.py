@@ -159,21 +159,6 @@ def frame_of(rendered: Rendered) -> Frame:
     return Frame(rendered.image, rendered.alpha, lambda: rendered.depth)
 
 
-class Shade(Protocol):
-    """A function that colours the visible rows instead of harmonics alone.
-
-    It is called between projection and blending.
-    """
-
-    def __call__(
-        self,
-        base: Tensor,  # [M, 3] SH(direction) + 0.5 of the rows, not clamped
-        rows: Tensor | slice,  # [M] int64, visible Gaussians; on an accelerator all of them, a slice
-    ) -> tuple[Tensor, ShadeVjp]:
-        """Return colours [M, 3], which the renderer clamps at 0, and their vjp."""
-        ...
-
-
 @dataclass(frozen=True)
 class ShadeGradients:
     """The gradients that the vjp of shaded colours returns."""
@@ -185,6 +170,10 @@ class ShadeGradients:
 
 
 ShadeVjp = Callable[[Tensor], ShadeGradients]  # from dL/dcolours [M, 3]
+# Colours the visible rows instead of harmonics alone, between projection and blending. Gets SH(direction) +
+# 0.5 of the rows [M, 3], not clamped, and the rows [M] int64 (on an accelerator all of them, a slice);
+# returns colours [M, 3], which the renderer clamps at 0, and their vjp.
+Shade = Callable[[Tensor, Tensor | slice], tuple[Tensor, ShadeVjp]]
 
 
 def spread(gradients: Gradients, shading: ShadeGradients, rows: Tensor | slice, g: Gaussians) -> Gradients:

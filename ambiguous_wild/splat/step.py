@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import Camera, Scene
+from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.splat.backend import Backend, backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -60,7 +60,7 @@ class ViewContext:
     view: int | None  # index into TrainData.photos; None for any other camera
     camera: Camera  # at the resolution of the picture
     photo: Tensor | None = None  # [H, W, 3] at that resolution; None if the picture has no photo
-    divisor: int = 1  # the picture has 1/divisor of the photo's width and height (resolution schedule)
+    downsampling: int = 1  # factor of the resolution schedule: the photo's size over the picture's
     fitting: bool = False  # a test photo is fitted; `photo` is black outside of the part to fit to
     other_gaussians: bool = False  # Gaussians of a method are drawn instead of the model
     progress: float = -1.0  # share of the run that is done, in [0, 1]
@@ -68,6 +68,10 @@ class ViewContext:
     def __post_init__(self) -> None:
         if self.progress < 0:
             object.__setattr__(self, "progress", self.nominal / NOMINAL_ITERATIONS)
+
+    @property
+    def divisor(self) -> NoReturn:
+        raise AwError("step.divisor is step.downsampling now")
 
     @property
     def neutral(self) -> bool:

@@ -1,16 +1,22 @@
-"""The training loop. Methods fill its places (`method_hooks.py`); nothing here knows a method by name."""
+"""The state of a training and its step; the loop is in `training_loop.py`.
+
+Methods implement hooks (`method_hooks.py`); nothing here knows a method by name.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import NoReturn
 
 import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.config import State
+from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.calibration import warm_backward
 from ambiguous_wild.splat.data import Pyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
@@ -19,7 +25,7 @@ from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.field import Field, rates_with
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
-from ambiguous_wild.splat.method_hooks import MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks, check_cotangents, check_keep
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.pace import Pace, TrainConfig
 from ambiguous_wild.splat.rendered import (
@@ -30,18 +36,20 @@ from ambiguous_wild.splat.rendered import (
     check_needs,
     with_visible,
 )
-from ambiguous_wild.splat.run import Probe, Run
 from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
-from ambiguous_wild.splat.watchdog import DeviceFiniteCheck
+from ambiguous_wild.splat.training_records import Clock, RunObserver, Timeline, clock_for
+from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, Watchdog
+
+Probe = Callable[[Callable[[Camera], Tensor]], float]
 
 
-class Trainer(Run):
+class Trainer:
     """Trains one model on one scene; stops and resumes at any iteration with the same bits."""
 
     def __init__(
         self,
         data: TrainData,
-        parts: MethodHooks,
+        hooks: MethodHooks,
         config: TrainConfig,
         *,
         folder: Path,
@@ -50,40 +58,51 @@ class Trainer(Run):
         """
         Args:
             data: the training side.
-            parts: the method.
+            hooks: the method.
             config: length and bookkeeping.
             folder: folder for checkpoint and timeline.
             probe: takes a function that renders a camera; returns PSNR in dB of the test views.
         """
         data.backend.use_threads(config.torch_threads)
-        if parts.train_data is not None:
-            data = replace(parts.train_data(data.for_method()), scene=data.scene)
-        super().__init__(data, config, folder, probe)
+        if hooks.train_data is not None:
+            data = replace(hooks.train_data(data.for_method()), scene=data.scene)
+        self.data, self.config, self.folder, self.probe = data, config, folder, probe
+        names = [view.name for view in data.scene.train]
+        self.watchdog = Watchdog(folder, config.on_nonfinite, config.seed, names)
+        self.clock: Clock = clock_for(data.device)
+        self.meter: RunObserver | None = None
+        self.marks: tuple[int, int] | None = None  # probes and timeline rows due after the last step
+        self.setup_s = 0.0  # seconds before the first step, in the process that began the run
+        # "hash" of the run's configuration and "about", its name; empty = unknown
+        self.run_identity: dict[str, str] = {}
+        self.iteration = 0
+        self.timeline = Timeline()
+        self._skipped: set[int] = set()  # views that were fully masked at some step
         data = data.for_method()
-        self.parts = parts
+        self.hooks = hooks
         self.pyramid = Pyramid(data)
         self._compiled: set[frozenset[str]] = set()  # cotangents for which the backward pass is compiled
-        self._divisors: dict[int, int] = {}  # divisors of the steps since the sentinel was last read
+        self._downsampling: dict[int, int] = {}  # factors of the steps since the device's check was last read
         # where reading a value makes the host wait, checks stay on the device and are read later
         views = len(data.photos)
-        self.sentinel = None if data.backend.reads_at_once else DeviceFiniteCheck(data.device, views)
-        check_needs(parts.density.needs, data.backend.statistics)
-        most = parts.density_config.max_gaussians
-        room = Pace(config, parts.schedule, data, start=0, most=most).most
-        gaussians = parts.first_gaussians(data, room)
-        self.pace = Pace(config, parts.schedule, data, start=len(gaussians), most=most)
-        sizes = self.pyramid.sizes(self.pace.divisors)
-        data.backend.prepare_loss(data.device, sizes, parts.lambda_dssim, parts.weighting)
-        self.effects = EffectPipeline(parts.effects, data)
+        self.device_check = None if data.backend.reads_at_once else DeviceFiniteCheck(data.device, views)
+        check_needs(hooks.density.needs, data.backend.statistics)
+        most = hooks.density_config.max_gaussians
+        room = Pace(config, hooks.schedule, data, start=0, most=most).most
+        gaussians = hooks.first_gaussians(data, room)
+        self.pace = Pace(config, hooks.schedule, data, start=len(gaussians), most=most)
+        sizes = self.pyramid.sizes(self.pace.factors)
+        data.backend.prepare_loss(data.device, sizes, hooks.lambda_dssim, hooks.weighting)
+        self.effects = EffectPipeline(hooks.effects, data)
         attributes = self.effects.rows(gaussians)
         if attributes:
             gaussians = gaussians.carrying({name: a.values for name, a in attributes.items()})
-        density = parts.density(parts.density_config, data.scene.extent, config.seed)
+        density = hooks.density(hooks.density_config, data.scene.extent, config.seed)
         density.setup(data)
         density.protected = self.effects.protected()
         self.field = Field(gaussians, rates_with(attributes, self.pace.learning_rates), density)
-        self.drawing = SceneRenderer(data, parts, self.field, self.effects)
-        parts.mask.setup(data)
+        self.drawing = SceneRenderer(data, hooks, self.field, self.effects)
+        hooks.mask.setup(data)
 
     # The static field is the result of the run.
     @property
@@ -99,23 +118,123 @@ class Trainer(Run):
         assert self.field.density is not None
         return self.field.density
 
+    @property
+    def parts(self) -> NoReturn:
+        raise AwError("trainer.parts is trainer.hooks now")
+
     def state(self) -> State:
+        """Return everything that decides how the run goes on; parts that are absent have no key."""
+        rollbacks = self.watchdog.state_dict()
         others, effects = self.drawing.state_dict(), self.effects.state_dict()
         return {
-            **super().state(),
+            **({"run": dict(self.run_identity)} if self.run_identity else {}),
+            "iteration": self.iteration,
+            "elapsed_s": self.clock.now(),
+            "setup_s": self.setup_s,
+            "parts_s": self.clock.parts_s,
+            "cpu_s": self.clock.cpu_s,
+            **({} if self.meter is None else {"meter": self.meter.state_dict()}),
+            "timeline": self.timeline.rows,
+            "loss": [float(self.timeline.loss_sum), self.timeline.loss_count],
+            "skipped": sorted(self.skipped),
+            **({"rollbacks": rollbacks} if rollbacks else {}),
             **self.field.state_dict(),
             **({"fields": others} if others else {}),
-            "mask": self.parts.mask.state_dict(),
+            "mask": self.hooks.mask.state_dict(),
             **({"effects": effects} if effects else {}),
         }
 
     def load_state(self, state: State) -> None:
+        """Restore what `state` returned; exact, so that a resumed run gives the same bits.
+
+        Raises:
+            KeyError: a key is missing.
+        """
         self.field.load_state_dict(state, self.data.device)
         if self.drawing.others:
             self.drawing.load_state_dict(state["fields"], self.data.device)
-        self.parts.mask.load_state_dict(state["mask"])
+        self.hooks.mask.load_state_dict(state["mask"])
         self.effects.load_state_dict(state.get("effects", {}))
-        super().load_state(state)
+        self.iteration = state["iteration"]
+        self.setup_s = state["setup_s"]
+        self.clock = clock_for(self.data.device, state["elapsed_s"], dict(state["parts_s"]))
+        self.clock.cpu_s = state.get("cpu_s", 0.0)
+        if self.meter is not None and "meter" in state:
+            self.meter.load_state_dict(state["meter"])
+        self.marks = None  # counted again from the new state
+        self.timeline.rows = list(state["timeline"])
+        self.timeline.loss_sum, self.timeline.loss_count = state["loss"]
+        self._skipped = set(state["skipped"])
+        self.watchdog.load_state_dict(state.get("rollbacks", []))
+
+    @property
+    def checkpoint_path(self) -> Path:
+        return self.folder / "checkpoint" / "last.safetensors"
+
+    def save(self) -> None:
+        """Write the state and the timeline, each atomically."""
+        checkpoint.save(self.checkpoint_path, self.state())
+        self.timeline.write(self.folder / "timeline.csv")
+
+    def resume(self) -> bool:
+        """Load the last checkpoint, if there is one; returns whether there was.
+
+        Raises:
+            AwError: the checkpoint is incomplete, or belongs to another run; the message names the file.
+        """
+        path = self.checkpoint_path
+        if not path.exists():
+            return False
+        state = checkpoint.load(path)
+        other = state.get("run", self.run_identity)  # checkpoints of earlier versions do not hold it
+        if self.run_identity and other != self.run_identity:
+            raise AwError(
+                f"checkpoint {path} is of another run ({other.get('about')}, configuration "
+                f"{str(other.get('hash'))[:12]}), this one is {self.run_identity['about']}, configuration "
+                f"{self.run_identity['hash'][:12]}; delete it, or train again with --overwrite always"
+            )
+        try:
+            self.load_state(state)
+        except (KeyError, TypeError) as error:
+            raise AwError(f"checkpoint {path} lacks {error}; train again with --overwrite always") from None
+        if self.device_check is not None:
+            self.device_check.reset()
+        return True
+
+    def progress(self, iteration: int) -> float:
+        """Return the share of the run done after `iteration` steps, in [0, 1]."""
+        return self.pace.progress(iteration, self.clock.now())
+
+    @property
+    def done(self) -> bool:
+        return self.progress(self.iteration) >= 1.0
+
+    @property
+    def ms_per_iteration(self) -> float:
+        return 1e3 * self.clock.now() / max(self.iteration, 1)
+
+    @property
+    def skipped_views(self) -> list[str]:
+        """Names of train photos that were fully masked at some step, which was then skipped."""
+        return sorted(self.data.scene.train[i].name for i in self.skipped)
+
+    @property
+    def skipped(self) -> set[int]:
+        """Indices of train photos that were fully masked at some step."""
+        return self._skipped | (self.device_check.empty_views() if self.device_check is not None else set())
+
+    def check_photos_used(self) -> None:
+        """Raise AwError if nothing was learnt: the loss was 0 in every row of the timeline."""
+        rows = self.timeline.rows
+        if rows and all(row["loss"] == 0.0 for row in rows):
+            masked = len(self.skipped)
+            why = (
+                f"{masked} of {len(self.data.scene.train)} train photos are masked all over: mask less, or "
+                "mend masks/train (white is kept)"
+                if masked
+                else "check the masks, poses, focal lengths and points of the scene"
+            )
+            raise AwError(f"the loss stayed 0 over {self.iteration} iterations, so nothing was learnt; {why}")
 
     def context(self, camera: Camera, *, fitting: bool = False) -> ViewContext:
         """Return the view context, at the present time of the run, of a camera without a train photo."""
@@ -134,9 +253,17 @@ class Trainer(Run):
         """Draw the static field for any camera, in its present state, without the light of a photo."""
         return self.drawing(self.gaussians, self.context(camera))
 
+    @torch.no_grad()
+    def picture(self, camera: Camera) -> Tensor:
+        """Draw a picture [H, W, 3] between two steps; the run has the same bits as without it.
+
+        Rows that are pending in the optimiser are brought up to date, as a later step would have done.
+        """
+        return self.render(camera).image
+
     def neutral_model(self) -> Gaussians:
         """Return the Gaussians for viewers, changed as the effects change them for every camera."""
-        return self.drawing.neutral_model(self.gaussians, self.iteration)
+        return self.effects.neutral_model(self.gaussians, self.iteration)
 
     def render_fitted(self, camera: Camera, photo: Tensor, keep: Tensor) -> Tensor:
         """Draw a test view [H, W, 3] after fitting the colour effects to a part of its photo.
@@ -150,18 +277,18 @@ class Trainer(Run):
         photo, keep = photo.to(self.data.device), keep.to(self.data.device)
         return self.drawing.fit(self.gaussians, self.context(camera, fitting=True), photo, keep)
 
-    def make_step(self, iteration: int, view: int, divisor: int | None = None) -> Step:
+    def make_step(self, iteration: int, view: int, downsampling: int | None = None) -> Step:
         """Draw a train view as the loop does; also used to predict masks after the training."""
         progress = self.progress(iteration)
-        divisor = self.pace.divisor(progress) if divisor is None else divisor
+        downsampling = self.pace.downsampling(progress) if downsampling is None else downsampling
         context = ViewContext(
             iteration=iteration,
             nominal=progress * NOMINAL_ITERATIONS,
             progress=progress,
             view=view,
-            divisor=divisor,
-            photo=self.pyramid.photo(view, divisor),
-            camera=self.pyramid.camera(view, divisor),
+            downsampling=downsampling,
+            photo=self.pyramid.photo(view, downsampling),
+            camera=self.pyramid.camera(view, downsampling),
         )
         context = replace(context, camera=self.effects.camera(context))
         with self.clock.part("render"):
@@ -169,7 +296,7 @@ class Trainer(Run):
         of_context = {f.name: getattr(context, f.name) for f in fields(ViewContext)}
         return Step(
             **of_context,
-            ceiling=self.pace.ceiling(divisor, progress),
+            ceiling=self.pace.ceiling(downsampling, progress),
             rendered=rendered,
             gaussians=self.gaussians,
             drawer=self.drawing.again,
@@ -180,8 +307,8 @@ class Trainer(Run):
             step.rendered.image,
             step.photo,
             keep,
-            lambda_dssim=self.parts.lambda_dssim,
-            weighting=self.parts.weighting,
+            lambda_dssim=self.hooks.lambda_dssim,
+            weighting=self.hooks.weighting,
         )
 
     def combine_user_keep(self, step: Step, keep: Tensor | None) -> Tensor | None:
@@ -190,22 +317,11 @@ class Trainer(Run):
         Raises:
             AwError: the policy's map is no tensor, or its values are out of range.
         """
-        if keep is not None and not isinstance(keep, Tensor):
-            raise AwError(
-                f"keep(step) of the method's mask policy gave a {type(keep).__name__}; it must give a torch "
-                "tensor [H, W], or None (docs/extend.md)"
-            )
-        if self.sentinel is None and keep is not None:  # on the CPU, where reading costs nothing
-            low, high = keep.min().item(), keep.max().item()
-            if low < -0.01 or high > 1.01:  # rounding may leave the range
-                raise AwError(
-                    f"keep(step) of the method's mask policy gave values from {low:.3g} to {high:.3g}: "
-                    "weights of pixels lie between 0, masked, and 1, kept"
-                )
+        check_keep(keep, read=self.device_check is None)
         user = self.data.user_keep[step.view]
         if user is None:
             return keep
-        user = shrink_keep(user, step.divisor)
+        user = shrink_keep(user, step.downsampling)
         return user if keep is None else keep * user
 
     def step(self) -> float | Tensor:
@@ -226,20 +342,20 @@ class Trainer(Run):
         shown = (step.photo, step.rendered.image)
         changes = [picture._version for picture in shown]  # torch counts changes in place
         with part("mask"):
-            keep = self.combine_user_keep(step, self.parts.mask.keep(step))
+            keep = self.combine_user_keep(step, self.hooks.mask.keep(step))
         with part("loss"):
             loss = self._photometric(step, keep)
-        if self.sentinel is None:
+        if self.device_check is None:
             self.watchdog.check_loss(step, keep, loss)
         with part("mask loss"):
-            method_cotangents = self.parts.mask.cotangent(step, keep)
-            _refuse_a_loss(method_cotangents, step)
+            method_cotangents = self.hooks.mask.cotangent(step, keep)
+            check_cotangents(method_cotangents, step)
             if changes != [picture._version for picture in shown]:
                 raise AwError(
-                    f"keep or cotangent of {type(self.parts.mask).__name__} changed step.photo or "
+                    f"keep or cotangent of {type(self.hooks.mask).__name__} changed step.photo or "
                     "step.rendered.image in place, which training reads: change a copy, .clone()"
                 )
-        if self.sentinel is None and keep is not None and not bool(keep.any()):
+        if self.device_check is None and keep is not None and not bool(keep.any()):
             # Nothing to learn: steps by Adam's momentum alone would drift away from the scene.
             self._skipped.add(step.view)
             self.iteration = iteration
@@ -250,19 +366,19 @@ class Trainer(Run):
             gradients = self._gradients(step, keep, cotangents)
         skip_step = None
         with part("watchdog"):
-            if self.sentinel is None:
+            if self.device_check is None:
                 self.watchdog.check_gradients(step, keep, loss, gradients)
             else:
                 skip_step = self._watch(step, keep, method_cotangents, loss, gradients)
                 step, gradients = _for_statistics(step, gradients, skip_step)
         events = self._learn(step, keep, gradients, skip_step)
         if "reset" in events:
-            self.parts.mask.on_opacity_reset(step)
+            self.hooks.mask.on_opacity_reset(step)
         if self.pyramid.prefetch is not None:
             self.pyramid.prefetch(self.pace.view(iteration + 1))
         if events or self.watchdog.due(iteration):
             with part("watchdog"):
-                self._look_back()
+                self._read_device_check()
                 self.watchdog.check_parameters(iteration, view, self.gaussians)
         self.iteration = iteration
         return loss.value
@@ -277,7 +393,7 @@ class Trainer(Run):
     def _gradients(self, step: Step, keep: Tensor | None, cotangents: Cotangents) -> Gradients:
         """Backpropagate the step's render and the further pictures that the method drew."""
         gradients = step.rendered.backward(cotangents, self.density.needs)
-        more = self.parts.mask.gradients(step, keep)
+        more = self.hooks.mask.gradients(step, keep)
         if more is not None:
             gradients = gradients + more
         gradients = self.drawing.with_other_pictures(step, keep, gradients)
@@ -291,12 +407,12 @@ class Trainer(Run):
         loss: PhotometricLoss,
         gradients: Gradients,
     ) -> Tensor:
-        """Let the sentinel check the step; returns [1] on the device, 1 = skip the optimiser's step."""
-        assert self.sentinel is not None
+        """Check the step on the device; returns [1] on the device, 1 = skip the optimiser's step."""
+        assert self.device_check is not None
         checked = list(self.watchdog.checked_gradients(gradients).values())
         value = torch.as_tensor(loss.value)
-        self._divisors[step.iteration] = step.divisor
-        return self.sentinel.watch(step.iteration, step.view, value, checked, keep, method_cotangents)
+        self._downsampling[step.iteration] = step.downsampling
+        return self.device_check.watch(step.iteration, step.view, value, checked, keep, method_cotangents)
 
     def _learn(
         self, step: Step, keep: Tensor | None, gradients: Gradients, skip_step: Tensor | None
@@ -305,7 +421,7 @@ class Trainer(Run):
         part, progress = self.clock.part, self.progress(step.iteration)
         events: list[str] = []
         density_keep = keep
-        if self.density.reads_keep and (composed := self.parts.mask.composed_keep(step)) is not None:
+        if self.density.reads_keep and (composed := self.hooks.mask.composed_keep(step)) is not None:
             density_keep = self.combine_user_keep(step, composed)
         # as on the CPU, a fully masked photo changes nothing; only before growth does the host read the flag
         if skip_step is not None and keep is not None and self.density.due(step) and bool(skip_step):
@@ -322,7 +438,7 @@ class Trainer(Run):
         if gradients.fields:
             with part("fields"):
                 self.drawing.learn(step, gradients.fields, progress, skip_step)
-        if self.parts.effects:
+        if self.hooks.effects:
             with part("effects"):
                 self.effects.step(gradients, replace(step, progress=progress), skip_step)
                 if events:
@@ -330,19 +446,19 @@ class Trainer(Run):
                 self.effects.after_step(step, self.gaussians)
         return events
 
-    def _look_back(self) -> None:
-        """Read the sentinel; if a step since the last look was not finite, repeat it to find the values.
+    def _read_device_check(self) -> None:
+        """Read the device's check; if a step was not finite since the last one, repeat it to find the values.
 
         Raises:
             NonFinite: the finding that the step itself would have raised on the CPU.
         """
-        broken = None if self.sentinel is None else self.sentinel.first_broken()
-        divisors, self._divisors = self._divisors, {}
+        broken = None if self.device_check is None else self.device_check.first_broken()
+        factors, self._downsampling = self._downsampling, {}
         if broken is None:
             return
         # repeat at the step's own size: under a budget the schedule has moved on with the clock
-        view, divisor = self.pace.view(broken.iteration), divisors.get(broken.iteration)
-        step = self.make_step(broken.iteration, view, divisor)
+        view, downsampling = self.pace.view(broken.iteration), factors.get(broken.iteration)
+        step = self.make_step(broken.iteration, view, downsampling)
         keep = broken.keep
         loss = self._photometric(step, keep)
         self.watchdog.check_loss(step, keep, loss)
@@ -352,31 +468,9 @@ class Trainer(Run):
 
     def check_parameters(self) -> None:
         """Raise NonFinite for the last step if a parameter is not finite."""
-        self._look_back()
+        self._read_device_check()
         view = self.pace.view(max(self.iteration, 1))
         self.watchdog.check_parameters(self.iteration, view, self.gaussians)
-
-
-def _refuse_a_loss(value: object, step: Step) -> None:
-    """Raise AwError if `cotangent` of a mask policy returned a loss, or a gradient of another shape."""
-    if value is None:
-        return
-    shape = list(step.rendered.image.shape)
-    if isinstance(value, Cotangents):
-        for name, size in {"image": shape, "extra": shape, "alpha": shape[:2], "depth": shape[:2]}.items():
-            tensor = getattr(value, name)
-            if tensor is not None and list(tensor.shape) != size:
-                raise AwError(
-                    f"cotangent(step, keep) of the method's mask policy gave {name} {list(tensor.shape)}; it "
-                    f"must be {size}"
-                )
-        return
-    if not isinstance(value, Tensor) or list(value.shape) != shape:
-        what = f"a tensor {list(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
-        raise AwError(
-            f"cotangent(step, keep) of the method's mask policy gave {what}; it must give a gradient, "
-            f"{shape}; return a loss from loss(render, step, keep) instead (docs/extend.md)"
-        )
 
 
 def _for_statistics(step: Step, gradients: Gradients, skip_step: Tensor) -> tuple[Step, Gradients]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -127,6 +127,25 @@ def clock_for(device: torch.device, elapsed_s: float = 0.0, parts_s: dict[str, f
     return (GpuClock if device.type == "cuda" else Clock)(elapsed_s, parts_s)
 
 
+class RunObserver(Protocol):
+    """Watches the machine while a run trains; it is called with the run's clock stopped.
+
+    `harness.meter.Meter` is one; this package cannot import it.
+    """
+
+    def begin(self, trained_s: float) -> None: ...
+
+    def due(self, trained_s: float, progress: float) -> bool: ...
+
+    def look(self, trained_s: float) -> None: ...
+
+    def end(self, trained_s: float) -> None: ...
+
+    def state_dict(self) -> State: ...
+
+    def load_state_dict(self, state: State) -> None: ...
+
+
 Row = dict[str, float | None]  # one row of a timeline, see `Timeline.add`
 
 
@@ -173,7 +192,7 @@ class Timeline:
 
 
 @dataclass
-class Places:
+class SampledPositions:
     """Positions [n, 3] in the world, thinned evenly to at most `MOST` without random numbers."""
 
     xyz: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
@@ -207,8 +226,8 @@ class DensityLog:
     """Rounds of growth in order, and positions of the Gaussians that they made."""
 
     rounds: list[Round] = field(default_factory=list)
-    added: Places = field(default_factory=Places)  # Gaussians added by cloning and splitting
-    merged: Places = field(default_factory=Places)  # Gaussians that replaced merged ones
+    added: SampledPositions = field(default_factory=SampledPositions)  # by cloning and splitting
+    merged: SampledPositions = field(default_factory=SampledPositions)  # in place of merged Gaussians
 
     def begin(self, iteration: int) -> None:
         """Start a round."""
@@ -240,4 +259,4 @@ class DensityLog:
 
     def load_state_dict(self, state: State) -> None:
         self.rounds = [Round(*row) for row in state["rounds"]]
-        self.added, self.merged = Places(**state["added"]), Places(**state["merged"])
+        self.added, self.merged = SampledPositions(**state["added"]), SampledPositions(**state["merged"])

@@ -42,7 +42,7 @@ FOLDER = "nonfinite"
 REPORT, GOOD, STEP = "report.json", "good.safetensors", "step.safetensors"
 EVERY = 50  # iterations between checks of the parameters
 MOST_ROLLBACKS = 5  # a run that needs more is stopped
-_LOOKED_AT = ("means", "quats", "log_scales", "opacity_logits", "sh0")  # gradients that are checked
+_CHECKED = ("means", "quats", "log_scales", "opacity_logits", "sh0")  # gradients that are checked
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Watchdog:
 
     def checked_gradients(self, gradients: Gradients) -> dict[str, Tensor]:
         """Return the gradients that are checked in every step."""
-        return {name: getattr(gradients, name) for name in _LOOKED_AT} | dict(gradients.attributes)
+        return {name: getattr(gradients, name) for name in _CHECKED} | dict(gradients.attributes)
 
     def nonreproducible(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> NonFinite:
         """Return the finding of a step that is finite when repeated: a GPU sums in another order."""
@@ -148,7 +148,7 @@ class Watchdog:
         return any(r["epoch"] == epoch and r["view"] == view for r in self.rollbacks)
 
     @property
-    def undoes(self) -> bool:
+    def rolls_back(self) -> bool:
         """Whether the run rolls back after a finding."""
         return self.action == "rollback" and len(self.rollbacks) < MOST_ROLLBACKS
 
@@ -183,7 +183,7 @@ class Watchdog:
             f"it again from the last good state; --on-nonfinite rollback leaves such a photo out and goes on",
         )
 
-    def keep(self, good: Path, error: NonFinite) -> Path:
+    def snapshot(self, good: Path, error: NonFinite) -> Path:
         """Store what reproduces a finding: a report, the last good checkpoint and what the step saw.
 
         Args:

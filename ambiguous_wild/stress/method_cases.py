@@ -20,7 +20,7 @@ from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.config import State
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.methods.entry import MethodEntry
-from ambiguous_wild.methods.references import place_of
+from ambiguous_wild.methods.references import error_location
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.pace import TrainConfig
@@ -53,10 +53,10 @@ def case_of(entry: MethodEntry) -> Case:
             with tempfile.TemporaryDirectory(prefix="aw-stress-") as folder:
                 wrong = _faults(entry, Path(folder), torch.device(device))
         except Exception as error:
-            if isinstance(error, AwError) or not place_of(error):
+            if isinstance(error, AwError) or not error_location(error):
                 raise
             why = " ".join(f"{type(error).__name__}: {error}".split())
-            raise AwError(why + place_of(error)) from error
+            raise AwError(why + error_location(error)) from error
         return CaseResult(
             float(len(wrong)), 0.0, "; ".join(wrong) or "exact", "same bits when repeated, resumed"
         )
@@ -91,8 +91,8 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
             "keep no state in a module or class"
         ]
     step = again.make_step(middle, 0)
-    again.parts.mask.predict(step)
-    again.parts.mask.panels(step)
+    again.hooks.mask.predict(step)
+    again.hooks.mask.panels(step)
     if changed := differing(before, _state(again)):
         return [f"predict(step) or panels(step) changes {changed}: they must learn and store nothing"]
     resumed = trainer("first")
@@ -114,15 +114,15 @@ def _faults(entry: MethodEntry, folder: Path, device: torch.device) -> list[str]
 
 def _parts(trainer: Trainer) -> list[Any]:
     effects = trainer.effects.effects
-    fields = () if trainer.parts.fields is None else (trainer.parts.fields,)
-    return [trainer.parts.mask, trainer.density, *effects, *fields]
+    fields = () if trainer.hooks.fields is None else (trainer.hooks.fields,)
+    return [trainer.hooks.mask, trainer.density, *effects, *fields]
 
 
 def _state(trainer: Trainer) -> State:
     """Save the run; return what it holds, without times."""
     trainer.save()
     held = checkpoint.load(trainer.checkpoint_path)
-    facts = copy.deepcopy(trainer.parts.mask.facts())
+    facts = copy.deepcopy(trainer.hooks.mask.facts())
     return {name: value for name, value in held.items() if name not in _CLOCKS} | {"facts": facts}
 
 

@@ -218,8 +218,8 @@ class LiveView:
         photo = read_png_rgb(path)
         if name not in self._train:
             return photo
-        step = trainer.make_step(max(trainer.iteration, 1), self._train[name], divisor=1)
-        keep = trainer.combine_user_keep(step, trainer.parts.mask.predict(step))
+        step = trainer.make_step(max(trainer.iteration, 1), self._train[name], downsampling=1)
+        keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
         if keep is None:
             return photo
         return tint(photo, (keep < 0.5).cpu().numpy(), MASKED)

@@ -20,6 +20,7 @@ from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.stress.case import run
 from ambiguous_wild.stress.method_cases import case_of
 from tests.tiny_scene import write_tiny_scene
@@ -64,7 +65,7 @@ def trained(name: str, scene, folder, iterations=200, **config) -> Trainer:
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
     config = TrainConfig(iterations=iterations, probes=0, **config)
     trainer = Trainer(data, entry.build(entry.options()), config, folder=folder / name)
-    trainer.train()
+    train(trainer)
     return trainer
 
 
@@ -76,7 +77,7 @@ def test_a_loss_of_ones_own_acts_and_a_loss_in_place_of_its_gradient_is_refused(
         data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
         parts = entry.build(dataclasses.replace(entry.options(), weight=weight))
         trainer = Trainer(data, parts, TrainConfig(iterations=60, probes=0), folder=tmp_path / str(weight))
-        trainer.train()
+        train(trainer)
         image = trainer.render(scene.test[0].camera).image
         variation.append(float(image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean()))
     assert variation[1] < 0.8 * variation[0]
@@ -95,7 +96,7 @@ def test_a_loss_of_ones_own_acts_and_a_loss_in_place_of_its_gradient_is_refused(
             parts, mask=type("Wrong", (type(parts.mask),), {name: hook})(parts.mask.config)
         )
         with pytest.raises(AwError, match=why):
-            Trainer(data, parts, TrainConfig(iterations=60, probes=0), folder=tmp_path / "w").train()
+            train(Trainer(data, parts, TrainConfig(iterations=60, probes=0), folder=tmp_path / "w"))
 
 
 def test_a_loss_by_autograd_is_that_of_its_cotangent(tmp_path):
@@ -121,7 +122,7 @@ def test_a_loss_by_autograd_is_that_of_its_cotangent(tmp_path):
         data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
         folder = tmp_path / type(policy).__name__
         trainer = Trainer(data, MethodHooks(mask=policy), TrainConfig(iterations=20, probes=0), folder=folder)
-        trainer.train()
+        train(trainer)
         means.append(trainer.gaussians.means.clone())
         assert policy.regularises() == (type(policy) is not MaskPolicy)
     assert torch.equal(means[0], means[1]) and not torch.equal(means[0], means[2])

@@ -23,7 +23,7 @@ from ambiguous_wild.harness.cell import (
     scene_identity,
 )
 from ambiguous_wild.harness.grid import plan_cells
-from ambiguous_wild.harness.training import peak_rss_mb, reset_peak
+from ambiguous_wild.harness.run_cost import peak_rss_mb, reset_peak
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin

@@ -12,7 +12,7 @@ from ambiguous_wild.cli import main
 from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.splat.run import Stopped, deferred
+from ambiguous_wild.splat.training_loop import Stopped, deferred
 from tests.tiny_scene import write_tiny_scene
 
 LENGTH = 30

@@ -22,6 +22,7 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from tests.tiny_scene import write_tiny_scene
 
 CORES = 4
@@ -279,7 +280,7 @@ def test_a_meter_changes_no_bit_of_a_run(scene, tmp_path):
             monitored.due = lambda trained_s, progress: True  # after every iteration
             kernel = Calibration(torch.device("cpu"), Size("test", 1.0, 200, 48, 32, 1))
             monitored._read = kernel.read
-        trainer.train()
+        train(trainer)
         found.append({k: v.numpy().tobytes() for k, v in trainer.gaussians.items()})
     assert len(monitored.samples) == 61
     assert found[0] == found[1]

@@ -28,6 +28,7 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH, write_tiny_scene
 
 ITERATIONS = 120
@@ -60,13 +61,13 @@ def watched(scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "watched"
     trainer = trainer_for(scene, folder)
     recorder = Recorder(trainer, folder)
-    trainer.train(tick=recorder)
+    train(trainer, tick=recorder)
     return trainer, folder, draw_all(trainer, recorder, folder)
 
 
 def test_a_run_is_the_same_bits_with_and_without_pictures(scene, watched, tmp_path):
     blind = trainer_for(scene, tmp_path)
-    blind.train()
+    train(blind)
     trainer, folder, _ = watched
     assert bits(blind) == bits(trainer)
     one, two = (checkpoint.load(f / "checkpoint" / "last.safetensors")["mask"] for f in (tmp_path, folder))
@@ -95,7 +96,7 @@ def test_a_run_that_stopped_has_the_pictures_of_one_that_did_not(scene, watched,
     second = trainer_for(scene, tmp_path)
     assert second.resume() and second.iteration == 40
     recorder = Recorder(second, tmp_path)
-    second.train(tick=recorder)
+    train(second, tick=recorder)
     draw_all(second, recorder, tmp_path)
     for name in ("training_train_0.png", "training_train_5.png"):
         whole = read_png_rgb(watched[1] / "pictures" / name)

@@ -107,7 +107,7 @@ def test_an_opened_run_draws_the_masks_that_it_wrote(masked):
     before = {p: p.read_bytes() for p in masked.rglob("*") if p.is_file()}
     trainer = open_run(masked)
     for view, photo in enumerate(trainer.data.scene.train):
-        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view, divisor=1))
+        keep = trainer.hooks.mask.predict(trainer.make_step(trainer.iteration, view, downsampling=1))
         written = read_keep_map((masked / "masks" / photo.name).with_suffix(".png"))
         assert torch.equal(keep > 0.5, torch.from_numpy(written))
     assert before == {p: p.read_bytes() for p in masked.rglob("*") if p.is_file()}

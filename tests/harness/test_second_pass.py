@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild import bench
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness import training as passes
-from ambiguous_wild.harness.training import both_passes
+from ambiguous_wild.harness.run_cost import both_passes
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.given_masks import FixedMasks

@@ -16,6 +16,7 @@ from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from tests.tiny_scene import TRAIN
 
 
@@ -38,7 +39,7 @@ def trainer_of(
 
 def trained(scene: Path, folder: Path, parts: MethodHooks, iterations: int = 120, seed: int = 0) -> Trainer:
     trainer = trainer_of(scene, folder, parts, iterations, seed)
-    trainer.train()
+    train(trainer)
     return trainer
 
 
@@ -51,15 +52,15 @@ def step_of(
 ) -> Step:
     """A step whose render is `image`; no Gaussians."""
     photo = data.photos[view]
-    divisor = photo.shape[0] // image.shape[0]
+    downsampling = photo.shape[0] // image.shape[0]
     rendered = SimpleNamespace(image=image, alpha=torch.ones(image.shape[:2]))
     return Step(
         iteration=iteration,
         nominal=nominal,
         view=view,
-        divisor=divisor,
+        downsampling=downsampling,
         ceiling=1000,
-        photo=photo[::divisor, ::divisor].contiguous(),
+        photo=photo[::downsampling, ::downsampling].contiguous(),
         camera=data.cameras[view].resized(image.shape[1], image.shape[0]),
         rendered=rendered,  # type: ignore[arg-type]
         gaussians=None,  # type: ignore[arg-type]
@@ -80,7 +81,7 @@ def masked_more_inside(trainer: Trainer) -> tuple[float, float]:
     """Mean keep on the red squares, and elsewhere."""
     inside, outside = [], []
     for view in range(len(TRAIN)):
-        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
+        keep = trainer.hooks.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
         square = np.zeros(keep.shape, bool)
         square[14:26, 14 + 4 * view : 26 + 4 * view] = True
         inside.append(keep[square].mean()), outside.append(keep[~square].mean())

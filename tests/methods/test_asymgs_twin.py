@@ -32,7 +32,7 @@ def test_pictures_are_drawn_to_each_other_after_the_warm_up(twin):
     first = torch.full_like(twin.data.photos[0], 0.5)
     second = first.clone()
     second[:, :32] += 0.1
-    context = SimpleNamespace(nominal=1001.0, camera=twin.data.cameras[0], divisor=1)
+    context = SimpleNamespace(nominal=1001.0, camera=twin.data.cameras[0], downsampling=1)
     found = twin.regularise(frames(first, second), context)
     each = 1.0 / first.numel()
     assert found[STATIC].image[:, :32].unique().tolist() == pytest.approx([-each])
@@ -47,7 +47,7 @@ def test_the_second_model_learns_its_own_photo_under_its_own_mask(twin):
     soft = torch.sigmoid(8 * twin.masks.soft[view].values[0]).clone()
     camera = twin.data.cameras[view]
     twin._second = view, camera
-    context = SimpleNamespace(nominal=500.0, camera=camera, divisor=1)
+    context = SimpleNamespace(nominal=500.0, camera=camera, downsampling=1)
     found = twin.regularise(frames(first, first), context)
     keep = torch.nn.functional.interpolate(soft[None, None], size=first.shape[:2], mode="bilinear")[0, 0]
     wanted = photometric(first, twin.data.photos[view], keep).d_image

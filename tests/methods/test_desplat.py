@@ -97,8 +97,8 @@ def test_test_views_show_the_static_field_alone_and_the_mask_is_what_the_layer_l
         step = trainer.make_step(trainer.iteration, view)
         alpha = frames_of(step.rendered)[str(view)].alpha
         assert float(alpha.max()) > 0.02
-        assert torch.equal(trainer.parts.mask.predict(step), 1.0 - alpha)
-        assert trainer.parts.mask.keep(step) is None
+        assert torch.equal(trainer.hooks.mask.predict(step), 1.0 - alpha)
+        assert trainer.hooks.mask.keep(step) is None
         alone = trainer.render(camera).image
         assert torch.equal(alone, frames_of(step.rendered)[STATIC].image)
         assert not torch.equal(alone, step.rendered.image)
@@ -109,7 +109,7 @@ def test_layers_take_up_distractors(scene, tmp_path):
     trainer = trained(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), iterations=400)
     inside, outside = [], []
     for view in range(6):
-        keep = trainer.parts.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
+        keep = trainer.hooks.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
         square = np.zeros(keep.shape, bool)
         square[14:26, 14 + 4 * view : 26 + 4 * view] = True
         inside.append(keep[square].mean()), outside.append(keep[~square].mean())

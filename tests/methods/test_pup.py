@@ -9,6 +9,7 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.pup import PupConfig, PupDensity, log_det, removed
 from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.training_loop import train
 from tests.methods.baselines import parts_of, trainer_of
 from tests.splat.scenes import camera, gaussians
 
@@ -92,7 +93,7 @@ def test_rounds_together_remove_the_share(scene, tmp_path):
     while trainer.iteration < 39:
         trainer.step()
     before = len(trainer.gaussians)
-    trainer.train()
+    train(trainer)
     assert trainer.density.pruning_rounds == 3
     assert len(trainer.gaussians) == pytest.approx(0.2 * before, abs=4)
 
@@ -102,5 +103,5 @@ def test_what_no_view_sees_goes_first(scene, tmp_path):
     with torch.no_grad():
         trainer.gaussians.means[::4, 2] = -5.0  # behind every camera
         trainer.gaussians.sh0[::4] = 9.0
-    trainer.train()
+    train(trainer)
     assert float(trainer.gaussians.sh0.max()) < 8.0

@@ -59,12 +59,14 @@ META = torch.device("meta")
 MOST_LAUNCHES = 640  # 626 with the defaults, a third of them in the two runs of components
 
 
-def on_meta(step, divisor=1):
+def on_meta(step, downsampling=1):
     rendered = step.rendered
-    h, w = HEIGHT // divisor, WIDTH // divisor
+    h, w = HEIGHT // downsampling, WIDTH // downsampling
     maps = {"image": (h, w, 3), "alpha": (h, w), "depth": (h, w)}
     empty = {name: torch.empty(size, device=META) for name, size in maps.items()}
-    return dataclasses.replace(step, divisor=divisor, rendered=SimpleNamespace(**(vars(rendered) | empty)))
+    return dataclasses.replace(
+        step, downsampling=downsampling, rendered=SimpleNamespace(**(vars(rendered) | empty))
+    )
 
 
 def moved(policy: RefineSplatMask) -> RefineSplatMask:
@@ -74,11 +76,10 @@ def moved(policy: RefineSplatMask) -> RefineSplatMask:
     policy.data = dataclasses.replace(
         policy.data, device=META, photos=[photo.to(META) for photo in policy.data.photos]
     )
-    inputs = policy.inputs
+    inputs, readable = policy.inputs, dataclasses.replace(policy.data, photos=photos)
     policy.masks = MaskStore(
-        policy.config, photos, policy.data.cameras, surfaces, policy.looks, inputs.labels, inputs.static,
-        META, policy.compare,
-    )  # fmt: skip
+        policy.config, readable, surfaces, policy.looks, inputs.labels, inputs.static, policy.compare
+    )
     policy.masks.pixels.photos = policy.data.photos
     policy.first = {view: first.to(META) for view, first in policy.first.items()}
     return policy
@@ -94,13 +95,13 @@ def moved(policy: RefineSplatMask) -> RefineSplatMask:
 def test_an_examination_reads_nothing_back(scene, changes):
     policy = moved(made(scene, dataclasses.replace(PLAIN, mask=MaskConfig(**changes))))
     for number in range(VIEWS + 2):
-        step = on_meta(visit(scene, number), divisor=1 + number % 2)
+        step = on_meta(visit(scene, number), downsampling=1 + number % 2)
         with Launches() as launches:
             keep = policy.keep(step)
         assert keep.device == META and keep.shape == step.rendered.alpha.shape
     assert policy.predict(step).shape == keep.shape
     assert 100 < launches.count <= MOST_LAUNCHES
-    early = dataclasses.replace(step, iteration=1, nominal=1.0, divisor=1)
+    early = dataclasses.replace(step, iteration=1, nominal=1.0, downsampling=1)
     assert policy.keep(early).device == META  # the first look
     with pytest.raises((RuntimeError, NotImplementedError), match=READ):
         policy.masks.state_dict()  # this test would notice a read

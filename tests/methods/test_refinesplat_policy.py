@@ -94,14 +94,14 @@ def step_of(
     view: int,
     image: torch.Tensor,
     iteration: int = 100,
-    divisor: int = 1,
+    downsampling: int = 1,
     alpha: float = 1.0,
 ) -> Step:
     return Step(
         iteration=iteration,
         nominal=20.0 * iteration,
         view=view,
-        divisor=divisor,
+        downsampling=downsampling,
         ceiling=1000,
         photo=data.photos[view],
         camera=data.cameras[view],
@@ -237,11 +237,11 @@ def test_smaller_steps_keep_a_pixel_only_if_all_it_covers_is_kept(scene):
     policy = fresh(scene)
     image = blurred(scene.clean[2], 2)
     full = policy.keep(step_of(scene.data, 2, image)).numpy()
-    half = policy.keep(step_of(scene.data, 2, image, 101, divisor=2)).numpy()
+    half = policy.keep(step_of(scene.data, 2, image, 101, downsampling=2)).numpy()
     assert half.shape == (HEIGHT // 2, WIDTH // 2)
     assert np.array_equal(half, full.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).min(axis=(1, 3)))
     small = torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], scale_factor=0.5, mode="area")[0]
-    predicted = policy.predict(step_of(scene.data, 2, small.permute(1, 2, 0), 102, divisor=2))
+    predicted = policy.predict(step_of(scene.data, 2, small.permute(1, 2, 0), 102, downsampling=2))
     assert predicted.shape == (HEIGHT // 2, WIDTH // 2)
 
 

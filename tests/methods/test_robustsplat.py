@@ -305,4 +305,4 @@ def test_the_seed_decides(scene, tmp_path):
     one, other = (
         trained(scene, tmp_path / str(seed), parts_of("robustsplat", **EARLY), 40, seed) for seed in (0, 1)
     )
-    assert not torch.equal(one.parts.mask.net.first.weight, other.parts.mask.net.first.weight)
+    assert not torch.equal(one.hooks.mask.net.first.weight, other.hooks.mask.net.first.weight)

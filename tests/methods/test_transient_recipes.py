@@ -61,7 +61,7 @@ def nexus(scene, tmp_path_factory):
 
 
 def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
-    policy, step = nexus.parts.mask, nexus.make_step(10, 0)
+    policy, step = nexus.hooks.mask, nexus.make_step(10, 0)
     keep, gradients = policy._weight(step, learn=True)
     distance = policy.distance(step)
     codes, leaf = step.gaussians.attributes["nexus_doubt"], policy.effect._leaf(step)
@@ -86,7 +86,7 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
 
 
 def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
-    policy, step = nexus.parts.mask, nexus.make_step(10, 0)
+    policy, step = nexus.hooks.mask, nexus.make_step(10, 0)
     _, alone = policy._weight(step, learn=True)
     assert not any(getattr(alone, name).any() for name in GEOMETRY)
     monkeypatch.setattr(policy, "config", replace(policy.config, through_geometry=True))
@@ -96,7 +96,7 @@ def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
 
 
 def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
-    policy, step = nexus.parts.mask, nexus.make_step(10, 0)
+    policy, step = nexus.hooks.mask, nexus.make_step(10, 0)
     monkeypatch.setattr(policy.effect, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
     monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
     weight, gradients = policy._weight(step, learn=True)
@@ -107,7 +107,7 @@ def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
 
 
 def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch):
-    policy, step = nexus.parts.mask, nexus.make_step(10, 0)
+    policy, step = nexus.hooks.mask, nexus.make_step(10, 0)
     plain, before = policy._weight(step, learn=True)
     monkeypatch.setattr(policy, "config", replace(policy.config, boundary=True))
     wide, after = policy._weight(step, learn=True)
@@ -182,7 +182,7 @@ def test_the_composite_by_hand():
 
 def test_stages_share_the_loss_as_described(scene, tmp_path):
     trainer = trainer_of(scene, tmp_path, parts_of("hybridgs", points="60"))
-    policy, effect = trainer.parts.mask, trainer.effects.effects[0]
+    policy, effect = trainer.hooks.mask, trainer.effects.effects[0]
     early, apart, joint = (
         trainer.make_step(i, 0) for i in (10, 40, 80)
     )  # of 120: nominal 2500, 10 000, 20 000
@@ -281,7 +281,7 @@ def test_masks_of_a_photo_stand_in_after_a_reset(scene, tmp_path):
 def test_depth_is_smoothed(scene, tmp_path):
     trainer = trained(scene, tmp_path, parts_of("t-3dgs", variation="0.1"), iterations=60)
     step = trainer.make_step(60, 0)
-    found = trainer.parts.mask.cotangent(step, None)
+    found = trainer.hooks.mask.cotangent(step, None)
     alpha, depth = step.rendered.alpha.double(), step.rendered.depth.double()
 
     def loss(moved):
@@ -309,7 +309,7 @@ def forest(scene, tmp_path_factory):
 
 def test_the_mixture_and_where_its_gradient_goes(forest):
     step = forest.make_step(10, 2)
-    frames, mask = frames_of(step.rendered), 1.0 - forest.parts.mask.predict(step)
+    frames, mask = frames_of(step.rendered), 1.0 - forest.hooks.mask.predict(step)
     want = mask[..., None] * frames["transient"].image + (1 - mask)[..., None] * frames[STATIC].image
     torch.testing.assert_close(step.rendered.image, want)
     assert torch.equal(forest.render(step.camera).image, frames[STATIC].image)
@@ -321,7 +321,7 @@ def test_the_mixture_and_where_its_gradient_goes(forest):
 def test_the_mask_learns_from_its_three_losses(forest):
     nets, step = forest.effects.effects[0], forest.make_step(10, 2)
     frames = frames_of(step.rendered)
-    found = forest.parts.fields.regularise(frames, step)[STATIC].effect_grads["forestsplats"]["last_bias0"]
+    found = forest.hooks.fields.regularise(frames, step)[STATIC].effect_grads["forestsplats"]["last_bias0"]
     leaf, area = nets._leaf(step), max(0.006, 0.05 * math.exp(-0.001 * step.nominal))
 
     def loss(bias):
@@ -349,8 +349,8 @@ def test_bent_gradients_are_those_of_the_picture(forest):
     found = gradients.fields["transient"].opacity_logits
     row = int(found.abs().argmax())
     logits = forest.drawing.others["transient"].gaussians.opacity_logits
-    shot_mask = 1.0 - forest.parts.mask.predict(step)
-    photo_term = forest.parts.fields.regularise(frames_of(step.rendered), step)["transient"].image
+    shot_mask = 1.0 - forest.hooks.mask.predict(step)
+    photo_term = forest.hooks.fields.regularise(frames_of(step.rendered), step)["transient"].image
 
     def loss(moved):
         kept = logits.clone()

@@ -20,6 +20,7 @@ from ambiguous_wild.splat.effects.autograd_effect import Visible
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import ViewContext
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from tests.methods.baselines import masked_more_inside, parts_of, trainer_of
 from tests.splat.scenes import camera
 from tests.tiny_scene import write_tiny_scene
@@ -63,7 +64,7 @@ def test_it_trains_and_carries_its_embeddings(tmp_path):
     config = TrainConfig(iterations=60, probes=0, max_gaussians=500)
     whole = Trainer(data, entry.build(entry.options()), config, folder=tmp_path / "run")
     start = whole.gaussians.attributes["wild_embedding"].clone()
-    whole.train()
+    train(whole)
     after = whole.gaussians.attributes["wild_embedding"]
     assert len(after) == len(whole.gaussians) and not torch.equal(after[: len(start)], start)
     assert whole.effects.facts()["wildgaussians"]["photo_std"] > 0
@@ -93,8 +94,8 @@ def test_it_masks_what_only_one_photo_shows_and_can_do_without_either_part(tmp_p
     scene = write_tiny_scene(tmp_path / "scene")
     options = {"width": "8", "mask_start": "0", "min_mask_start": "100"}
     trainer = trainer_of(scene, tmp_path / "run", parts_of("wildgaussians", **options), iterations=300)
-    assert trainer.parts.mask.predict(trainer.make_step(1, 0)) is None  # not begun
-    trainer.train()
+    assert trainer.hooks.mask.predict(trainer.make_step(1, 0)) is None  # not begun
+    train(trainer)
     inside, outside = masked_more_inside(trainer)
     assert inside < outside - 0.3, (inside, outside)
     alone = parts_of("wildgaussians", appearance="false")
@@ -107,7 +108,7 @@ def test_after_an_opacity_reset_the_head_rests(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene")
     options = {"width": "8", "mask_start": "0", "min_mask_start": "5", "min_reset_pause": "20"}
     trainer = trainer_of(scene, tmp_path / "run", parts_of("wildgaussians", **options))
-    policy = trainer.parts.mask
+    policy = trainer.hooks.mask
     for _ in range(10):
         trainer.step()
     policy.on_opacity_reset(trainer.make_step(10, 0))

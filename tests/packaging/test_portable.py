@@ -60,7 +60,7 @@ def test_the_check_sees_a_module_that_needs_what_is_absent() -> None:
 
 
 def test_locks_and_peak_memory_work_without_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ambiguous_wild.harness import training as memory
+    from ambiguous_wild.harness import run_cost as memory
 
     monkeypatch.setitem(sys.modules, "resource", None)
     monkeypatch.setattr(memory, "_PROC", tmp_path / "absent")

@@ -11,6 +11,7 @@ from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 
 
 def camera(width=37, height=29, *, angle=0.3, fx=30.0, fy=33.0, cx=None, cy=None) -> Camera:
@@ -75,7 +76,7 @@ def trainer_for(scene, folder, *, parts=None, probe=None, change=None, **config)
 
 def trained(scene, folder, **kw) -> Trainer:
     trainer = trainer_for(scene, folder, **kw)
-    trainer.train()
+    train(trainer)
     return trainer
 
 

@@ -14,6 +14,7 @@ from ambiguous_wild.splat.losses import photometric, ssim_map
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.reference import photometric_reference, ssim_map_reference
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.splat.training_records import SAMPLED, Clock, GpuClock, clock_for
 from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, NonFinite
 from tests.host_reads import READ, moved, no_transfers
@@ -174,7 +175,7 @@ def test_a_rollback_leaves_the_photo_out_and_goes_on(scene, tmp_path, fake):
         on_nonfinite="rollback",
     )  # fmt: skip
     trainer.watchdog.every = 10
-    trainer.train()
+    train(trainer)
     assert trainer.iteration == 24
     assert [r["iteration"] for r in trainer.watchdog.rollbacks] == [9]
     assert all(bool(torch.isfinite(tensor).all()) for _, tensor in trainer.gaussians.items())
@@ -223,7 +224,7 @@ def test_a_run_of_an_accelerator_goes_on_on_the_cpu_and_back(scene, tmp_path, mo
     with fake_gsplat.installed(monkeypatch):
         back = trainer_for(scene, tmp_path / "run", iterations=30, probes=0)
         assert back.resume() and back.iteration == 20
-        back.train()
+        train(back)
         straight = trained(scene, tmp_path / "straight", iterations=30, probes=0)
         assert error_of(back) == pytest.approx(error_of(straight), rel=1e-3)
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ambiguous_wild.splat import checkpoint, training_records
-from ambiguous_wild.splat.training_records import DensityLog, Places
+from ambiguous_wild.splat.training_records import DensityLog, SampledPositions
 
 
 def numbered(start: int, count: int) -> torch.Tensor:
@@ -18,7 +18,7 @@ def numbered(start: int, count: int) -> torch.Tensor:
 def test_what_is_kept_is_every_so_many_th_of_all(sizes):
     most, training_records.MOST = training_records.MOST, 16
     try:
-        places = Places()
+        places = SampledPositions()
         for size in sizes:
             places.add(numbered(places.passed, size))
     finally:

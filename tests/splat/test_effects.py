@@ -20,6 +20,7 @@ from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import TrainData, ViewContext
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import bits, disturbed
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import gaussians as random_gaussians
@@ -35,14 +36,14 @@ def trainer_for(scene, folder, names=(), **config) -> Trainer:
 
 def test_a_run_without_effects_never_calls_one_and_has_the_same_bits(scene, tmp_path, monkeypatch):
     plain = trainer_for(scene, tmp_path / "plain")
-    plain.train()
+    train(plain)
     calls = []
     for cls in (Effect, AffineExposure, AppearanceEmbedding, SmoothingFilter, PoseRefinement, RowAdam):
         for name, value in list(vars(cls).items()):
             if callable(value):
                 monkeypatch.setattr(cls, name, lambda *a, _n=f"{cls.__name__}.{name}", **k: calls.append(_n))
     asked = trainer_for(scene, tmp_path / "asked", ())
-    asked.train()
+    train(asked)
     assert calls == []
     assert not asked.effects.effects and "effects" not in asked.clock.parts_s
     assert bits(asked) == bits(plain)
@@ -52,9 +53,9 @@ def test_a_run_without_effects_never_calls_one_and_has_the_same_bits(scene, tmp_
 
 def test_an_effect_that_does_nothing_leaves_the_bits_alone(scene, tmp_path):
     plain = trainer_for(scene, tmp_path / "plain")
-    plain.train()
+    train(plain)
     idle = trainer_of(scene, tmp_path / "idle", parts=MethodHooks(effects=(Effect(),)))
-    idle.train()
+    train(idle)
     assert bits(idle) == bits(plain)
 
 
@@ -122,14 +123,14 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
 @pytest.mark.parametrize("names", [ALL, ("sh1",), ("skybox", "dense", "near")], ids="+".join)
 def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
     whole = trainer_for(scene, tmp_path / "whole", names, iterations=20)
-    whole.train()
+    train(whole)
     first = trainer_for(scene, tmp_path / "parts", names, iterations=20)
     while first.iteration < 11:
         first.step()
     first.save()
     second = trainer_for(scene, tmp_path / "parts", names, iterations=20)
     assert second.resume()
-    second.train()
+    train(second)
     assert bits(second) == bits(whole)
     assert str(second.effects.state_dict()) == str(whole.effects.state_dict())
     assert all(np.isfinite(v) for facts in whole.effects.facts().values() for v in facts.values())
@@ -137,8 +138,8 @@ def test_a_resumed_run_equals_an_undisturbed_one(scene, tmp_path, names):
 
 def test_a_render_between_steps_changes_nothing(scene, tmp_path):
     plain, probed = (trainer_for(scene, tmp_path / n, ALL, iterations=20) for n in ("plain", "probed"))
-    plain.train()
-    probed.train(tick=lambda t: (t.picture(t.data.cameras[0]), t.make_step(t.iteration, 1)))
+    train(plain)
+    train(probed, tick=lambda t: (t.picture(t.data.cameras[0]), t.make_step(t.iteration, 1)))
     assert bits(probed) == bits(plain)
 
 

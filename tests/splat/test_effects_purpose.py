@@ -12,6 +12,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import ViewContext
+from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import bits, disturbed, trainer_for
 from tests.splat.scenes import camera as make_camera
 from tests.tiny_scene import write_tiny_scene
@@ -57,7 +58,7 @@ def test_colour_effects_explain_drifting_exposure(scene, tmp_path, name):
         for n in ("", name)
     }
     for run in runs.values():
-        run.train()
+        train(run)
     photos = runs[""].data.photos
     assert psnr_of(runs[name], photos) > psnr_of(runs[""], photos) + 3
     # a photo of unseen exposure, fitted on its left half, is explained on the right one
@@ -99,7 +100,7 @@ def test_poses_return_when_they_were_disturbed(scene, tmp_path):
         return float(np.std([t[0, 2] for t in turns]) + np.std([t[1, 2] for t in turns])) * truth[0].fx
 
     before = error(trainer.data.cameras)
-    trainer.train()
+    train(trainer)
     after = error([trainer.effects.camera(shot_of(i, c)) for i, c in enumerate(trainer.data.cameras)])
     assert after < 0.6 * before
 

@@ -16,6 +16,7 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from tests.tiny_scene import write_tiny_scene
 
 from .scenes import camera, cotangents, gaussians, given
@@ -108,9 +109,9 @@ def test_a_step_waits_for_nothing_but_the_tiles(scene, tmp_path, monkeypatch, me
     if method in ("robustsplat", "refinesplat"):
         # what is meant to run does: the net's steps, the masks that are made anew
         what = (
-            (trainer.parts.mask.optimiser, "step")
+            (trainer.hooks.mask.optimiser, "step")
             if method == "robustsplat"
-            else (trainer.parts.mask.masks, "renew")
+            else (trainer.hooks.mask.masks, "renew")
         )
         inner = getattr(*what)
 
@@ -133,7 +134,7 @@ def test_cpu_and_gpu_learn_the_same(scene, tmp_path, method):
     errors = {}
     for device in ("cpu", "cuda"):
         trainer = trainer_for(scene, tmp_path / device, method, torch.device(device), iterations=600)
-        trainer.train()
+        train(trainer)
         views = trainer.data.scene.test
         with torch.no_grad():
             images = [trainer.render(view.camera).image.cpu().numpy() for view in views]
@@ -151,13 +152,13 @@ def test_a_run_stops_on_the_gpu_and_goes_on_on_the_cpu(scene, tmp_path):
     trainer.save()
     again = trainer_for(scene, tmp_path, device=torch.device("cpu"), iterations=200)
     assert again.resume() and again.iteration == 100
-    again.train()
+    train(again)
 
 
 def test_parts_are_timed_and_add_up(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, iterations=400)
     begin = time.perf_counter()
-    trainer.train()
+    train(trainer)
     spent = time.perf_counter() - begin
     trainer.clock.settle()
     assert {"render", "loss", "backward", "optimiser"} <= trainer.clock.parts_s.keys()

@@ -17,6 +17,7 @@ from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.step import ViewContext
+from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import camera, gaussians
 from tests.splat.scenes import trainer_for as trainer_of
 
@@ -107,7 +108,7 @@ def trainer_for(scene, folder, effect):
 def test_a_photo_that_was_not_trained_on(scene, tmp_path):
     effect = Everything()
     trainer = trainer_for(scene, tmp_path, effect)
-    trainer.train()
+    train(trainer)
     seen = trainer.data.cameras[0]
     neutral = ViewContext(iteration=0, nominal=0, view=None, camera=seen)
     assert not effect._leaf(neutral)["tint"].any()

@@ -12,6 +12,7 @@ from ambiguous_wild.splat.effects import skybox, with_effects
 from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
+from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import trainer_for
 
 
@@ -92,7 +93,7 @@ def started(scene, tmp_path, monkeypatch):
 
 def test_density_control_takes_what_became_transparent(started):
     without, near_space = started("without", ()), started("near")
-    without.train()
-    near_space.train()
+    train(without)
+    train(near_space)
     assert near_space.effects.facts()["near"]["cameras"] > 0
     assert len(near_space.gaussians.means) < len(without.gaussians.means)

@@ -11,26 +11,27 @@ import torch
 
 from ambiguous_wild.splat.method_hooks import Schedule
 from ambiguous_wild.splat.pace import Pace, TrainConfig
-from ambiguous_wild.splat.run import Run
-from ambiguous_wild.splat.training_records import ROWS
+from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import advance, train
+from ambiguous_wild.splat.training_records import ROWS, Timeline
 
 COUNTS = (1, 3, 7, 8, 16)
 
 
-class Empty(Run):
+class Empty(Trainer):
     """A run whose steps learn nothing; its clock is set by the test."""
 
     gaussians = range(5)  # type: ignore[assignment]
-    optimiser = None  # type: ignore[assignment]
+    meter = marks = device_check = None  # type: ignore[assignment]
     step_s = 0.01
     between_s = 0.0  # pass after a step, before the clock is read again
 
     def __init__(self, config: TrainConfig, folder: Any) -> None:
         photo = torch.zeros(8, 8, 3)
-        scene = SimpleNamespace(train=[SimpleNamespace(name="a.png")], extent=1.0)
-        data = SimpleNamespace(scene=scene, device=torch.device("cpu"), photos=[photo])
-        super().__init__(data, config, folder, lambda draw: 20.0 + self.iteration)
-        self.sentinel = None
+        data = SimpleNamespace(scene=SimpleNamespace(extent=1.0), photos=[photo])
+        self.config, self.folder, self.iteration = config, folder, 0
+        self.probe = lambda draw: 20.0 + self.iteration
+        self.timeline = Timeline()
         self.pace = Pace(config, Schedule(), data, start=5, most=5)  # type: ignore[arg-type]
         self.clock = Steady(self)
 
@@ -38,9 +39,6 @@ class Empty(Run):
         self.iteration += 1
         self.clock.elapsed_s += self.step_s
         return 0.5
-
-    def render(self, camera: Any) -> Any:
-        raise AssertionError
 
     def check_parameters(self) -> None: ...
 
@@ -51,7 +49,7 @@ class Empty(Run):
     def load_state(self, state: dict[str, Any]) -> None:
         self.iteration, self.clock.elapsed_s = state["iteration"], state["elapsed_s"]
         self.timeline.rows = state["rows"]
-        self._marks = None
+        self.marks = None
 
     def probed(self) -> list[dict[str, Any]]:
         return [row for row in self.timeline.rows if row["psnr_probe"] is not None]
@@ -78,7 +76,7 @@ class Steady:
 @pytest.mark.parametrize("iterations", [1000, 3000])
 def test_iterations_have_the_probes_that_were_asked_for(tmp_path, probes, iterations):
     run = Empty(TrainConfig(iterations=iterations, probes=probes), tmp_path)
-    run.train()
+    train(run)
     at = [row["iteration"] for row in run.probed()]
     assert at == [-(-k * iterations // probes) for k in range(1, probes + 1)]
     assert sum(row["iteration"] * ROWS % iterations < ROWS for row in run.timeline.rows) == ROWS
@@ -89,7 +87,7 @@ def test_iterations_have_the_probes_that_were_asked_for(tmp_path, probes, iterat
 def test_a_budget_has_the_probes_that_were_asked_for(tmp_path, probes, between_s):
     run = Empty(TrainConfig(budget_s=10.0, probes=probes), tmp_path)
     run.between_s = between_s
-    run.train()
+    train(run)
     at = np.array([row["wall_s"] for row in run.probed()])
     assert len(at) == probes
     np.testing.assert_allclose(
@@ -102,14 +100,14 @@ def test_a_budget_has_the_probes_that_were_asked_for(tmp_path, probes, between_s
 def test_a_run_that_goes_on_has_no_probe_twice_and_none_too_few(tmp_path, budget_s):
     config = TrainConfig(iterations=1000, budget_s=budget_s, probes=7)
     whole = Empty(config, tmp_path)
-    whole.train()
+    train(whole)
     state: dict[str, Any] | None = None
     for stop in (1, 142, 143, 144, 500, 999, 1001):
         run = Empty(config, tmp_path)
         if state is not None:
             run.load_state(state)
         while run.iteration < stop and not run.done:
-            run._advance(None)
+            advance(run)
         state = run.state()
     assert run.done
     assert [r["iteration"] for r in run.probed()] == [r["iteration"] for r in whole.probed()]
@@ -117,5 +115,5 @@ def test_a_run_that_goes_on_has_no_probe_twice_and_none_too_few(tmp_path, budget
 
 def test_steps_longer_than_the_distance_of_probes_have_one_each(tmp_path):
     run = Empty(TrainConfig(iterations=5, probes=16), tmp_path)
-    run.train()
+    train(run)
     assert [row["iteration"] for row in run.probed()] == [1, 2, 3, 4, 5]

@@ -19,6 +19,7 @@ from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 from tests.tiny_scene import write_tiny_scene
 
 MANY = 1_000_000
@@ -117,7 +118,7 @@ def test_pup_removes_its_share_of_those_that_are_no_skybox(data, tmp_path):
     config = replace(parts.density_config, stop=0.0, prune_at=0.0, rounds=1, share=0.5)
     trainer = trainer_for(data, tmp_path, replace(parts, density_config=config), iterations=20)
     first, others = far_rows(trainer), len(trainer.gaussians) - far_rows(trainer)
-    trainer.train()
+    train(trainer)
     assert far_rows(trainer) == first
     assert len(trainer.gaussians) - first == pytest.approx(others / 2, abs=2)
 
@@ -146,7 +147,7 @@ def test_pruning_never_leaves_the_skybox_alone(data, tmp_path):
     parts = method.build(method.options())
     config = replace(parts.density_config, stop=0.0, prune_at=0.0, between=1.0, rounds=3, share=0.999)
     trainer = trainer_for(data, tmp_path / "pup", replace(parts, density_config=config), iterations=20)
-    trainer.train()
+    train(trainer)
     assert len(trainer.gaussians) > far_rows(trainer) > 0
 
 
@@ -182,7 +183,7 @@ def test_density_control_neither_copies_nor_removes_it(data, tmp_path):
     trainer = trainer_for(data, tmp_path, parts)
     first, near = far_rows(trainer), len(trainer.gaussians) - far_rows(trainer)
     assert first == trainer.effects.facts()["skybox"]["points"] > 0
-    trainer.train()
+    train(trainer)
     assert far_rows(trainer) == first
     assert len(trainer.gaussians) - first != near  # the others changed
 
@@ -195,6 +196,6 @@ def test_every_kind_of_density_control_leaves_it_alone(data, tmp_path, name):
     parts = replace(parts, density_config=replace(parts.density_config, **eager))
     trainer = trainer_for(data, tmp_path, parts, iterations=120)
     first, most = far_rows(trainer), len(trainer.gaussians)
-    trainer.train()
+    train(trainer)
     assert far_rows(trainer) == first > 0
     assert len(trainer.gaussians) != most  # it did act

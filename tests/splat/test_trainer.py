@@ -22,8 +22,9 @@ from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, divisor_at
+from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, factor_at
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
 
@@ -76,12 +77,13 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
+from ambiguous_wild.splat.training_loop import train
 scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
 data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
 config = TrainConfig(iterations=400, checkpoint_every_s=0.05, probes=0)
 trainer = Trainer(data, MethodHooks(), config, folder=folder)
 trainer.resume()
-trainer.train()
+train(trainer)
 """
 
 
@@ -135,7 +137,7 @@ class FakeTime:
 @pytest.fixture
 def fake_time(monkeypatch):
     clock = FakeTime()
-    for module in ("run", "training_records"):
+    for module in ("training_loop", "training_records"):
         monkeypatch.setattr(f"ambiguous_wild.splat.{module}.time", clock)
     return clock
 
@@ -194,7 +196,7 @@ class _AllMasked(MaskPolicy):
 def test_photos_that_are_all_masked_teach_nothing_and_are_named(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, parts=MethodHooks(mask=_AllMasked()), iterations=12)
     before = bits(trainer)
-    trainer.train()
+    train(trainer)
     assert bits(trainer) == before
     assert trainer.skipped_views == [v.name for v in scene.train]
 
@@ -243,6 +245,14 @@ def test_what_a_policy_must_not_do_is_refused(scene, tmp_path, place, fault, mes
     setattr(mask, place, fault)
     with pytest.raises(AwError, match=message):
         trainer_for(scene, tmp_path, parts=MethodHooks(mask=mask)).step()
+
+
+def test_an_old_name_says_the_new_one(scene, tmp_path):
+    trainer = trainer_for(scene, tmp_path)
+    with pytest.raises(AwError, match=r"trainer\.hooks"):
+        _ = trainer.parts
+    with pytest.raises(AwError, match=r"step\.downsampling"):
+        _ = trainer.make_step(1, 0).divisor
 
 
 def test_a_method_gets_no_test_photo(scene, tmp_path):
@@ -314,12 +324,12 @@ def test_coarse_to_fine_follows_the_photos_spectrum():
     noise = rng.random((400, 400, 3))
     smooth = np.cumsum(np.cumsum(noise - 0.5, 0), 1)
     rough_levels, smooth_levels = coarse_to_fine([noise]), coarse_to_fine([smooth])
-    assert [level.divisor for level in rough_levels] == [4, 2, 1]
+    assert [level.factor for level in rough_levels] == [4, 2, 1]
     assert all(0 <= a.begin < b.begin <= 0.4 for a, b in pairwise(rough_levels))
-    assert [level.divisor for level in smooth_levels] == [4, 2, 1]
+    assert [level.factor for level in smooth_levels] == [4, 2, 1]
     assert coarse_to_fine([np.full((400, 400, 3), 0.5)]) == (Level(0.0, 1),)
     assert coarse_to_fine([noise[:80, :80]]) == (Level(0.0, 1),)
-    assert [divisor_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
+    assert [factor_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
 
 
 def test_the_count_ceiling_rises_with_the_resolution():

@@ -11,6 +11,7 @@ from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MOST_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.splat.test_trainer import parts_of
@@ -40,7 +41,7 @@ def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     with pytest.raises(
         NonFinite, match=rf"gradient of .*means.* iteration 17, view {view}.*--replay"
     ) as info:
-        trainer.train()
+        train(trainer)
     assert trainer.iteration == 16
     assert all(bool(torch.isfinite(t).all()) for _, t in trainer.gaussians.items())
     finding = info.value.finding
@@ -65,7 +66,7 @@ def test_a_parameter_is_found_and_never_saved(scene, tmp_path, name):
             getattr(trainer.gaussians, name)[5].fill_(math.inf)
 
     with pytest.raises(NonFinite, match=f"parameter of {name} in 1 Gaussians") as info:
-        trainer.train(tick=spoil)
+        train(trainer, tick=spoil)
     finding = info.value.finding
     assert finding.rows == (5,)
     assert finding.since <= 13 <= finding.iteration
@@ -77,18 +78,18 @@ def test_a_loss_is_named(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, iterations=20)
     trainer.data.photos[2][4, 4] = math.nan
     with pytest.raises(NonFinite, match=r"loss is not finite at iteration \d, view train_2\.png"):
-        trainer.train()
+        train(trainer)
 
 
 def test_a_rollback_goes_on_as_if_the_photo_had_been_left_out(scene, tmp_path):
     trainer = poisoned(
         scene, tmp_path / "a", Poison([17, 40]), on_nonfinite="rollback", checkpoint_every_s=1e9
     )
-    trainer.train()
+    train(trainer)
     other = poisoned(scene, tmp_path / "b", Poison())
     left_out = {(other.pace.epoch(i), other.pace.view(i)) for i in (17, 40)}
     other.watchdog.skips = lambda epoch, view: (epoch, view) in left_out
-    other.train()
+    train(other)
     assert bits(trainer) == bits(other)
     facts = trainer.watchdog.facts()["rollbacks"]
     assert [row["iteration"] for row in facts] == [17, 40]
@@ -103,7 +104,7 @@ def test_a_rollback_goes_on_as_if_the_photo_had_been_left_out(scene, tmp_path):
 def test_a_photo_that_never_works_ends_the_run(scene, tmp_path):
     trainer = poisoned(scene, tmp_path, Poison(view=3), on_nonfinite="rollback")
     with pytest.raises(NonFinite, match=f"after {MOST_ROLLBACKS} rollbacks"):
-        trainer.train()
+        train(trainer)
 
 
 @pytest.mark.parametrize("method", ["3dgs", "refinesplat"])

@@ -20,6 +20,7 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.harness import evaluate
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
+from ambiguous_wild.splat import training_loop
 from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
@@ -164,7 +165,7 @@ def train(method: str, scene_root: Path, folder: Path) -> list[dict[str, Any]]:
             )
 
     trainer = Trainer(data, entry.build(entry.options()), config, folder=folder, probe=probe)
-    trainer.train(tick=look)
+    training_loop.train(trainer, tick=look)
     return [row | seen for row, seen in zip(trainer.timeline.rows, looks, strict=True)]
 
 

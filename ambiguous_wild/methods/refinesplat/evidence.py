@@ -16,6 +16,7 @@ from ambiguous_wild.methods.refinesplat.maps import spread_of
 from ambiguous_wild.methods.refinesplat.structure import box
 from ambiguous_wild.methods.refinesplat.threshold import Statistic, contrast, entropy, surprise
 
+_EPS_SHARE = 0.1
 _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 
 
@@ -100,14 +101,14 @@ def calibrated_cosine(distance: Tensor, normal: float) -> Tensor:
     return 1.0 - (distance / normal).clamp(0.0, 2.0)
 
 
-def ratio(u: Tensor, h: Tensor, eps_share: float = 0.1, perturbation: float | None = None) -> Tensor:
-    """Return R = U / max(H, eps) with eps = `eps_share` of H's own mean, so that no H = 0 dominates var(R).
+def ratio(u: Tensor, h: Tensor, perturbation: float | None = None) -> Tensor:
+    """Return R = U / max(H, eps) with eps = `_EPS_SHARE` of H's own mean, so that no H = 0 dominates var(R).
 
     With a `perturbation` (printed, but without its value) R = U / (H + perturbation).
     """
     if perturbation is not None:
         return u / (h + perturbation)
-    return u / torch.maximum(h, (eps_share * h.mean()).clamp(min=1e-6))
+    return u / torch.maximum(h, (_EPS_SHARE * h.mean()).clamp(min=1e-6))
 
 
 def global_mask(

@@ -4,43 +4,37 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
-from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.masks import MaskStore, enlarge
-from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.splat.step import Step
 from ambiguous_wild.vision.motion_maps import POINTS, draw_points
 
 
-class Policy(Protocol):
-    """What pictures need of `RefineSplatMask`."""
-
-    config: RefineSplatConfig
-    data: TrainData
-    inputs: FrozenInputs
-    points: dict[str, MotionPoints]
-    masks: MaskStore
-
-
-def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.ndarray]:
+def panels(
+    store: MaskStore,
+    step: Step,
+    photo: np.ndarray,  # [H, W, 3] uint8
+    labels: np.ndarray,  # [H, W] int32, its instances
+    points: MotionPoints | None = None,  # its moving and static features
+    *,
+    begun: bool = True,
+) -> dict[str, np.ndarray]:
     """Return pictures of the evidence, instances by their statistic, and all masks; [H, W, 3] uint8 each.
 
     The evidence is the statistic of pixels, or the entropy where the method computes it.
 
     Args:
-        policy: the policy, which learns nothing here.
+        store: the masks of all views; nothing is learnt here.
         step: step of a train view at the photo's own size.
+        photo, labels, points: what is known of its photo.
         begun: whether masks are used at this step.
     """
-    maps, masks = policy.masks.examine(step)
-    labels = policy.inputs.labels[step.view]
-    photo = (policy.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
+    maps, masks = store.examine(step)
     grey = faded(photo)
     local, global_, final, means = (
         t.cpu().numpy() for t in (masks.local, masks.global_, masks.keep < 0.5, masks.means)
@@ -53,7 +47,6 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
     evidence = enlarge(shown, labels.shape[0], labels.shape[1]).cpu().numpy()
     name, most = ("evidence", top) if maps.entropy is None else ("entropy", 1.0)
     used = "" if begun else ", not used yet"
-    points = policy.points.get(policy.data.scene.train[step.view].name)
     return {
         **({} if points is None else {POINTS: draw_points(photo, points)}),
         f"{name}, mean {evidence.mean():.2f}": ramp(evidence, 0.0, most),
@@ -64,17 +57,16 @@ def panels(policy: Policy, step: Step, *, begun: bool = True) -> dict[str, np.nd
     }
 
 
-def explain(policy: Policy, step: Step, x: int, y: int) -> list[str]:
+def explain(store: MaskStore, step: Step, x: int, y: int) -> list[str]:
     """Return what decided about a pixel of the photo, in the order in which it is asked."""
-    maps, masks = policy.masks.examine(step)
-    view, config = step.view, policy.config.mask
-    store = policy.masks
+    maps, masks = store.examine(step)
+    view, config = step.view, store.config.mask
     shape = store.labels.shapes[view]
     structure, seen = config.statistic == "structure", store.pixels.seen[view]
     static = store.labels.static.get(view)
     if structure and seen is not None and not bool(seen[y, x]):
         return ["too few other photos see this surface: never masked"]
-    if view in store.within and not bool(store.within[view][y, x]):
+    if view in store.maskable and not bool(store.maskable[view][y, x]):
         return ["first look at the photos before training: a crowd, but not this pixel; never masked"]
     own = float(enlarge(maps.statistic, *shape)[y, x])
     what = "difference in structure, in units of what noise causes" if structure else config.statistic
@@ -122,9 +114,9 @@ def _outlined(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return image
 
 
-def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
+def draw_entropies(store: MaskStore, folder: Path) -> list[Path]:
     """Write entropies.png: the last statistics of all photos' instances, and their thresholds."""
-    judged, shares = policy.masks.judged, policy.masks.shares
+    judged, shares = store.judged, store.shares
     views = [v for v in sorted(judged) if v in shares and len(judged[v].values)]
     if not views:
         return []
@@ -150,7 +142,7 @@ def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
     left.set_ylabel("instances")
     size = 4 + 60 * np.sqrt(areas / max(float(areas.max()), 1.0))
     # `structure` is itself a distance of photo and render, so its other axis is the area of the instance
-    features = policy.config.mask.statistic != "structure"
+    features = store.config.mask.statistic != "structure"
     beside = distances if features else areas
     for chosen, colour in ((~above, kept), (above, masked)):
         right.scatter(clipped[chosen], beside[chosen], size[chosen], color=colour, alpha=0.5, lw=0)
@@ -164,10 +156,10 @@ def draw_entropies(policy: Policy, folder: Path) -> list[Path]:
         if len(finite):
             label = f"T_ent, median {np.median(finite):.2f} ({len(finite)} of {len(views)} photos)"
             axes.axvline(float(np.median(finite)), color="k", lw=1.5, label=label)
-        axes.set_xlabel(f"mean {policy.config.mask.statistic} of an instance (at the end: and above)")
+        axes.set_xlabel(f"mean {store.config.mask.statistic} of an instance (at the end: and above)")
         axes.set_xlim(0, end)
     left.legend(fontsize=8, loc="upper right")
-    left.set_title(f"{len(values)} instances of {len(views)} photos, w2 = {policy.masks.w2:.2f}", fontsize=10)
+    left.set_title(f"{len(values)} instances of {len(views)} photos, w2 = {store.w2:.2f}", fontsize=10)
     what = "photo against render" if features else "what stands out, and how large it is"
     right.set_title(f"{what}: each instance, its size by its area", fontsize=10)
     path = folder / "entropies.png"

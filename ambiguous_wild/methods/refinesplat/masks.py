@@ -1,6 +1,7 @@
 """Local, global and final masks of one photo (RefineSplat, Eqs. 3-7), and the masks of all photos.
 
-Masks are bool, True = transient; keep = 1 - M_final. Statistics are in float64. Code that `renew` calls reads
+M_local, M_global and M_final are bool, True on distractors, as in the paper; outside of this package masks
+are keep maps, 1 - M_final. Statistics are in float64. Code that `renew` calls reads
 no value on the host, so shapes and the number of launches depend on sizes alone; set-up, checkpoints and
 pictures read values.
 """
@@ -16,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_by
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
@@ -27,7 +27,7 @@ from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshol
 from ambiguous_wild.splat.backend import backend_of
 
 if TYPE_CHECKING:
-    from ambiguous_wild.splat.step import Step
+    from ambiguous_wild.splat.step import Step, TrainData
 
 PRICE = 3.0  # cost of a masked pixel, in MADs above the median distance, if `disagree` is off
 
@@ -36,8 +36,8 @@ PRICE = 3.0  # cost of a masked pixel, in MADs above the median distance, if `di
 class PhotoMasks:
     """Masks of one photo, and the statistics that they were made from."""
 
-    local: Tensor  # [H, W] bool
-    global_: Tensor  # [H, W] bool
+    local: Tensor  # [H, W] bool, M_local
+    global_: Tensor  # [H, W] bool, M_global
     keep: Tensor  # [H, W] float32, 1 - M_final, bounded
     means: Tensor  # [K] float64, mean statistic of every instance, NaN for missing ones
     distances: Tensor  # [K] float64, mean distance in units
@@ -139,7 +139,7 @@ def make_masks(
     w2: Tensor | float,
     config: MaskConfig,
     ceiling: Tensor | None = None,
-    seen: Tensor | None = None,
+    maskable: Tensor | None = None,
 ) -> PhotoMasks:
     """Make M_local, M_global and the keep map of one photo (Eqs. 3-7).
 
@@ -152,7 +152,7 @@ def make_masks(
         w2: weight of T_ent's lower subset.
         config: thresholds.
         ceiling: upper limit of the threshold, 0-d; None: no limit.
-        seen: pixels that may be masked, [H, W] bool; None: all.
+        maskable: pixels that may be masked, [H, W] bool; None: all.
     """
     height, width = shape = labels.shapes[view]
     pixels = enlarge(maps.statistic, height, width)
@@ -193,11 +193,11 @@ def make_masks(
     if static is not None:
         # no mask contains static instances
         final, global_ = final & ~static, global_ & ~static
-    if seen is not None:
-        final = final & seen
+    if maskable is not None:
+        final = final & maskable
     final = grown(final, config, judging)
-    if seen is not None:
-        final = final & seen
+    if maskable is not None:
+        final = final & maskable
     return PhotoMasks(local, global_, (~final).float(), means, distances, cut, pool)
 
 
@@ -213,16 +213,15 @@ class MaskStore:
     def __init__(
         self,
         config: RefineSplatConfig,
-        photos: Sequence[Tensor],  # [H, W, 3] float32 in [0, 1] on `device`
-        cameras: Sequence[Camera],
+        data: TrainData,
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points
         looks: Mapping[int, InitialMaskPrior],
         labels: Sequence[np.ndarray],  # [H, W] int32 instances, 0 = none
         static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
-        device: torch.device | str,
         compare: Callable[[Step], Maps],  # on the feature grid; called only if the statistic needs it
     ) -> None:
         self.config, self.compare = config, compare
+        photos, cameras, device = data.photos, data.cameras, data.device
         self.pixels = PixelEvidence(photos, cameras, surfaces, config.mask, device)
         structure = config.mask.statistic == "structure"
         # features are judged on their whole grid
@@ -233,8 +232,8 @@ class MaskStore:
         self.factors = {
             view: sized(look.factor(sizes[view]), device) for view, look in looks.items() if look.weight != 1
         }
-        # view -> pixels outside of which nothing is masked, [H, W] bool; absent if there is no such limit
-        self.within = {
+        # view -> pixels that may be masked, [H, W] bool; absent if all may
+        self.maskable = {
             view: torch.from_numpy(~keep).to(device)
             for view, look in looks.items()
             if look.within and (keep := look.keep(sizes[view])) is not None
@@ -285,7 +284,7 @@ class MaskStore:
         """
         view, rendered = step.view, step.rendered
         mask = self.limited.get(view, self.config.mask)
-        ceiling = seen = None
+        ceiling = maskable = None
         if mask.statistic == "structure":
             image, alpha, depth = (t.detach() for t in (rendered.image, rendered.alpha, rendered.depth))
             evidence, unit = self.pixels.look(view, image, alpha, depth, remember=remember)
@@ -294,14 +293,15 @@ class MaskStore:
             if mask.entropy_weight > 0:
                 evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
             maps = Maps(evidence, evidence)
-            seen, ceiling = self.pixels.seen[view], self.pixels.ceiling(unit)
+            maskable, ceiling = self.pixels.seen[view], self.pixels.ceiling(unit)
         else:
             maps = self.compare(step)
-        if view in self.within:
-            seen = self.within[view] if seen is None else seen & self.within[view]
+        if view in self.maskable:
+            crowd = self.maskable[view]
+            maskable = crowd if maskable is None else maskable & crowd
         w2 = torch.sigmoid(self.theta) if mask.w2 is None else mask.w2
         others = self.means, self.distances
-        return maps, make_masks(view, maps, self.labels, others, w2, mask, ceiling, seen)
+        return maps, make_masks(view, maps, self.labels, others, w2, mask, ceiling, maskable)
 
     @property
     def w2(self) -> float:

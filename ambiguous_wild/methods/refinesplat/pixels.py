@@ -109,22 +109,22 @@ def dilate(mask: Tensor, size: int) -> Tensor:
     return F.max_pool2d(mask[None].float(), size, 1, size // 2)[0] > 0.5
 
 
-def grown(transient: Tensor, config: MaskConfig, evidence: Tensor) -> Tensor:
+def grown(masked: Tensor, config: MaskConfig, evidence: Tensor) -> Tensor:
     """Make M_final [H, W] bool: limit the mask's size, fill its gaps, dilate it.
 
     If the mask is too large, its surest pixels stay. Their gaps are filled too, because a mask with specks
     lets a distractor through; then the mask may be a quarter larger (`GAPS`).
 
     Args:
-        transient: pixels above the threshold, [H, W] bool.
+        masked: pixels above the threshold, [H, W] bool.
         config: `most`, the largest share of the photo that is masked; `fill`, `dilation`.
         evidence: [H, W], larger = surer.
     """
-    size = transient.numel()
-    surest = torch.where(transient, evidence, -torch.inf).flatten()
+    size = masked.numel()
+    surest = torch.where(masked, evidence, -torch.inf).flatten()
     cut = surest.kthvalue(size + 1 - max(int(config.most * size), 1)).values
-    too_many = transient.sum() > config.most * size
-    chosen = transient & ((evidence > cut) | ~too_many)
+    too_many = masked.sum() > config.most * size
+    chosen = masked & ((evidence > cut) | ~too_many)
     larger = dilate(fill_holes(chosen, config.fill), config.dilation)
     return torch.where(too_many & (larger.sum() > GAPS * config.most * size), chosen, larger)
 
@@ -159,7 +159,7 @@ class PixelEvidence:
                 seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(cameras), cameras
             )
         ]
-        # [H, W] bool of each view: pixels that may be masked; None: all
+        # [H, W] bool of each view: pixels that enough other photos see; None: all
         self.seen = [
             None if unseen is None else torch.from_numpy(~unseen).to(device) for unseen in self.unseen_on_host
         ]

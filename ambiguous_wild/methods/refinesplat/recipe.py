@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, resized
 from ambiguous_wild.methods.refinesplat import mask_pictures
@@ -138,10 +139,8 @@ class RefineSplatMask(PausingMask):
             photos = (photo.cpu().numpy() for photo in data.photos)  # one at a time: all may not fit
             looks = first_look(data.cameras, photos, surfaces, config.first_look, moving)
             self.looks = {view: look for view, look in enumerate(looks) if look is not None}
-        self.masks = MaskStore(
-            config, data.photos, data.cameras, surfaces, self.looks, self.inputs.labels, self.inputs.static,
-            data.device, self.compare,
-        )  # fmt: skip
+        labels, static = self.inputs.labels, self.inputs.static
+        self.masks = MaskStore(config, data, surfaces, self.looks, labels, static, self.compare)
         # view -> its keep map before masks begin, [H, W] float32; absent if everything is kept
         self.first = {
             view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
@@ -164,7 +163,7 @@ class RefineSplatMask(PausingMask):
     def keep(self, step: Step) -> Tensor | None:
         if not self.begun(step):
             first = self.first.get(step.view)
-            return None if first is None else shrink_keep(first, step.divisor)
+            return None if first is None else shrink_keep(first, step.downsampling)
         visit = self.visits.get(step.view, 0)
         due = step.view not in self.masks.keeps or visit % self.config.mask_every == 0
         if due and not self.paused(step):
@@ -173,7 +172,7 @@ class RefineSplatMask(PausingMask):
         keep = self.masks.keeps.get(step.view)
         if keep is not None and self.config.factor == "transient":
             keep = 1.0 - keep
-        return None if keep is None else shrink_keep(keep, step.divisor)
+        return None if keep is None else shrink_keep(keep, step.downsampling)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
         """Return d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""
@@ -206,7 +205,7 @@ class RefineSplatMask(PausingMask):
     def predict(self, step: Step) -> Tensor | None:
         if not self.begun(step):
             return None
-        return shrink_keep(self.masks.examine(step)[1].keep, step.divisor)
+        return shrink_keep(self.masks.examine(step)[1].keep, step.downsampling)
 
     def facts(self) -> Facts:
         shares = self.masks.shares
@@ -249,7 +248,7 @@ class RefineSplatMask(PausingMask):
         flat = logits.reshape(-1, channels)
         # without weights the capture's own masks still apply
         own = self.data.user_keep[step.view]
-        everywhere = _cells(None if own is None else shrink_keep(own, step.divisor), h, w, image)
+        everywhere = _cells(None if own is None else shrink_keep(own, step.downsampling), h, w, image)
         kept = _cells(keep, h, w, image)
         variant = config.mask.variant
         loss = (flat * 0.0).sum()
@@ -265,28 +264,31 @@ class RefineSplatMask(PausingMask):
         return loss
 
     def panels(self, step: Step) -> dict[str, np.ndarray]:
-        return mask_pictures.panels(self, step, begun=self.begun(step))
+        photo = (self.data.photos[step.view].cpu().numpy() * 255 + 0.5).astype(np.uint8)
+        labels = self.inputs.labels[step.view]
+        points = self.points.get(self.data.scene.train[step.view].name)
+        return mask_pictures.panels(self.masks, step, photo, labels, points, begun=self.begun(step))
 
     def explain(self, step: Step, x: int, y: int) -> list[str]:
-        return mask_pictures.explain(self, step, x, y)
+        return mask_pictures.explain(self.masks, step, x, y)
 
     def draw(self, folder: Path) -> list[Path]:
-        return mask_pictures.draw_entropies(self, folder)
+        return mask_pictures.draw_entropies(self.masks, folder)
 
     def state_dict(self) -> State:
         psi = self.inputs.semantics.psi if self.inputs.has_semantics else None
         return {
+            **super().state_dict(),
             **self.masks.state_dict(),
             "visits": {str(view): count for view, count in self.visits.items()},
-            "last_reset": self.last_reset,
             # saved, because the last bits of psi's training may differ on another machine
             "psi": None if psi is None else dict(psi.state_dict()),
         }
 
     def load_state_dict(self, state: State) -> None:
+        super().load_state_dict(state)
         self.masks.load_state_dict(state)
         self.visits = {int(v): int(count) for v, count in state["visits"].items()}
-        self.last_reset = int(state["last_reset"])
         if state["psi"] is not None and self.inputs.semantics.psi is not None:
             self.inputs.semantics.psi.load_state_dict(state["psi"])
 
@@ -295,7 +297,7 @@ def _cells(keep: Tensor | None, h: int, w: int, like: Tensor) -> Tensor:
     """Return weights [h * w] of cells under a keep map [H, W]: the least value in each cell."""
     if keep is None:
         return torch.ones(h * w, device=like.device)
-    return -F.adaptive_max_pool2d(-keep[None, None], (h, w)).reshape(-1)
+    return smaller_keep(keep, (h, w), "any masked").reshape(-1)
 
 
 def _instances(config: RefineSplatConfig) -> Instances:

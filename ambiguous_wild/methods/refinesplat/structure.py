@@ -64,14 +64,14 @@ def unrelated_residual(photos: Sequence[Tensor], base: float = 0.3) -> float:
     return float(np.median(values)) if values else 0.0
 
 
-def correlation(a: Tensor, b: Tensor, size: int = STRUCTURE_BOX) -> Tensor:
+def correlation(a: Tensor, b: Tensor) -> Tensor:
     """Return the normalised cross-correlation of grey images [H, W] float32 over boxes, in [-1, 1].
 
     It is 1 where both are plain, and near 0 where only one is: a plain coat in front of a textured wall
     shares no structure with it.
     """
     # variances are small differences of these means
-    mean_a, mean_b, aa, bb, ab = box(torch.stack([a, b, a * a, b * b, a * b]), size)
+    mean_a, mean_b, aa, bb, ab = box(torch.stack([a, b, a * a, b * b, a * b]), STRUCTURE_BOX)
     var_a, var_b = (aa - mean_a * mean_a).clamp_(min=0.0), (bb - mean_b * mean_b).clamp_(min=0.0)
     common = (ab - mean_a * mean_b).add_(NOISE)
     return common.div_((var_a.add_(NOISE) * var_b.add_(NOISE)).sqrt_()).clamp_(-1.0, 1.0)

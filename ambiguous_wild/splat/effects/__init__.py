@@ -1,4 +1,4 @@
-"""Optional effects of the trainer, by name. Effects that are not requested are not imported or built.
+"""What --effects switches: effects, initialisations and the SH degree, by name, built only where requested.
 
 This module imports no torch: names are checked before anything heavy is loaded.
 """
@@ -16,21 +16,22 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.effects.base import Effect
     from ambiguous_wild.splat.method_hooks import MethodHooks
 
-# name -> (module, class, what it is for), in the order in which they act on a render
-EFFECTS: dict[str, tuple[str, str, str]] = {
-    "exposure": ("colour", "AffineExposure", "an affine change of colour per photo"),
-    "appearance": ("colour", "AppearanceEmbedding", "light that changes by photo and place"),
-    "antialias": ("smoothing", "SmoothingFilter", "Mip-Splatting's filters, for photos from near and far"),
-    "poses": ("poses", "PoseRefinement", "a small correction of every camera's pose"),
-    "skybox": ("skybox", "Skybox", "first Gaussians on a far sphere too, for what lies behind the scene"),
-    "dense": ("dense", "DenseStart", "first Gaussians on dense points too, for few photos"),
-    "near": ("skybox", "NearSpace", "no Gaussians close in front of a camera"),
-    "sh0": ("", "", "colours that do not depend on the direction"),
-    "sh1": ("", "", "spherical harmonics up to degree 1"),
-    "sh2": ("", "", "spherical harmonics up to degree 2"),
-}  # fmt: skip
-ALL = ("exposure", "appearance", "antialias", "poses")
-DEGREES = {"sh0": 0, "sh1": 1, "sh2": 2}
+# name -> (module, class), in the order in which they act on a render
+EFFECTS = {
+    "exposure": ("colour", "AffineExposure"),  # an affine change of colour per photo
+    "appearance": ("colour", "AppearanceEmbedding"),  # light that changes by photo and place
+    "antialias": ("smoothing", "SmoothingFilter"),  # Mip-Splatting's filters, for photos from near and far
+    "poses": ("poses", "PoseRefinement"),  # a small correction of every camera's pose
+}
+ALL = tuple(EFFECTS)
+# the same of what changes no picture: first Gaussians, and where there are none
+INITIALISATIONS = {
+    "skybox": ("skybox", "Skybox"),  # on a far sphere too, for what lies behind the scene
+    "dense": ("dense", "DenseStart"),  # on dense points too, for few photos
+    "near": ("skybox", "NearSpace"),  # none close in front of a camera
+}
+SH_DEGREES = {"sh0": 0, "sh1": 1, "sh2": 2}  # highest degree of the harmonics; 0: equal in all directions
+NAMES = (*EFFECTS, *INITIALISATIONS, *SH_DEGREES)  # all that --effects takes
 
 
 def check_effects(names: Iterable[str]) -> tuple[str, ...]:
@@ -41,28 +42,28 @@ def check_effects(names: Iterable[str]) -> tuple[str, ...]:
     """
     wanted = list(names)
     for name in wanted:
-        if name not in EFFECTS:
-            raise unknown("effect", name, EFFECTS)
-    degrees = sorted(set(wanted) & DEGREES.keys())
+        if name not in NAMES:
+            raise unknown("effect", name, NAMES)
+    degrees = sorted(set(wanted) & SH_DEGREES.keys())
     if len(degrees) > 1:
         raise AwError(f"effects {' and '.join(degrees)} exclude each other: name one degree")
-    return tuple(name for name in EFFECTS if name in wanted)
+    return tuple(name for name in NAMES if name in wanted)
 
 
-def with_effects(parts: MethodHooks, names: Sequence[str]) -> MethodHooks:
-    """Add effects to a method's parts; without effects returns the same object."""
+def with_effects(hooks: MethodHooks, names: Sequence[str]) -> MethodHooks:
+    """Add what is named to a method's hooks; without names returns the same object."""
     if not names:
-        return parts
+        return hooks
     built: list[Effect] = []
-    present = {effect.name for effect in parts.effects}  # effects of the method are not added twice
+    present = {effect.name for effect in hooks.effects}  # effects of the method are not added twice
     for name in check_effects(names):
         if name in present:
             continue
-        if name in DEGREES:
-            parts = dataclasses.replace(parts, sh_degree=min(parts.sh_degree, DEGREES[name]))
+        if name in SH_DEGREES:
+            hooks = dataclasses.replace(hooks, sh_degree=min(hooks.sh_degree, SH_DEGREES[name]))
             continue
-        module, cls, _ = EFFECTS[name]
+        module, cls = (EFFECTS | INITIALISATIONS)[name]
         effect = getattr(importlib.import_module(f"{__name__}.{module}"), cls)()
-        parts = parts.suited_to(effect)
+        hooks = hooks.suited_to(effect)
         built.append(effect)
-    return dataclasses.replace(parts, effects=(*parts.effects, *built))
+    return dataclasses.replace(hooks, effects=(*hooks.effects, *built))

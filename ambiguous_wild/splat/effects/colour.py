@@ -38,6 +38,9 @@ from ambiguous_wild.splat.step import TrainData, ViewContext
 
 EXPOSURE_RATE, EXPOSURE_RATE_FINAL = 0.01, 0.001  # 3DGS's exposure_lr
 EXPOSURE_FIT_RATE = 0.02
+SIZE, HIDDEN, OCTAVES = 4, 32, 4  # sizes of the embedding, of the net, of the Fourier features
+RATE_ROWS, RATE_NET, FINAL = 0.02, 2e-3, 0.1  # two learning rates, and the share that both decay to
+EMBEDDING_FIT_RATE = 0.1  # WildGaussians
 
 
 class AffineExposure(Effect):
@@ -113,11 +116,6 @@ class AffineExposure(Effect):
 
     def load_state_dict(self, state: State) -> None:
         self.adam.load_state_dict(state)
-
-
-SIZE, HIDDEN, OCTAVES = 4, 32, 4  # sizes of the embedding, of the net, of the Fourier features
-RATE_ROWS, RATE_NET, FINAL = 0.02, 2e-3, 0.1  # two learning rates, and the share that both decay to
-EMBEDDING_FIT_RATE = 0.1  # WildGaussians
 
 
 class AppearanceEmbedding(Effect):

@@ -247,7 +247,7 @@ def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], 
 
 
 def _typed(config: Any, owner: str, texts: Mapping[str, str]) -> dict[str, Any]:
-    changed = with_options(config, texts, f"--set {owner}:")
+    changed = with_options(config, texts, "setting")
     check_limits(changed, f"--set {owner}", **{key: RARE[owner][key] for key in texts if RARE[owner][key]})
     return {key: getattr(changed, key) for key in texts}
 

@@ -27,21 +27,24 @@ class Process:
         assert self.ended
 
 
-def test_nothing_is_left_behind_even_after_an_error(monkeypatch, tmp_path):
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    """An empty folder of compiled kernels; processes are counted, not started."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(Process, "started", [])
     monkeypatch.setattr(subprocess, "Popen", Process)
+    return tmp_path
+
+
+def test_nothing_is_left_behind_even_after_an_error(cache):
     with pytest.raises(KeyError), kernels.kernels_meanwhile():
         raise KeyError
     assert [p.ended for p in Process.started] == [True]
 
 
-def test_what_is_compiled_already_is_left_alone(monkeypatch, tmp_path):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(Process, "started", [])
-    monkeypatch.setattr(subprocess, "Popen", Process)
-    (tmp_path / "adam_1").mkdir()
-    (tmp_path / "adam_1" / "adam.catch_up_all-128.py311.nbi").touch()
+def test_what_is_compiled_already_is_left_alone(cache):
+    (cache / "adam_1").mkdir()
+    (cache / "adam_1" / "adam.catch_up_all-128.py311.nbi").touch()
     with kernels.kernels_meanwhile():
         assert Process.started == []
 

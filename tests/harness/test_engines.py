@@ -211,7 +211,7 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
         (["--gpus-per-cell", "1", "--cpus-per-cell", "2"], "--cpus-per-cell, --gpus-per-cell is for"),
         (["--transfer", "store"], "--transfer is for a cluster"),
         (["--jobs", "0"], "--jobs"),
-        (["--set", "engine.retries=-1"], "--set engine: retries is at least 0"),
+        (["--set", "engine.retries=-1"], "setting retries is at least 0"),
         (["--set", "engine.memory_per_cell=4"], "--set engine.memory_per_cell is for a cluster"),
         (["--set", "engine.retrys=1"], "did you mean 'engine.retries'?"),
         (["--engine", "slurm"], "'local', 'ray'"),

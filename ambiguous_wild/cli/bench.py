@@ -193,14 +193,14 @@ def command(
     rare, own = _rare_settings(settings)
     train = {"resolution": resolution, "max_gaussians": max_gaussians, **rare["train"]}
     engine = {name: given.pop(name) for name in Engine.__dataclass_fields__ if name in given}
-    effects, plan = _plan_among(effects)
+    wanted_effects, plan = _plan_among(effects)
     report = bench(
         methods,
         scenes,
         output=output,
         iterations=iterations,
         budgets_s=seconds,
-        effects=effects,
+        effects=wanted_effects,
         plan=plan,
         settings=own,
         parts={"mask": mask} if mask else {},

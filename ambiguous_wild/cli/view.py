@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 MOST_GAUSSIANS = 150_000
 THIS_MACHINE = "127.0.0.1"
+FORMATS = ("compressed-ply", "spz", "sog", "gltf")
+UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
 class HostPort(click.ParamType):
@@ -179,10 +181,6 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
     say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
     if done.gif is not None:
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
-
-
-FORMATS = ("compressed-ply", "spz", "sog", "gltf")
-UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
 @click.command(name="export")

@@ -193,7 +193,7 @@ def command(
     rare, own = _rare_settings(settings)
     train = {"resolution": resolution, "max_gaussians": max_gaussians, **rare["train"]}
     engine = {name: given.pop(name) for name in Engine.__dataclass_fields__ if name in given}
-    wanted_effects, plan = _plan_among(effects)
+    wanted_effects, plan = plan_among(effects)
     report = bench(
         methods,
         scenes,
@@ -252,7 +252,7 @@ def _typed(config: Any, owner: str, texts: Mapping[str, str]) -> dict[str, Any]:
     return {key: getattr(changed, key) for key in texts}
 
 
-def _plan_among(effects: Sequence[str]) -> tuple[list[str], Path | None]:
+def plan_among(effects: Sequence[str]) -> tuple[list[str], Path | None]:
     """Replace the file of a plan among the values of --effects by "auto", and return the file.
 
     Raises:

@@ -6,10 +6,11 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
-from ambiguous_wild.cli.bench import parse_budget
+from ambiguous_wild.cli.bench import parse_budget, plan_among
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.benchmark import find_methods
 from tests.command_line import ROOT, aw
@@ -75,3 +76,8 @@ def test_outcomes_as_json(scene, tmp_path):
     assert json.loads(first.stdout)[0]["outcome"] == "trained"
     assert json.loads(second.stdout)[0]["outcome"] == "kept"
     assert "aw table" in second.stderr
+
+
+def test_a_plan_among_effects_stands_for_auto():
+    assert plan_among(["none", "a/plan.json"]) == (["none", "auto"], Path("a/plan.json"))
+    assert plan_among(["auto", "exposure,poses"]) == (["auto", "exposure,poses"], None)

@@ -24,10 +24,6 @@ register(MethodEntry(
 """
 
 
-def ablate(*arguments) -> subprocess.CompletedProcess:
-    return aw("ablate", *arguments)
-
-
 @pytest.fixture(scope="module")
 def plugin(tmp_path_factory):
     path = tmp_path_factory.mktemp("plugin") / "mine.py"
@@ -47,14 +43,14 @@ def test_listing_shows_every_group_and_variant_and_imports_no_torch():
     groups = {g["group"]: g for g in json.loads(done.stdout)}
     variants = [v["name"] for v in groups["masks"]["variants"]]
     assert variants == ["neither", "local", "global", "union", "fused"]
-    plain = ablate("--group", "alpha1").stdout
+    plain = aw("ablate", "--group", "alpha1").stdout
     assert "lambda_cr=0.3" in plain and "mask." not in plain
 
 
 def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     words = ["--method", "mine", "--plugin", plugin, "--scene", scene, "--iterations", "20", "-o", tmp_path]
     words += ["--group", "size"]
-    first = ablate(*words)
+    first = aw("ablate", *words)
     assert first.returncode == 0, first.stderr
     assert (tmp_path / "scene" / "mine@size-few" / "seed0" / "metrics.json").is_file()
     rows = {row["variant"]: row for row in csv.DictReader((tmp_path / "ablation.csv").open())}
@@ -62,10 +58,10 @@ def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     assert float(rows["few"]["psnr"]) > 10 and float(rows["default"]["difference_psnr"]) == 0
     assert rows["peer"]["status"] == "missing" and "not-here" in rows["peer"]["reason"]
     assert "| few |" in first.stdout and "- peer missing" in first.stdout
-    again = ablate(*words)
+    again = aw("ablate", *words)
     assert again.stderr.count("finished before, kept") == 2
     assert list(csv.DictReader((tmp_path / "ablation.csv").open())) == list(rows.values())
-    joined = ablate(*words[:-1], "length")
+    joined = aw("ablate", *words[:-1], "length")
     assert joined.returncode == 0 and "with what" in joined.stderr, joined.stderr
     together = list(csv.DictReader((tmp_path / "ablation.csv").open()))
     assert [(row["group"], row["variant"]) for row in together] == [
@@ -73,5 +69,7 @@ def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     ]  # fmt: skip
     made_by = json.loads((tmp_path / "ablation.json").read_text())["made_by"]
     assert made_by.endswith("--group length --group size")
-    other = ablate(*words[:-1], "length", "--set", "mine.stop=700")  # of other settings: a report of its own
+    other = aw(
+        "ablate", *words[:-1], "length", "--set", "mine.stop=700"
+    )  # of other settings: a report of its own
     assert "with what" not in other.stderr

@@ -17,15 +17,11 @@ from tests.command_line import ROOT, aw
 from tests.tiny_scene import write_tiny_scene
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10m", 600), ("1.5h", 5400), (" 2 min ", 120)])
-def test_budgets(text, seconds):
-    assert parse_budget(text) == seconds
-
-
-@pytest.mark.parametrize("text", ["", "10", "m", "-3m", "0s", "10m30", "1e3s"])
-def test_what_is_no_budget(text):
-    with pytest.raises(AwError, match="no duration"):
-        parse_budget(text)
+def test_budgets():
+    assert [parse_budget(text) for text in ("90s", "10m", "1.5h", " 2 min ")] == [90, 600, 5400, 120]
+    for text in ("", "10", "m", "-3m", "0s", "10m30", "1e3s"):
+        with pytest.raises(AwError, match="no duration"):
+            parse_budget(text)
 
 
 def test_methods_with_commas_and_in_any_case():

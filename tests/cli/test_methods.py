@@ -5,21 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-from click.testing import CliRunner
-
-from ambiguous_wild.cli.methods import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods import registry
-
-
-@pytest.fixture(autouse=True)
-def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "registered", {})
+from tests.command_line import aw
 
 
 def shown(*args: str) -> str:
-    return CliRunner().invoke(command, list(args), catch_exceptions=False).output
+    return aw("methods", *args).stdout
 
 
 def test_every_method_is_listed_with_what_it_needs() -> None:

@@ -26,9 +26,8 @@ def test_budgets():
 
 def test_methods_with_commas_and_in_any_case():
     names = ["3DGS, RefineSplat", "robustsplat@density=absgs,mask=truth,3dgs"]
-    assert list(find_methods(names, [], {}, 1)) == [
-        "3dgs", "refinesplat", "robustsplat@mask=truth,density=absgs"
-    ]  # fmt: skip
+    expected = ["3dgs", "refinesplat", "robustsplat@mask=truth,density=absgs"]
+    assert list(find_methods(names, [], {}, 1)) == expected
 
 
 @pytest.mark.slow

@@ -27,13 +27,11 @@ def test_cut_jpeg_among_good_ones_is_skipped_and_counted(tmp_path):
     said = done.stderr.splitlines()
     assert list(dict.fromkeys(line for line in said if line in stages)) == stages  # no bars here
     facts = json.loads(done.stdout)
-    assert facts["counts"]["photos"] == 7
-    assert facts["counts"]["registered"] == 5
+    assert facts["counts"]["photos"] == 7 and facts["counts"]["registered"] == 5
     assert facts["skipped"] == [{"source": "p02.jpg", "skipped": "cut JPEG (its end is missing)"}]
     assert "registered 5 of 7" in facts["verdict"]
     again = aw(*words, 500, cwd=tmp_path)
-    assert again.returncode == 0
-    assert again.stdout.startswith("scene is up to date")
+    assert again.returncode == 0 and again.stdout.startswith("scene is up to date")
     assert "1 of 7 photos skipped: p02.jpg" in again.stdout
     assert again.stdout.endswith("next: aw bench --method refinesplat --scene scene -o runs\n")
     # Other features now: refused with the setting's name.

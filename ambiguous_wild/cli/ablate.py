@@ -60,8 +60,9 @@ def command(
 ) -> None:
     """Train the variants of METHOD on SCENEs. Write ablation.csv, .json, .md and .png to OUTPUT.
 
-    Without --scene, the groups and variants of METHOD are listed. Finished runs are kept: after an interruption the same command continues. Another --group of the same
-    scenes, seeds and length is added to the results in OUTPUT.
+    Without --scene, the groups and variants of METHOD are listed. Finished runs are kept: after an
+    interruption the same command continues. Another --group of the same scenes, seeds and length is added to
+    the results in OUTPUT.
 
     \b
     aw ablate --method refinesplat

@@ -66,7 +66,8 @@ def parse_budget(text: str) -> float:
     "scenes",
     multiple=True,
     type=PathName(),
-    help="A scene folder; repeatable. With --suite: a folder with one folder per scene, in any layout of 'aw import'.",
+    help="A scene folder; repeatable. With --suite: a folder with one folder per scene, in any layout of "
+    "'aw import'.",
 )
 @click.option(
     "--suite",
@@ -106,8 +107,8 @@ def parse_budget(text: str) -> float:
     multiple=True,
     default=("auto",),
     show_default=True,
-    help="Optional effects (docs/effects.md), the same for all methods; auto: a plan of the scene is made; LIST: "
-    "names with commas; PLAN.json: as 'aw plan' wrote it. Repeatable: trains each.",
+    help="Optional effects (docs/effects.md), the same for all methods; auto: a plan of the scene is made; "
+    "LIST: names with commas; PLAN.json: as 'aw plan' wrote it. Repeatable: trains each.",
 )
 @click.option(
     "--protocol",

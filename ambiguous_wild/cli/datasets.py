@@ -114,7 +114,8 @@ def summary(info: ImportRecord, why: str) -> list[str]:
 def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
     """Download the dataset NAME and unpack it; without NAME, list the datasets: licence, size, page.
 
-    An interrupted download continues. The hash of the first download is stored in OUTPUT/archives/downloads.json; later downloads must match it.
+    An interrupted download continues. The hash of the first download is stored in
+    OUTPUT/archives/downloads.json; later downloads must match it.
     """
     from ambiguous_wild.datasets.fetch import find_public, public_data
 

@@ -50,8 +50,8 @@ def simulate_command(
 ) -> None:
     """Simulate a capture: photos with distractors, clean test photos, and the exact truth.
 
-    NAME is a preset; without it, they are listed. SPEC.yaml describes world, walk, distractors and effects (docs/simulation.md).
-    Missing keys are as in the preset courtyard; if distractors is missing, there are none.
+    NAME is a preset; without it, they are listed. SPEC.yaml describes world, walk, distractors and effects
+    (docs/simulation.md). Missing keys are as in the preset courtyard; if distractors is missing, there are none.
     """
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized
     from ambiguous_wild.simulate.spec_file import dump_spec, is_spec_file, plain_spec, read_spec

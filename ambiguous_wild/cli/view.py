@@ -59,8 +59,8 @@ class HostPort(click.ParamType):
 @scene_folder_option
 @click.option(
     "--max-gaussians", type=click.IntRange(4),
-    help="Largest number of Gaussians of a model in the page: a larger model is reduced, with a note.  [default: "
-    f"{MOST_GAUSSIANS}] With --live: of the training.  [default: the method's]",
+    help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note. With "
+    f"--live: in the training.  [default: {MOST_GAUSSIANS}; with --live, the method's]",
 )  # fmt: skip
 @plugin_option
 @click.option("--title", help="Title of the page.  [default: the scene's name]")

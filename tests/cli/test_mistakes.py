@@ -90,6 +90,8 @@ MISTAKES = [
     ("table runs -o t.pdf", "end the name in .txt, .md"),
     ("table runs --format csv -o runs/yard/3dgs/seed0/metrics.json", "no table"),
     ("table runs -o pipe", "nobody reads"),
+    ("audit -o t.pdf", "end the name in .txt, .md, .csv, .json"),
+    ("stress -o t.pdf", "end the name in .txt, .md, .json"),
     ("table runs --metric nope", "unknown metric 'nope': the nearest of ... 'aw table RUNS' shows"),
     ("table runs --metric all --metric psnr", "leave the other --metric out"),
     ("table runs --sheet sheet.txt", "ends in .png or .jpg"),

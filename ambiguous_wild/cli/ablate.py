@@ -10,8 +10,15 @@ import sys
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
-from ambiguous_wild.cli.options import PathName, choose_device, prepare_cpu, training_options
+from ambiguous_wild.cli.options import (
+    PathName,
+    choose_device,
+    json_option,
+    prepare_cpu,
+    training_options,
+)
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.ablation_groups import Group
 
@@ -30,8 +37,7 @@ from ambiguous_wild.methods.ablation_groups import Group
 )
 @click.option("-o", "--output", type=PathName(), default=Path("ablation"), show_default=True)
 @click.option("--pictures/--no-pictures", default=False, show_default=True, help="Save every run's pictures.")
-@click.option("--list", "listing", is_flag=True, help="Show groups and variants, train nothing.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option
 def command(
     method: str,
     scenes: tuple[Path, ...],
@@ -50,16 +56,16 @@ def command(
     overwrite: str,
     cache: Path | None,
     pictures: bool,
-    listing: bool,
     as_json: bool,
 ) -> None:
     """Train the variants of METHOD on SCENEs. Write ablation.csv, .json, .md and .png to OUTPUT.
 
-    Finished runs are kept: after an interruption the same command continues. Another --group of the same
-    scenes, seeds and length is added to the results in OUTPUT.
+    Without --scene, the groups and variants of METHOD are listed. Finished runs are kept: after an
+    interruption the same command continues. Another --group of the same scenes, seeds and length is added to
+    the results in OUTPUT.
 
     \b
-    aw ablate --list
+    aw ablate --method refinesplat
     aw ablate --method refinesplat --scene scene --group masks --iterations 3000 -o ablation
     aw ablate --method my.py:trimmed --scene scene --sweep share=0.7,0.9 -o ablation
     """
@@ -75,11 +81,11 @@ def command(
         entry = register(dataclasses.replace(entry, ablations=(*entry.ablation_groups(), *swept)))
         groups = (*groups, *(group.name for group in swept))
     chosen = choose_groups(method, entry.ablation_groups(), groups)
-    if listing:
+    if not scenes:
+        if click.get_current_context().get_parameter_source("output") is not ParameterSource.DEFAULT:
+            raise AwError("no scene to train on: give one with --scene, or leave -o out to list the groups")
         click.echo(json.dumps(_listed(chosen), indent=2) if as_json else _list_text(chosen))
         return
-    if not scenes:
-        raise AwError("no scene: give one with --scene, or see the groups with --list")
     if iterations is not None and budget is not None:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, seed_option
+from ambiguous_wild.cli.options import PathName, json_option
 
 
 @click.command("ambiguity-report")
@@ -46,9 +46,8 @@ from ambiguous_wild.cli.options import PathName, seed_option
     help="Folder of masks of the static objects to compare with, <stem>.png, white = object.  "
     "[default: every static segment]",
 )
-@seed_option("Seed of the bootstrap.")
 @click.option("--record/--no-record", default=True, show_default=True, help="Save the scores in scene.json.")
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def command(
     scene: Path,
     output: Path | None,
@@ -58,7 +57,6 @@ def command(
     run: Path | None,
     features: str,
     objects: Path | None,
-    seed: int,
     record: bool,
     as_json: bool,
 ) -> None:
@@ -94,7 +92,7 @@ def command(
         objects=objects,
         progress=lambda v: tqdm(v, unit="photo", desc="measure", disable=as_json or None),
     )
-    facts = ambiguity_summary.summarise(measured, seed)
+    facts = ambiguity_summary.summarise(measured)
     ambiguity_page.write_report(measured, facts, folder)
     # scene.json is not part of the scene's identity, which is a hash of the other files.
     info = read_scene_json(scene) if record else None

@@ -5,27 +5,34 @@ from __future__ import annotations
 import math
 import re
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ambiguous_wild.cli.options import (
-    FiniteFloat,
     PathName,
     engine_options,
+    json_option,
     metric_file_option,
     say,
     training_options,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.config import check_limits, with_options
+from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.benchmark import Engine, bench
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.suite import PreparedSuite
 
 SUITES = ("ambiguous-wild", "on-the-go", "robustnerf", "photo-tourism", "drone")
+# Settings that are given by --set, and the range of each; None: its type says all.
+RARE: dict[str, dict[str, Any]] = {
+    "train": {"probes": (0, 100), "checkpoint_every_s": (0.01, math.inf), "on_nonfinite": None},
+    "engine": {"retries": (0, 1000), "memory_per_cell": (0, math.inf), "transfer_limit": (0.001, math.inf)},
+}
 LONGEST_S = 366 * 24 * 3600.0
 _UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
 
@@ -50,23 +57,23 @@ def parse_budget(text: str) -> float:
     "--method",
     "methods",
     multiple=True,
-    help="A name of 'aw methods', FILE.py:RECIPE, external:FILE.yaml or nerfbaselines:METHOD; several with commas.",
+    help="A name of 'aw methods', also 3dgs@mask=A,density=B,regulariser=C with parts of other methods, or "
+    "3dgs+2passes, trained again with the final masks; FILE.py:RECIPE, external:FILE.yaml or "
+    "nerfbaselines:METHOD. Several with commas.",
 )
 @click.option(
     "--scene",
     "scenes",
     multiple=True,
     type=PathName(),
-    help="A scene folder; repeatable.",
+    help="A scene folder; repeatable. With --suite: a folder with one folder per scene, in any layout of "
+    "'aw import'.",
 )
 @click.option(
     "--suite",
     "suite_name",
     type=click.Choice(SUITES),
-    help="All scenes of a published table instead of --scene; prints the table beside the reported numbers.",
-)
-@click.option(
-    "--root", type=PathName(), help="One folder per scene of the suite, in any layout of 'aw import'."
+    help="All scenes of a published table; prints it beside the reported numbers.",
 )
 @training_options
 @click.option(
@@ -85,29 +92,23 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--mask",
     metavar="METHOD",
-    help="Masks of another method; none; motion: of moving features; or truth: exact masks.",
+    help="Masks of another method, for all; none; motion: of moving features; or truth: exact masks.",
 )
-@click.option("--density", metavar="METHOD", help="Density control of another method.")
-@click.option("--regulariser", metavar="METHOD", help="Losses of another method on the render.")
-@click.option("--passes", type=click.IntRange(1, 2), default=1, show_default=True,
-              help="2: train again with the final masks; the cost counts both trainings.")  # fmt: skip
 @click.option(
-    "--set", "settings", multiple=True, metavar="METHOD.KEY=VALUE", help="Option of a method; repeatable."
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME.KEY=VALUE",
+    help="Option of a method ('aw methods METHOD'), or one of the settings above; repeatable.",
 )
 @click.option(
     "--effects",
-    metavar="auto|none|all|LIST",
+    metavar="auto|none|all|LIST|PLAN.json",
     multiple=True,
     default=("auto",),
     show_default=True,
-    help="Optional effects (docs/effects.md), the same for all methods; auto: the plan of the scene; LIST: "
-    "names with commas. Repeatable: trains each.",
-)
-@click.option(
-    "--plan",
-    "plan",
-    type=PathName(dir_okay=False),
-    help="Use this plan of 'aw plan' instead of making a new one.",
+    help="Optional effects (docs/effects.md), the same for all methods; auto: a plan of the scene is made; "
+    "LIST: names with commas; PLAN.json: as 'aw plan' wrote it. Repeatable: trains each.",
 )
 @click.option(
     "--protocol",
@@ -124,51 +125,26 @@ def parse_budget(text: str) -> float:
 @metric_file_option
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(
-    "--probes",
-    type=click.IntRange(0, 100),
-    default=8,
-    show_default=True,
-    help="Measurements of the test PSNR during training; they change neither result nor training time.",
-)
-@click.option(
-    "--checkpoint-every",
-    type=FiniteFloat(min=0.0, min_open=True),
-    default=60.0,
-    show_default=True,
-    help="Seconds between checkpoints.",
-)
-@click.option(
-    "--on-nonfinite",
-    type=click.Choice(["stop", "rollback"]),
-    default="stop",
-    show_default=True,
-    help="On a NaN or infinite value: stop and say where, or go back and skip that photo.",
-)
-@click.option(
     "--pictures/--no-pictures",
     default=True,
     show_default=True,
     help="Save pictures of masks and training in RUN/pictures.",
 )
 @engine_options
-@click.option("--json", "as_json", is_flag=True, help="Print the outcome of every run as JSON.")
+@json_option
 def command(
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
     suite_name: str | None,
-    root: Path | None,
     iterations: int | None,
     budgets: tuple[str, ...],
     resolution: str,
     max_gaussians: int | None,
     mask: str | None,
-    density: str | None,
-    regulariser: str | None,
+    settings: tuple[str, ...],
+    effects: tuple[str, ...],
     protocol: str | None,
     output: Path,
-    probes: int,
-    checkpoint_every: float,
-    on_nonfinite: str,
     as_json: bool,
     **given: Any,  # the other arguments of `bench`, and the fields of `Engine`, by their names
 ) -> None:
@@ -179,17 +155,23 @@ def command(
     aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.mask_every=8
     aw bench --method 3dgs,refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw bench --method 3dgs,robustsplat --mask refinesplat --scene scene -o runs
-    aw bench --suite on-the-go --root datasets/on-the-go -o runs
+    aw bench --suite on-the-go --scene datasets/on-the-go -o runs
 
     A run is one method on one scene with one seed. --jobs 4 trains four runs at a time, --engine ray as many
     as a cluster has room for.
 
-    --mask, --density and --regulariser replace a part of every METHOD by that of another method. The runs are
-    called 3dgs@mask=refinesplat, which is also a METHOD.
-
     Several --budget or --effects train every combination, each into its own folder:
     runs/budget-60s/effects-exposure/SCENE/METHOD/seed0. 'aw cost runs' compares all of them, 'aw table' the
     runs of one folder.
+
+    \b
+    Settings that few need, as --set NAME.KEY=VALUE:
+      train.probes=8               how often the test PSNR is measured while training
+      train.checkpoint_every_s=60  seconds between checkpoints
+      train.on_nonfinite=stop      a NaN ends the run; rollback: go back and leave that photo out
+      engine.retries=3             how often a run is repeated whose process or node was lost
+      engine.memory_per_cell=GB    with Ray: memory per run
+      engine.transfer_limit=4000   with Ray: MB of the largest scene or run that is sent
     """
     if iterations is not None and budgets:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
@@ -199,38 +181,33 @@ def command(
         from ambiguous_wild.datasets.suites import get_suite
         from ambiguous_wild.report.suite import prepare_suite, suite_methods
 
-        if root is None or scenes:
-            raise AwError(f"--suite {suite_name} takes its scenes from --root DIR; leave --scene out")
+        if len(scenes) != 1:
+            raise AwError(f"--suite {suite_name} takes its scenes from one folder: give --scene DIR once")
         suite = get_suite(suite_name)
-        prepared = prepare_suite(suite, root, output, say=say)
+        prepared = prepare_suite(suite, scenes[0], output, say=say)
         scenes, protocol = tuple(prepared.scenes.values()), protocol or suite.protocol
         methods = methods or tuple(suite_methods(suite))
         iterations = iterations if iterations is not None or seconds else suite.iterations
-    elif root is not None:
-        raise AwError("--root goes with --suite: name the suite whose scenes it holds")
     for flag, names in (("--method", methods), ("--scene", scenes)):
         if not names:
             raise AwError(f"{flag} is missing: 'aw bench --help' shows examples")
-    if math.isnan(checkpoint_every):
-        raise AwError("--checkpoint-every nan: give a number of seconds")
-    parts = {"mask": mask, "density": density, "regulariser": regulariser}
-    train: dict[str, Any] = {
-        "resolution": resolution,
-        "max_gaussians": max_gaussians,
-        "probes": probes,
-        "checkpoint_every_s": checkpoint_every,
-        "on_nonfinite": on_nonfinite,
-    }
+    rare, own = _rare_settings(settings)
+    train = {"resolution": resolution, "max_gaussians": max_gaussians, **rare["train"]}
+    engine = {name: given.pop(name) for name in Engine.__dataclass_fields__ if name in given}
+    wanted_effects, plan = plan_among(effects)
     report = bench(
         methods,
         scenes,
         output=output,
         iterations=iterations,
         budgets_s=seconds,
-        parts={place: donor for place, donor in parts.items() if donor},  # type: ignore[misc]
+        effects=wanted_effects,
+        plan=plan,
+        settings=own,
+        parts={"mask": mask} if mask else {},
         train=train,  # type: ignore[arg-type]
         protocol=protocol,  # type: ignore[arg-type]
-        engine=Engine(**{name: given.pop(name) for name in Engine.__dataclass_fields__}),
+        engine=Engine(**engine, **rare["engine"]),
         callbacks=ProgressBar(),
         **given,
     )
@@ -238,6 +215,55 @@ def command(
         for folder in report.folders:
             _print_tables(prepared, folder)
     finish(report, as_json)
+
+
+def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], list[str]]:
+    """Split `train.KEY=VALUE` and `engine.KEY=VALUE` from the options of methods.
+
+    Returns:
+        the values by key, for "train" and "engine"; the options of methods.
+
+    Raises:
+        AwError: unknown key, or a value that is none of its.
+    """
+    texts: dict[str, dict[str, str]] = {owner: {} for owner in RARE}
+    own = []
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        owner, _, key = name.partition(".")
+        if owner not in RARE or not equals:
+            own.append(setting)
+            continue
+        if key not in RARE[owner]:
+            raise unknown("name in --set", name, [f"{owner}.{key}" for key in RARE[owner]])
+        texts[owner][key] = text
+    values: dict[str, dict[str, Any]] = {owner: {} for owner in RARE}
+    if texts["train"]:
+        from ambiguous_wild.splat.pace import TrainConfig
+
+        values["train"] = _typed(TrainConfig(), "train", texts["train"])
+    if texts["engine"]:
+        values["engine"] = _typed(Engine(), "engine", texts["engine"])
+    return values, own
+
+
+def _typed(config: Any, owner: str, texts: Mapping[str, str]) -> dict[str, Any]:
+    changed = with_options(config, texts, "setting")
+    check_limits(changed, f"--set {owner}", **{key: RARE[owner][key] for key in texts if RARE[owner][key]})
+    return {key: getattr(changed, key) for key in texts}
+
+
+def plan_among(effects: Sequence[str]) -> tuple[list[str], Path | None]:
+    """Replace the file of a plan among the values of --effects by "auto", and return the file.
+
+    Raises:
+        AwError: two plans, or a plan and "auto".
+    """
+    plans = [text for text in effects if Path(text).suffix or len(Path(text).parts) > 1]
+    if plans and (len(plans) > 1 or "auto" in effects):
+        raise AwError(f"--effects {plans[0]} is a plan, and auto or another plan stands beside it: give one")
+    wanted = ["auto" if text in plans else text for text in effects]
+    return wanted, Path(plans[0]) if plans else None
 
 
 def _print_tables(prepared: PreparedSuite, folder: Path) -> None:

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, threads_option
+from ambiguous_wild.cli.options import (
+    PathName,
+    json_option,
+    license_option,
+    name_option,
+    seed_option,
+    threads_option,
+)
 from ambiguous_wild.core.processes import python_meanwhile
 
 if TYPE_CHECKING:
@@ -106,12 +113,12 @@ def _compiled() -> bool:
 @click.option("--test-list", type=PathName(), help="File with the names of the test photos, one per line.")
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
 @threads_option
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of COLMAP's random choices.")
-@click.option("--name", help="Name of the scene.  [default: the name of the output folder]")
-@click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
+@seed_option("Seed of COLMAP's random choices.")
+@name_option
+@license_option
 @click.option("--overwrite", is_flag=True, help="Replace a scene built from other photos or settings.")
 @click.option("--keep-work", is_flag=True, help="Keep the work folder with every stage and COLMAP's log.")
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def command(
     raw: tuple[Path, ...],
     output: Path,

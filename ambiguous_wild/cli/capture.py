@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import FiniteFloat, PathName, threads_option
+from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, threads_option
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ BROKEN_BELOW = 0.9  # of the frames in a video's header, which is often wrong by
     help="Seconds between photos of a camera.",
 )
 @threads_option
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def capture_command(
     sources: tuple[str, ...], output: Path, frames: int, every: float, threads: int | None, as_json: bool
 ) -> None:
@@ -99,7 +99,7 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Picture of which photos overlap, a PNG.")
 @click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
 @threads_option
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def screen_command(
     raw: tuple[Path, ...], output: Path | None, strict: bool, threads: int | None, as_json: bool
 ) -> None:

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import FiniteFloat, PathName, command_line, only_option
+from ambiguous_wild.cli.options import (
+    FiniteFloat,
+    PathName,
+    command_line,
+    json_option,
+    only_option,
+)
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -34,21 +40,17 @@ if TYPE_CHECKING:
     help="Add the set-up (features and masks made before the first step) to the time; short if cached.",
 )
 @click.option(
-    "--recommend", "recommended", type=PathName(file_okay=False), metavar="SCENE",
-    help="Name the best measured setting for this scene within the time of --budget.",
+    "--recommend", "recommended", type=(PathName(file_okay=False), str), metavar="SCENE TIME",
+    help="Name the best measured setting for this scene within this training time on this machine, e.g. 5m.",
 )  # fmt: skip
-@click.option("--budget", metavar="TIME", help="With --recommend: training time on this machine, e.g. 5m.")
-@click.option("--plots/--no-plots", default=True, show_default=True, help="Draw SVG and PNG.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@json_option
 def command(
     runs: tuple[Path, ...],
     output: Path,
     targets: tuple[float, ...],
     scenes: tuple[str, ...],
     with_setup: bool,
-    recommended: Path | None,
-    budget: str | None,
-    plots: bool,
+    recommended: tuple[Path, str] | None,
     as_json: bool,
 ) -> None:
     """Compare accuracy and cost of the runs below the folders RUNS: time to reach a PSNR, dB per extra
@@ -59,7 +61,7 @@ def command(
     \b
     aw bench --method 3dgs --method refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw cost runs --target 25 -o cost
-    aw cost runs --recommend my-scene --budget 5m
+    aw cost runs --recommend my-scene 5m
     """
     if any(not math.isfinite(t) for t in targets):
         raise AwError("--target must be a number of dB, e.g. 25")
@@ -67,22 +69,17 @@ def command(
     from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text, write_report
     from ambiguous_wild.report.cost_runs import read_cost_runs
 
-    if (recommended is None) != (budget is None):
-        raise AwError(
-            "--recommend SCENE and --budget TIME belong together, e.g. --recommend scene --budget 5m"
-        )
     cost_runs = read_cost_runs(runs, scenes=scenes)
-    if recommended is not None and budget is not None:
-        _recommend(cost_runs, recommended, budget, as_json)
+    if recommended is not None:
+        _recommend(cost_runs, *recommended, as_json)
         return
-    made_by = command_line(plots=None, as_json=None)
+    made_by = command_line(as_json=None)
     report = cost_report(cost_runs, targets=targets, setup=with_setup, made_by=made_by)
     check_output(output / "cost.json")
     written = write_report(report, output)
-    if plots:
-        from ambiguous_wild.report.cost_plots import draw_all
+    from ambiguous_wild.report.cost_plots import draw_all
 
-        written += draw_all(report, output)
+    written += draw_all(report, output)
     click.echo(json.dumps(plain_data(report), indent=2) if as_json else to_text(report), nl=as_json)
     click.echo(f"wrote {', '.join(p.name for p in written)} in {output}", err=True)
 

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, seed_option, threads_option
+from ambiguous_wild.cli.options import (
+    PathName,
+    json_option,
+    license_option,
+    name_option,
+    seed_option,
+    threads_option,
+)
 from ambiguous_wild.core.errors import AwError, shortlist
 
 if TYPE_CHECKING:
@@ -29,8 +36,8 @@ KINDS = (
 @click.option("--as", "kind", type=click.Choice(KINDS), help="Layout of SOURCE.  [default: recognised]")
 @click.option("--model", default="", help="Name of one of several COLMAP models.  [default: most photos]")
 @click.option("--factor", type=int, help="Downsampling.  [default: as in the papers]")
-@click.option("--name", default="", help="Name of the scene.  [default: the output folder's]")
-@click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
+@name_option
+@license_option
 @click.option("--dataset", default="", help="Name of the dataset in tables.  [default: the layout's]")
 @click.option(
     "--drop-test-only-points",
@@ -45,10 +52,11 @@ KINDS = (
 @threads_option
 @seed_option("Seed of matching and of random points.")
 @click.option("--overwrite", is_flag=True, help="Replace a scene imported from other files or settings.")
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def import_command(
     source: Path,
     output: Path,
+    name: str | None,
     threads: int | None,
     overwrite: bool,
     as_json: bool,
@@ -65,7 +73,7 @@ def import_command(
     done = import_scene(
         source,
         output,
-        ImportSettings(**settings),
+        ImportSettings(**settings, name=name or ""),
         overwrite=overwrite,
         jobs=threads,
         progress=not as_json,
@@ -102,17 +110,16 @@ def summary(info: ImportRecord, why: str) -> list[str]:
 @click.option(
     "-o", "--output", type=PathName(), default=Path("datasets"), show_default=True, help="Folder of datasets."
 )
-@click.option("--list", "listing", is_flag=True, help="List the datasets: licence, size, page.")
-@click.option("--unpack/--no-unpack", default=True, show_default=True, help="Unpack the archive.")
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
-def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, as_json: bool) -> None:
-    """Download the dataset NAME and unpack it. An interrupted download continues.
+@json_option
+def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
+    """Download the dataset NAME and unpack it; without NAME, list the datasets: licence, size, page.
 
-    The hash of the first download is stored in OUTPUT/archives/downloads.json; later downloads must match it.
+    An interrupted download continues. The hash of the first download is stored in
+    OUTPUT/archives/downloads.json; later downloads must match it.
     """
     from ambiguous_wild.datasets.fetch import find_public, public_data
 
-    if listing:
+    if name is None:
         if as_json:
             click.echo(json.dumps([asdict(d) for d in public_data().values()], indent=2, ensure_ascii=False))
             return
@@ -121,15 +128,13 @@ def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, a
             how = f"layout {data.layout}, {size}" if data.url else "from its page only"
             click.echo(f"{data.name:<30} {how}, licence: {data.license}\n{'':<30} {data.note}; {data.page}")
         return
-    if name is None:
-        raise AwError("which dataset? 'aw fetch --list' lists them")
     from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.datasets.fetch import fetch
 
     data = find_public(name)
     click.echo(f"{data.name}: licence: {data.license} ({data.page})", err=True)
     with ticking(desc=name, unit="B", unit_scale=True, disable=True if as_json else None) as tick:
-        done = fetch(data, output, unpack=unpack, tick=tick, say=lambda text: click.echo(text, err=True))
+        done = fetch(data, output, tick=tick, say=lambda text: click.echo(text, err=True))
     if as_json:
         facts = {"archive": str(done.archive), "folder": str(done.folder) if done.folder else None}
         click.echo(json.dumps({**facts, "sha256": done.sha256, "first": done.first}, indent=2))
@@ -153,7 +158,7 @@ def fetch_command(name: str | None, output: Path, listing: bool, unpack: bool, a
 )
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder to make.")
 @click.option("--copy", is_flag=True, help="Copy photos instead of linking them.")
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_json: bool) -> None:
     """Write SCENE in another tool's layout: photos at their training size, cameras, split, points, masks."""
     from ambiguous_wild.datasets.export import export_scene
@@ -174,9 +179,8 @@ def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_js
     "--info",
     "info_file",
     type=PathName(dir_okay=False),
-    help="YAML file with licence, consent, creators; see --template.",
+    help="YAML file with licence, consent, creators. Without SCENES an empty one is written, to fill in.",
 )
-@click.option("--template", type=PathName(dir_okay=False), help="Write an empty --info file and stop.")
 @click.option("--keep-metadata", is_flag=True, help="Keep EXIF (places, serial numbers) in the photos.")
 @click.option(
     "--people/--no-people",
@@ -185,12 +189,11 @@ def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_js
     help="List photos in which a detector sees a person; it misses most people.",
 )
 @threads_option
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def package_command(
     scenes: tuple[Path, ...],
     output: Path | None,
     info_file: Path | None,
-    template: Path | None,
     keep_metadata: bool,
     people: bool,
     threads: int | None,
@@ -199,7 +202,7 @@ def package_command(
     """Pack SCENES for release: one zip per scene, croissant.json, a data card, checksums.
 
     \b
-    aw package --template release.yaml          fill it in
+    aw package --info release.yaml              writes it: fill it in
     aw package scene1 scene2 --info release.yaml -o package
     aw verify package
 
@@ -207,13 +210,17 @@ def package_command(
     """
     from ambiguous_wild.datasets.release_facts import TEMPLATE, ReleaseInfo, read_release_info
 
-    if template is not None:
-        if template.exists():
-            raise AwError(f"{template} exists; nothing is overwritten: choose another name")
+    if info_file is not None and not scenes:
+        if output is not None:
+            raise AwError("-o without a scene: name the scene folders to pack")
+        if info_file.exists():
+            raise AwError(
+                f"{info_file} exists; nothing is overwritten: name the scene folders to pack, and -o"
+            )
         from ambiguous_wild.io.files import write_text
 
-        write_text(template, TEMPLATE)
-        click.echo(f"wrote {template}: fill it in, then pass it with --info")
+        write_text(info_file, TEMPLATE)
+        click.echo(f"wrote {info_file}: fill it in, then name scenes with it")
         return
     if not scenes or output is None:
         raise AwError("give at least one scene folder and -o DIR; 'aw package --help' shows examples")
@@ -252,18 +259,15 @@ def package_command(
 
 @click.command("verify")
 @click.argument("package", type=PathName())
-@click.option(
-    "--scratch", type=PathName(file_okay=False), help="Folder to unpack in.  [default: the system's]"
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
-def verify_command(package: Path, scratch: Path | None, as_json: bool) -> None:
+@json_option
+def verify_command(package: Path, as_json: bool) -> None:
     """Check PACKAGE, a folder of 'aw package' or one of its archives: every checksum, table and scene.
 
-    Nothing is trusted: hostile archives are refused.
+    Nothing is trusted: hostile archives are refused. TMPDIR is the folder to unpack in.
     """
     from ambiguous_wild.datasets.package_check import verify
 
-    verified = verify(package, scratch=scratch)
+    verified = verify(package)
     if as_json:
         facts = {"scenes": verified.scenes, "files": verified.files, "warnings": verified.warnings}
         click.echo(json.dumps(facts, indent=2, ensure_ascii=False))

@@ -24,6 +24,7 @@ from typing import Any, Literal
 
 import click
 
+from ambiguous_wild.cli.options import json_option
 from ambiguous_wild.core.errors import AwError, install_command, installed
 from ambiguous_wild.core.processes import python_command
 from ambiguous_wild.harness.callbacks import allowed_cores
@@ -348,7 +349,7 @@ def _git() -> SystemCheck:
 
 
 @click.command(name="doctor")
-@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+@json_option
 def command(as_json: bool) -> None:
     """Check this machine: packages, CPU, GPU, kernels, weights; with a command to install what is missing.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName
+from ambiguous_wild.cli.options import PathName, json_option, reported_option, title_option
 from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ _board = click.option(
     show_default=True,
     help="Folder of the leaderboard.",
 )
-_json = click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
 
 
 @click.group("leaderboard")
@@ -63,7 +62,7 @@ def command() -> None:
 )
 @click.option("--quick", is_flag=True, help="Recompute only PSNR.")
 @click.option("--dry-run", is_flag=True, help="Check only; write nothing.")
-@_json
+@json_option
 def add_command(
     runs: tuple[Path, ...],
     board: Path,
@@ -123,13 +122,8 @@ def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
 @command.command("publish")
 @_board
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder of the page.")
-@click.option("--reported", is_flag=True, help="Also show numbers from papers, in a table of their own.")
-@click.option(
-    "--reported-from",
-    type=PathName(file_okay=False),
-    help="Folder of *.csv with them.  [default: BOARD/reported, else those of this package]",
-)
-@click.option("--title", default="Leaderboard", show_default=True, help="Title of the page.")
+@reported_option("BOARD/reported or those of the package")
+@title_option("Leaderboard")
 @click.option(
     "--models",
     multiple=True,
@@ -137,11 +131,12 @@ def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
     metavar="RUNS",
     help="Run folders, or folders of them, whose models get pages; repeatable.",
 )
-@_json
+@json_option
 def publish_command(
     board: Path,
     output: Path,
     models: tuple[Path, ...],
+    reported: Path | bool | None,
     as_json: bool,
     **options: Any,  # the other arguments of `publish`, by their names
 ) -> None:
@@ -152,7 +147,15 @@ def publish_command(
 
     from ambiguous_wild.report.board_publish import publish
 
-    done = publish(board, output, models=models, say=lambda text: click.echo(text, err=True), **options)
+    done = publish(
+        board,
+        output,
+        reported=reported is not None,
+        reported_from=reported if isinstance(reported, Path) else None,
+        models=models,
+        say=lambda text: click.echo(text, err=True),
+        **options,
+    )
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(done), indent=2))
     summary = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures"
@@ -165,7 +168,7 @@ def publish_command(
 
 @command.command("check")
 @_board
-@_json
+@json_option
 def check_command(board: Path, as_json: bool) -> None:
     """Check the board: hashes, duplicates, pictures, files that do not match.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import plugin_option
+from ambiguous_wild.cli.options import json_option, plugin_option
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.entry import MethodEntry
@@ -21,7 +21,7 @@ WIDTH = 100
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @click.option("--table", is_flag=True, help="Table of the parts of each method: masks, density, ...")
 @plugin_option
-@click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.")
+@json_option
 def command(names: tuple[str, ...], table: bool, as_json: bool) -> None:
     """List the methods: name, summary, paper, extra requirements.
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 import math
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
 
 
@@ -24,6 +25,13 @@ class PathName(click.Path):
         if value == "":
             self.fail("the name is empty; write . for the current folder", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class PathOrAlone(PathName):
+    """The path after an option that may also stand alone, which gives True."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if value is True else super().convert(value, param, ctx)
 
 
 class FiniteFloat(click.FloatRange):
@@ -58,6 +66,9 @@ scene_folder_option = click.option(
     type=PathName(file_okay=False),
     help="The scene folder, if it was moved.  [default: as the runs say]",
 )
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+name_option = click.option("--name", help="Name of the scene.  [default: the output folder's]")
+license_option = click.option("--license", default="", help="Licence of the photos, recorded in scene.json.")
 threads_option = click.option(
     "--threads", type=click.IntRange(1), help="CPU threads; they do not change the result."
 )
@@ -79,6 +90,20 @@ def device_option(help: str) -> Callable[..., Any]:
 def seed_option(help: str) -> Callable[..., Any]:
     """Return the option --seed for one seed."""
     return click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=help)
+
+
+def title_option(default: str) -> Callable[..., Any]:
+    """Return the option --title of a page."""
+    return click.option("--title", default=default, show_default=True, help="Title of the page.")
+
+
+def reported_option(default: str) -> Callable[..., Any]:
+    """Return the option --reported: None, True where it stands alone, or the path after it."""
+    return click.option(
+        "--reported", is_flag=False, flag_value=True, type=PathOrAlone(), metavar="[PATH]",
+        help="Also show numbers from papers, in rows of their own; PATH: CSV files of yours instead of "
+        f"{default}.",
+    )  # fmt: skip
 
 
 def _all(*options: Callable[..., Any]) -> Callable[..., Any]:
@@ -134,7 +159,7 @@ training_options = _all(
 )
 
 
-engine_options = _all(  # the fields of `Engine`
+engine_options = _all(  # fields of `Engine`
     click.option("--engine", type=click.Choice(["local", "ray"]), default="local", show_default=True,
                  help="local: this machine; ray: Ray, also on a cluster (docs/cluster.md)."),
     click.option("--jobs", type=click.IntRange(1),
@@ -145,14 +170,8 @@ engine_options = _all(  # the fields of `Engine`
                  help="Ray: CPUs per run, also its threads.  [default: --threads, else 1]"),
     click.option("--gpus-per-cell", type=FiniteFloat(min=0),
                  help="Ray: GPUs per run; with 0.5 two runs share one.  [default: 1 on cuda]"),
-    click.option("--memory-per-cell", type=FiniteFloat(min=0), metavar="GB",
-                 help="Ray: memory per run."),
-    click.option("--retries", type=click.IntRange(0), default=3, show_default=True,
-                 help="How often to repeat a run whose process or node was lost."),
     click.option("--transfer", type=click.Choice(["shared", "store"]), default="shared", show_default=True,
                  help="Ray: shared: -o and scenes are on shared storage; store: they are sent through Ray."),
-    click.option("--transfer-limit", type=FiniteFloat(min=0, min_open=True), default=4000.0,
-                 show_default=True, metavar="MB", help="Ray: largest scene or run that is sent through Ray."),
 )  # fmt: skip
 
 
@@ -181,6 +200,19 @@ def prepare_cpu(threads: int | None) -> None:
 def say(text: str) -> None:
     """Write a line on stderr, so that stdout stays clean for results; names of runs cannot break it."""
     click.echo(plain(text), err=True)
+
+
+def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = "") -> str:
+    """Return the format that the ending of the name of -o says.
+
+    Raises:
+        AwError: no format has this ending; the message ends with `otherwise`, another way to choose one.
+    """
+    suffix = output.suffix.lower() if output is not None else ""
+    if suffix not in suffixes:
+        known = ", ".join(s for s in suffixes if s)
+        raise AwError(f"-o {output}: no format is known for {suffix}: end the name in {known}{otherwise}")
+    return suffixes[suffix]
 
 
 def command_line(**values: Any) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName, prepare_cpu
+from ambiguous_wild.cli.options import PathName, json_option, prepare_cpu
 from ambiguous_wild.core.errors import AwError
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ MASKS = (
 @click.option(
     "-o", "--output", type=PathName(dir_okay=False), help="File for the plan.  [default: SCENE-plan.json]"
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
+@json_option
 def command(
     scene: Path,
     factor: int | None,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from ambiguous_wild.cli.options import FiniteFloat, PathName, seed_option
+from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, seed_option
 from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
@@ -34,16 +34,8 @@ if TYPE_CHECKING:
 @click.option("--width", type=int, help="Width of a photo in px; keeps the aspect ratio.")
 @click.option("--depth", is_flag=True, help="Also write depth maps of the static scene.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier capture in this folder.")
-@click.option(
-    "--pictures/--no-pictures",
-    "sheet",
-    default=True,
-    show_default=True,
-    help="Write truth/sheet.jpg, a contact sheet.",
-)
 @click.option("--print-spec", is_flag=True, help="Print the spec as YAML, and stop.")
-@click.option("--list", "listing", is_flag=True, help="List all presets.")
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def simulate_command(
     name: str | None,
     like: Path | None,
@@ -53,25 +45,24 @@ def simulate_command(
     width: int | None,
     depth: bool,
     overwrite: bool,
-    sheet: bool,
     print_spec: bool,
-    listing: bool,
     as_json: bool,
 ) -> None:
     """Simulate a capture: photos with distractors, clean test photos, and the exact truth.
 
-    NAME is a preset of --list. SPEC.yaml describes world, walk, distractors and effects (docs/simulation.md).
-    Missing keys are as in the preset courtyard; if distractors is missing, there are none.
+    NAME is a preset; without it, they are listed. SPEC.yaml describes world, walk, distractors and effects
+    (docs/simulation.md). Missing keys are as in the preset courtyard; if distractors is missing, there are none.
     """
     from ambiguous_wild.simulate.presets import PRESETS, preset, resized
     from ambiguous_wild.simulate.spec_file import dump_spec, is_spec_file, plain_spec, read_spec
 
-    if listing:
+    if name is None and like is None:
+        if output is not None or print_spec:
+            raise AwError(f"name a capture: {', '.join(PRESETS)} ('aw simulate' describes them)")
         _print_list(PRESETS.values(), as_json)
         return
-    if (name is None) == (like is None):
-        given = "NAME and --like exclude each other" if name else "name a capture: " + ", ".join(PRESETS)
-        raise AwError(f"{given} ('aw simulate --list' describes them)")
+    if name is not None and like is not None:
+        raise AwError("NAME and --like exclude each other: a capture is made from one of them")
     twin = None
     if like is not None:
         from ambiguous_wild.io.scene_folder import load_scene
@@ -106,7 +97,7 @@ def simulate_command(
     with folder_lock(output, f"aw simulate {called}"):
         sweep_siblings(output)  # left by a killed call
         facts = simulate(spec, output, seed, depth, overwrite, bar)
-        if sheet and not (facts["reused"] and (output / "truth" / "sheet.jpg").is_file()):
+        if not (facts["reused"] and (output / "truth" / "sheet.jpg").is_file()):
             from ambiguous_wild.harness.sheets import write_capture_sheet
 
             write_capture_sheet(output)
@@ -140,8 +131,7 @@ def simulate_command(
     effects = list(plain_spec(spec)["effects"])
     if effects:
         click.echo(f"effects: {', '.join(effects)}")
-    if sheet:
-        click.echo(f"look at: {output / 'truth' / 'sheet.jpg'}")
+    click.echo(f"look at: {output / 'truth' / 'sheet.jpg'}")
     scene = output.parent / f"{output.name}-scene"
     factor = f" --factor {twin.factor}" if twin else ""
     click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
@@ -217,8 +207,8 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
     type=click.Choice(["bonnet", "stamp"]),
     help="Fixed to the camera: the same in all photos, test photos too. Plain photos only.",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@seed_option("Seed of where distractors stand.")
+@json_option
 @click.pass_context
 def composite_command(
     context: click.Context,

@@ -8,8 +8,17 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, choose_device, device_option, prepare_cpu
+from ambiguous_wild.cli.options import (
+    PathName,
+    choose_device,
+    device_option,
+    json_option,
+    prepare_cpu,
+    style_of,
+)
 from ambiguous_wild.core.errors import AwError
+
+SUFFIXES = {".txt": "text", ".md": "markdown", ".json": "json", "": "text"}  # of -o
 
 
 @click.command("stress")
@@ -25,15 +34,8 @@ from ambiguous_wild.core.errors import AwError
 )
 @click.option("--list", "listing", is_flag=True, help="Only print the names of the cases.")
 @device_option("auto: the CPU, and the GPU if there is one.")
-@click.option(
-    "--format",
-    "style",
-    type=click.Choice(["text", "markdown", "json"]),
-    default="text",
-    show_default=True,
-)
-@click.option("--json", "as_json", is_flag=True, help="Same as --format json.")
-@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
+@json_option
+@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file: .txt, .md or .json.")
 @click.option(
     "--replay",
     "run",
@@ -45,7 +47,6 @@ def command(
     methods: tuple[str, ...],
     listing: bool,
     device: str,
-    style: str,
     as_json: bool,
     output: Path | None,
     run: Path | None,
@@ -78,7 +79,7 @@ def command(
         click.echo("\n".join(c.key for c in cases))
         return
     devices = _devices(device)
-    style = "json" if as_json else style
+    style = "json" if as_json else style_of(output, SUFFIXES)
     live = style == "text" and output is None
     if live:
         click.echo(stress_table.HEADER)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, only_option, seed_option
+from ambiguous_wild.cli.options import PathName, json_option, only_option, seed_option, title_option
 
 
 @click.group("study")
@@ -65,21 +65,14 @@ def command() -> None:
     show_default=True,
     help="Largest longer side of an image, px.",
 )
-@click.option(
-    "--quality",
-    type=click.IntRange(50, 100),
-    default=92,
-    show_default=True,
-    help="JPEG quality of the images.",
-)
-@click.option("--title", default="Picture study", show_default=True, help="Title of the page.")
+@title_option("Picture study")
 @seed_option("Seed of the choice of questions.")
 @click.option(
     "--overwrite",
     is_flag=True,
     help="Replace an existing page and key; answers to the old page can no longer be scored.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the facts as JSON.")
+@json_option
 def make_command(
     runs: Path | None, photos_of: tuple[Path, ...], output: Path, methods: tuple[str, ...], scenes: tuple[str, ...],
     truth: bool, outline: bool, overwrite: bool, as_json: bool,
@@ -156,11 +149,8 @@ def make_command(
     type=PathName(file_okay=False),
     help="Folder for scores.md, .csv and .json.  [default: KEY-scores]",
 )
-@seed_option("Seed of the bootstrap over raters.")
-@click.option("--json", "as_json", is_flag=True, help="Print the scores as JSON.")
-def score_command(
-    answers: tuple[Path, ...], key: Path, output: Path | None, seed: int, as_json: bool
-) -> None:
+@json_option
+def score_command(answers: tuple[Path, ...], key: Path, output: Path | None, as_json: bool) -> None:
     """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
     from ambiguous_wild.io.files import check_output, is_record, refuse_files_there
     from ambiguous_wild.io.files import refuse_foreign_files as refuse_strangers
@@ -176,7 +166,7 @@ def score_command(
         if not is_record(folder / "scores.json", "raters"):
             refuse_files_there(folder, SCORE_FILES)
     check_output(folder)
-    scores = score(key_of_study, raters, seed)
+    scores = score(key_of_study, raters)
     write_scores(scores, folder)
     click.echo(json.dumps(scores, indent=2, ensure_ascii=False) if as_json else markdown_of(scores))
     if not as_json:

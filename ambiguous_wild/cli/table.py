@@ -16,9 +16,12 @@ import click
 from ambiguous_wild.cli.options import (
     PathName,
     command_line,
+    json_option,
     metric_file_option,
     only_option,
+    reported_option,
     scene_folder_option,
+    style_of,
 )
 from ambiguous_wild.core.errors import AwError, counted
 
@@ -31,6 +34,7 @@ STYLES = ("text", "markdown", "csv", "latex", "html", "tidy")
 SUFFIXES = {
     ".txt": "text", ".md": "markdown", ".csv": "csv", ".tex": "latex", ".html": "html", "": "text"
 }  # fmt: skip
+AUDIT_SUFFIXES = {".txt": "text", ".md": "markdown", ".csv": "csv", ".json": "json", "": "text"}
 SHEETS = (".png", ".jpg")
 LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 
@@ -47,19 +51,17 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 )  # fmt: skip
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
 @click.option(
-    "--metric", "metrics", multiple=True, help="Only this column; repeatable.  [default: all measured]"
+    "--metric",
+    "metrics",
+    multiple=True,
+    help="Only this column; repeatable. all: every column, however wide.  [default: those that fit, in text]",
 )
 @only_option
 @click.option(
     "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
     help="Group these scenes as dataset NAME; repeatable.  [default: as in the papers' tables]",
 )  # fmt: skip
-@click.option("--all", "everything", is_flag=True, help="Show every column of text tables, however wide.")
-@click.option("--reported", is_flag=True, help="Also show numbers from papers, in separate rows.")
-@click.option(
-    "--reported-from", type=PathName(exists=True),
-    help="Tables of the papers (CSV, as for 'aw audit').  [default: those that come with the package]",
-)  # fmt: skip
+@reported_option("those of the package")
 @click.option(
     "--sheet",
     type=PathName(dir_okay=False),
@@ -73,9 +75,7 @@ def table_command(
     metrics: tuple[str, ...],
     scenes: tuple[str, ...],
     datasets: tuple[str, ...],
-    everything: bool,
-    reported: bool,
-    reported_from: Path | None,
+    reported: Path | bool | None,
     sheet: Path | None,
 ) -> None:
     """Compare the runs below the folders RUNS: quality, cost and masks, method by method.
@@ -93,18 +93,22 @@ def table_command(
     """
     if output is not None and output.suffix.lower() not in SUFFIXES and output.exists():
         raise AwError(f"{output} exists, and by its name it is no table: choose another -o")
-    style = style or _style_of(output)
+    style = style or style_of(output, SUFFIXES, ", or give --format")
+    everything = "all" in metrics
+    if everything and len(metrics) > 1:
+        raise AwError("--metric all names every column: leave the other --metric out")
+    metrics = () if everything else metrics
     if sheet is not None and sheet.suffix.lower() not in SHEETS:
         raise AwError(f"--sheet {sheet}: it is a picture, give a name that ends in .png or .jpg")
     if style == "tidy":
-        if layout != "blocks" or datasets or reported or reported_from or sheet:
+        if layout != "blocks" or datasets or reported or sheet:
             raise AwError(
                 "--format tidy goes with --metric, --only and -o alone: it is every number there is"
             )
         _write_tidy(_read(runs), output, metrics, scenes)
         return
     if layout in ("blocks", "ablation"):
-        refused = {"--dataset": datasets, "--reported": reported or reported_from}
+        refused = {"--dataset": datasets, "--reported": reported}
         if layout == "ablation":
             if len(runs) > 1:
                 raise AwError("--layout ablation shows one folder, the output of 'aw ablate': give RUNS once")
@@ -121,8 +125,8 @@ def table_command(
         shown = write_sheet(loaded, sheet, scene=scenes[0] if scenes else None)
         click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
     named_style = None if style == "text" else style
-    made_by = "command: " + command_line(style=named_style, output=None, everything=None, sheet=None)
-    tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported, reported_from)
+    made_by = "command: " + command_line(style=named_style, output=None, sheet=None, metrics=metrics)
+    tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported)
     blocks = layout == "blocks" and style != "html"
     width = _width(everything or (blocks and bool(metrics)), output) if style == "text" else None
     color = style == "text" and output is None and sys.stdout.isatty()
@@ -144,16 +148,6 @@ def _read(runs: Sequence[Path]) -> Runs:
     from ambiguous_wild.harness.store import read_runs
 
     return read_runs(*runs)
-
-
-def _style_of(output: Path | None) -> str:
-    suffix = output.suffix.lower() if output is not None else ""
-    if suffix not in SUFFIXES:
-        known = ", ".join(s for s in SUFFIXES if s)
-        raise AwError(
-            f"-o {output}: no format is known for {suffix}: end the name in {known}, or give --format"
-        )
-    return SUFFIXES[suffix]
 
 
 def _width(everything: bool, output: Path | None) -> int | None:
@@ -224,8 +218,7 @@ def _layouts(
     metrics: Sequence[str],
     scenes: Sequence[str],
     datasets: dict[str, list[str]],
-    reported: bool,
-    reported_from: Path | None,
+    reported: Path | bool | None,  # True: the numbers of the package
 ) -> list[Table]:
     from ambiguous_wild.report import papers
     from ambiguous_wild.report.ablation_report import ablation
@@ -235,7 +228,7 @@ def _layouts(
         return ablation(runs, tuple(metrics))
     if layout == "blocks":
         return papers.in_blocks(loaded, metrics=metrics, scenes=scenes)
-    numbers = read_reported(reported_from) if reported or reported_from else []
+    numbers = read_reported(reported if isinstance(reported, Path) else None) if reported else []
     if not datasets:
         datasets = datasets_of(numbers or read_reported(), sorted(set(loaded.runs["scene"])))
     if layout == "memory":
@@ -263,7 +256,7 @@ def _named(datasets: Sequence[str]) -> dict[str, list[str]]:
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @scene_folder_option
 @metric_file_option
-@click.option("--json", "as_json", is_flag=True, help="Print what became of every run as JSON.")
+@json_option
 def rescore_command(
     runs: tuple[Path, ...], scene_folder: Path | None, metrics: tuple[Path, ...], as_json: bool
 ) -> None:
@@ -300,15 +293,11 @@ def rescore_command(
 @click.command("audit")
 @click.argument("tables", nargs=-1, type=PathName())
 @click.option(
-    "--format",
-    "style",
-    type=click.Choice(["text", "markdown", "csv", "json"]),
-    default="text",
-    show_default=True,
+    "-o", "--output", type=PathName(dir_okay=False), help="Write to this file: .txt, .md, .csv or .json."
 )
-@click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
 @click.option("--strict", is_flag=True, help="Exit with code 1 if anything is found.")
-def audit_command(tables: tuple[Path, ...], style: str, output: Path | None, strict: bool) -> None:
+@json_option
+def audit_command(tables: tuple[Path, ...], output: Path | None, strict: bool, as_json: bool) -> None:
     """Check TABLES (CSV, or folders of them; default: the paper's tables, which come with the package).
 
     Finds suspiciously equal numbers, contradictions between tables, swapped numbers, means that do not match
@@ -319,6 +308,7 @@ def audit_command(tables: tuple[Path, ...], style: str, output: Path | None, str
     from ambiguous_wild.report.audit import audit, csv_of, markdown_of, text_of
     from ambiguous_wild.report.audit_numbers import REPORTED, read_tables
 
+    style = "json" if as_json else style_of(output, AUDIT_SUFFIXES)
     numbers = read_tables(tables or (REPORTED,))
     findings = audit(numbers)
     if style == "json":

@@ -71,7 +71,17 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     step("plan", scene, "--no-probe", "-o", plan, done=plan)
     say(f"renders of your photos appear while it trains: {runs / '*' / '*' / 'seed0' / 'pictures'}")
     step(
-        "bench", "--method", ",".join(METHODS), "--scene", scene, *length, "--plan", plan, "-o", runs, *cores
+        "bench",
+        "--method",
+        ",".join(METHODS),
+        "--scene",
+        scene,
+        *length,
+        "--effects",
+        plan,
+        "-o",
+        runs,
+        *cores,
     )
     page = output / "view"
     step("view", runs, "-o", page)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from ambiguous_wild.cli.options import (
     FiniteFloat,
     PathName,
     device_option,
+    json_option,
     plugin_option,
     say,
     scene_folder_option,
@@ -28,9 +30,25 @@ if TYPE_CHECKING:
     from ambiguous_wild.viewing.model import ExportedModel
 
 MOST_GAUSSIANS = 150_000
-_one_scene = click.option(
-    "--only", "scene", metavar="NAME", help="Name of the scene, if the runs have several."
-)
+THIS_MACHINE = "127.0.0.1"
+FORMATS = ("compressed-ply", "spz", "sog", "gltf")
+UPS = ("x", "y", "z", "-x", "-y", "-z")
+
+
+class HostPort(click.ParamType):
+    """An address to listen on: (host, port) of "[HOST:]PORT"."""
+
+    name = "[HOST:]PORT"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, int]:
+        if isinstance(value, tuple):
+            return value
+        host, colon, port = str(value).rpartition(":")
+        if not re.fullmatch(r"\d{1,5}", port) or int(port) > 65535 or (colon and not host):
+            self.fail(f"{value!r} is no port from 0 to 65535, nor HOST:PORT.", param, ctx)
+        return host.strip("[]") or THIS_MACHINE, int(port)
 
 
 @click.command(name="view")
@@ -39,12 +57,11 @@ _one_scene = click.option(
     "-o", "--output", type=PathName(file_okay=False), default=Path("view"), show_default=True,
     help="Folder of the page; with --live, of the run (default then: runs).",
 )  # fmt: skip
-@_one_scene
 @scene_folder_option
 @click.option(
-    "--max-gaussians", "most_gaussians", type=click.IntRange(1), default=MOST_GAUSSIANS,
-    show_default=True,
-    help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note.",
+    "--max-gaussians", type=click.IntRange(4),
+    help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note. With "
+    f"--live: in the training.  [default: {MOST_GAUSSIANS}; with --live, the method's]",
 )  # fmt: skip
 @plugin_option
 @click.option("--title", help="Title of the page.  [default: the scene's name]")
@@ -56,35 +73,24 @@ _one_scene = click.option(
 )
 @click.option("--method", default="refinesplat", show_default=True, help="With --live: method to train.")
 @click.option("--iterations", type=click.IntRange(1), help="With --live: iterations.  [default: 30000]")
-@click.option(
-    "--max-train-gaussians",
-    "max_gaussians",
-    type=click.IntRange(4),
-    help="With --live: largest number of Gaussians.  [default: the method's]",
-)
 @seed_option("With --live: seed.")
-@click.option("--threads", type=click.IntRange(1), help="With --live: CPU threads.")
+@threads_option
 @device_option("With --live: auto is the GPU if torch and gsplat can use one, else the CPU.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="With --live: address to listen on.")
 @click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8080,
-    show_default=True,
-    help="With --live: port; 0 = any free one.",
-)
-@click.option("--paused", is_flag=True, help="With --live: pause after the first step.")
+    "--port", type=HostPort(), default="8080", show_default=True,
+    help=f"With --live: where to listen. HOST is {THIS_MACHINE} (this machine alone), PORT 0 any free one.",
+)  # fmt: skip
 @click.pass_context
 def view_command(
     ctx: click.Context,
     runs: tuple[Path, ...],
     output: Path,
-    scene: str | None,
     scene_folder: Path | None,
-    most_gaussians: int,
+    max_gaussians: int | None,
     title: str | None,
     live: Path | None,
     method: str,
+    port: tuple[str, int],
     **training: Any,  # the other arguments of `watch`, by their names
 ) -> None:
     """Write a page that shows the models of RUNS (run folders, folders of them, or splat files of any tool: PLY,
@@ -106,7 +112,16 @@ def view_command(
         from ambiguous_wild.report.model_views import watch
 
         folder = Path("runs") if chosen is click.core.ParameterSource.DEFAULT else output
-        watch(live, method, folder, say=say, **training)
+        watch(
+            live,
+            method,
+            folder,
+            max_gaussians=max_gaussians,
+            host=port[0],
+            port=port[1],
+            say=say,
+            **training,
+        )
         return
     if not runs:
         raise AwError("no RUNS: give the folder that 'aw bench -o' wrote, or --live SCENE")
@@ -115,9 +130,8 @@ def view_command(
     page = view_runs(
         runs,
         output,
-        scene=scene,
         scene_folder=scene_folder,
-        most_gaussians=most_gaussians,
+        most_gaussians=max_gaussians or MOST_GAUSSIANS,
         title=title,
         say=say,
     )
@@ -145,10 +159,11 @@ def view_command(
     "--width", type=click.IntRange(16, 4096), help="Width of each render, px.  [default: as the photos]"
 )
 @click.option("--columns", type=click.IntRange(1), help="Renders in a row.  [default: up to three]")
-@click.option("--gif", type=PathName(dir_okay=False), help="Also write this GIF of the whole path.")
-@click.option("--gif-seconds", type=FiniteFloat(0.5, 30), default=4.0, show_default=True)
-@click.option("--gif-width", type=click.IntRange(16, 2048), default=640, show_default=True, help="Width, px.")
-@_one_scene
+@click.option(
+    "--gif",
+    type=PathName(dir_okay=False),
+    help="Also write this GIF, 640 px wide: the whole path in four seconds.",
+)
 @scene_folder_option
 @plugin_option
 @threads_option
@@ -167,9 +182,6 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
     say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
     if done.gif is not None:
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
-
-
-UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
 @click.command(name="export")
@@ -194,7 +206,7 @@ UPS = ("x", "y", "z", "-x", "-y", "-z")
 @scene_folder_option
 @plugin_option
 @threads_option
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option
 def export_command(
     runs: tuple[Path, ...],
     formats: tuple[str, ...],

@@ -7,6 +7,7 @@ import json
 
 import click
 
+from ambiguous_wild.cli.options import json_option
 from ambiguous_wild.core.errors import AwError, counted
 
 
@@ -22,7 +23,7 @@ def command() -> None:
 
 
 @command.command(name="list")
-@click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
+@json_option
 def list_command(as_json: bool) -> None:
     """List every network: size, licence, source, use, and whether it is on this machine."""
     from ambiguous_wild.core.weight_files import folder_fault, weights_folder
@@ -61,9 +62,8 @@ def list_command(as_json: bool) -> None:
 
 @command.command(name="get")
 @click.argument("names", nargs=-1, required=True)
-@click.option("--overwrite", "again", is_flag=True, help="Download networks again that seem complete.")
-@click.option("--json", "as_json", is_flag=True, help="Print names and places as JSON.")
-def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
+@json_option
+def get_command(names: tuple[str, ...], as_json: bool) -> None:
     """Download networks into AW_WEIGHTS (by default ~/.cache/ambiguous_wild/weights).
 
     A network that is already there is checked, and downloaded again only if it is damaged. Hashes are checked;
@@ -72,7 +72,7 @@ def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     from ambiguous_wild.vision import weight_download, weight_registry
 
     wanted = weight_registry.chosen(names)
-    places = weight_download.get(wanted, lambda line: click.echo(line, err=True), again)
+    places = weight_download.get(wanted, lambda line: click.echo(line, err=True))
     if as_json:
         rows = [{"name": w.name, "where": str(place)} for w, place in zip(wanted, places)]
         click.echo(json.dumps(rows, indent=2))
@@ -80,7 +80,7 @@ def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
 
 @command.command(name="check")
 @click.argument("names", nargs=-1)
-@click.option("--json", "as_json", is_flag=True, help="Print the verdicts as JSON.")
+@json_option
 def check_command(names: tuple[str, ...], as_json: bool) -> None:
     """Load networks completely and compare hashes; without NAMES all that are on this machine.
 

@@ -67,7 +67,7 @@ def find_public(name: str) -> PublicData:
     """
     catalogue = public_data()
     if name not in catalogue:
-        raise unknown("dataset", name, catalogue, "'aw fetch --list' lists them")
+        raise unknown("dataset", name, catalogue, "'aw fetch' lists them")
     if not catalogue[name].url:
         raise AwError(
             f"{name} has no fixed archive: download it from {catalogue[name].page}, then 'aw import' it"

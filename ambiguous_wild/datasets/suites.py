@@ -70,7 +70,7 @@ def find_scenes(suite: Suite, root: Path) -> tuple[dict[str, Path], list[str]]:
         AwError: no folder, no scene of the suite, or two folders of one scene.
     """
     if not root.is_dir():
-        raise AwError(f"--root {root} is no folder")
+        raise AwError(f"--scene {root} is no folder")
     inner = [p for p in sorted(root.iterdir()) if p.is_dir() and not p.name.startswith(".")]
     folders = inner + [q for p in inner for q in sorted(p.iterdir()) if q.is_dir()]
     found: dict[str, Path] = {}

@@ -337,10 +337,12 @@ def _check_effects(
         return
     name = plan if isinstance(plan, str | Path) else plan.scene
     if len(scenes) > 1:
-        raise AwError(f"--plan {name} is of one scene; bench {len(scenes)} scenes one by one, or without it")
+        raise AwError(
+            f"the plan {name} is of one scene; bench {len(scenes)} scenes one by one, or without it"
+        )
     if "auto" not in choices or not any(map(takes_effects, methods)):
         raise AwError(
-            f"--plan {name} would not be used: {', '.join(method.name for method in methods)} with "
+            f"the plan {name} would not be used: {', '.join(method.name for method in methods)} with "
             f"--effects {', '.join(choices)}; add --effects auto"
         )
 

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport
     from ambiguous_wild.splat.trainer import Trainer
 
-_RAY_ONLY = ("address", "cpus_per_cell", "gpus_per_cell", "memory_per_cell")
+_RAY_ONLY = {  # field -> option
+    "address": "--address", "cpus_per_cell": "--cpus-per-cell", "gpus_per_cell": "--gpus-per-cell",
+    "memory_per_cell": "--set engine.memory_per_cell",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Engine:
 
     def check(self) -> None:
         """Raise AwError for settings that exclude each other, before anything heavy is loaded."""
-        stray = [f"--{name.replace('_', '-')}" for name in _RAY_ONLY if getattr(self, name) is not None]
+        stray = [option for name, option in _RAY_ONLY.items() if getattr(self, name) is not None]
         if self.engine == "local" and (stray or self.transfer != "shared"):
             raise AwError(
                 f"{', '.join(stray) or '--transfer'} is for a cluster: add --engine ray, or leave it out"

@@ -424,7 +424,8 @@ def with_occlusion(plan: EffectsPlan, occlusion: Occlusion) -> EffectsPlan:
              "distractors cover large parts of some photos", "no photo is covered in large parts",
              "--set refinesplat.mask.use_global=false where off"),
         line("entropy density", "patches that a probe cannot explain", occlusion.share, ENTROPY,
-             "growth should wait for masks", "growth need not wait for masks", "--density none where off"),
+             "growth should wait for masks", "growth need not wait for masks",
+             "METHOD@density=none where off"),
     )  # fmt: skip
     return replace(plan, decisions=(*lines, *plan.decisions), probed=True)
 

@@ -77,7 +77,10 @@ def read_models(
         if not trained:
             raise unknown("scene", scene, names)
     elif len(names) > 1:
-        raise AwError(f"these runs are of {len(names)} scenes ({shortlist(names)}): choose one with --only")
+        one = trained[0].run.parent.parent
+        raise AwError(
+            f"these runs are of {len(names)} scenes ({shortlist(names)}): give those of one, e.g. {one}"
+        )
     if len({t.scene_hash for t in trained}) > 1:
         runs = shortlist(sorted(str(t.run) for t in trained), 3)
         raise AwError(f"scene {trained[0].scene!r} differs between these runs: {runs}; name them one by one")

@@ -123,7 +123,7 @@ def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
     if size_mb > limit_mb:
         raise AwError(
             f"{root} has {size_mb:.0f} MB, more than the {limit_mb:.0f} MB that may be sent: put it on "
-            "shared storage, or raise --transfer-limit"
+            "shared storage, or raise --set engine.transfer_limit=MB"
         )
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w", dereference=True) as archive:

@@ -1,6 +1,6 @@
 """Ablations as data: a method lists the settings to vary, `aw ablate` trains and tabulates them.
 
-This module imports nothing heavy, so that `aw ablate --list` works without torch. At its end is the paper's
+This module imports nothing heavy, so that `aw ablate` lists them without torch. At its end is the paper's
 plug-in table: RefineSplat's masks, with three thresholds, in methods with appearance.
 """
 
@@ -90,7 +90,8 @@ def choose_groups(method: str, groups: Sequence[Group], names: Sequence[str]) ->
     known = [group.name for group in groups]
     for name in names:
         if name not in known:
-            raise unknown(f"group of {method}'s ablations", name, known, "'aw ablate --list' shows them")
+            hint = f"'aw ablate --method {method}' shows them"
+            raise unknown(f"group of {method}'s ablations", name, known, hint)
     return tuple(group for group in groups if not names or group.name in names)
 
 

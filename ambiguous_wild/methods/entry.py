@@ -179,7 +179,7 @@ def second_pass_name(name: str, passes: int) -> str:
         AwError: another number of passes.
     """
     if passes not in (1, 2):
-        raise AwError(f"--passes {passes}: a method trains once or twice")
+        raise AwError(f"passes={passes}: a method trains once or twice")
     return name if passes == 1 or name.endswith(SUFFIX) else name + SUFFIX
 
 
@@ -195,9 +195,7 @@ def second_pass(entry: MethodEntry) -> MethodEntry:
         AwError: an external program trains it.
     """
     if entry.program is not None:
-        raise AwError(
-            f"{entry.name} is trained by another program, which cannot be given masks: no --passes 2"
-        )
+        raise AwError(f"{entry.name} is trained by another program, which cannot be given masks: no +2passes")
     return dataclasses.replace(
         entry,
         name=entry.name + SUFFIX,

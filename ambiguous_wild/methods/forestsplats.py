@@ -4,7 +4,7 @@ Source: arXiv 2503.06179 and kalelpark/ForestSplats, which says that parts are m
 paper are unverified. Two readings of the code: superpixels are of channels-last photos, and masks stay
 fractions. Ours: the mask net (plain and dilated convolutions instead of CGNet) and the superpixels get the
 photo at `side` px; a narrower deforming net, whose heads start near zero; no sky points, no Mip filter. Its
-growth (UAD) has no effect in the released code: `--density uad` gives this toolkit's reading of it.
+growth (UAD) has no effect in the released code: `@density=uad` gives this toolkit's reading of it.
 Appearance is that of WildGaussians, for static Gaussians alone.
 
 Cost: a second picture, the deforming net, and two evaluations of D-SSIM for the mask.

@@ -4,8 +4,8 @@ Source: arXiv 2412.00155 and Vadim200116/T-3DGS; the divergence is the code's, t
 (unverified). Ours: features (Lab and HOG for DINOv2's, option `features`), enlarged bilinearly (FeatUp
 there); doublings of the head stop at half the photo's size; the annealing counts iterations of the run where
 these are fewer than nominal ones. Its second stage (SAM 2 tracks masks through the video, then trains anew)
-needs a video; `--passes 2` trains anew with the final masks. Cost: features of the render, and the head on
-two pictures forward and on one backward.
+needs a video; `t-3dgs+2passes` trains anew with the final masks. Cost: features of the render, and the head
+on two pictures forward and on one backward.
 """
 
 from __future__ import annotations

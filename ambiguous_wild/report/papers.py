@@ -258,7 +258,7 @@ def read_reported(folder: Path | None = None) -> list[PrintedNumber]:
     """
     folder = folder or REPORTED
     if not folder.exists():
-        raise AwError(f"no reported numbers in {folder}: name their folder with --reported-from")
+        raise AwError(f"no reported numbers in {folder}: name their folder with --reported")
     return read_tables([folder])
 
 

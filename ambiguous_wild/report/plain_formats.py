@@ -316,7 +316,7 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
     if not out:
         return list(tables)
     shown = [table.picked(sorted(kept)) for table in tables]
-    note = f"not shown, to fit {width} columns: {', '.join(out)}; --all shows them"
+    note = f"not shown, to fit {width} columns: {', '.join(out)}; --metric all shows them"
     return [*shown[:-1], shown[-1].with_notes(note)]
 
 

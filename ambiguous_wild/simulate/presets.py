@@ -23,7 +23,7 @@ def preset(name: str) -> CaptureSpec:
         AwError: unknown name; the message gives the nearest one.
     """
     if name not in PRESETS:
-        raise unknown("capture", name, PRESETS, "'aw simulate --list' lists them")
+        raise unknown("capture", name, PRESETS, "'aw simulate' lists them")
     return PRESETS[name]
 
 

@@ -180,7 +180,8 @@ class Watchdog:
             error.view,
             error.seen,
             f"{error}{after}; what the step saw is in {where}, and 'aw stress --replay {folder}' runs up to "
-            f"it again from the last good state; --on-nonfinite rollback leaves such a photo out and goes on",
+            "it again from the last good state; --set train.on_nonfinite=rollback leaves such a photo out "
+            "and goes on",
         )
 
     def snapshot(self, good: Path, error: NonFinite) -> Path:

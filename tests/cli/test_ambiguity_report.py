@@ -11,14 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from ambiguous_wild.cli.ambiguity_report import command
-from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
 from ambiguous_wild.report.ambiguity_summary import describe
+from tests.command_line import aw
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
 SEMANTIC_METRIC = "semantic_lookalike_labhog"
@@ -35,16 +33,20 @@ def scene(tmp_path: Path) -> Path:
     return root
 
 
+def printed(*words: object) -> str:
+    done = aw("ambiguity-report", *words)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def report(*words: object) -> dict:
-    done = CliRunner().invoke(command, [*(str(w) for w in words), "--json"], catch_exceptions=False)
-    assert done.exit_code == 0
-    return json.loads(done.stdout)
+    return json.loads(printed(*words, "--json"))
 
 
 def error(*words: object) -> str:
-    raised = CliRunner().invoke(command, [str(w) for w in words]).exception
-    assert isinstance(raised, AwError), raised
-    return str(raised)
+    done = aw("ambiguity-report", *words)
+    assert done.returncode == 2
+    return done.stderr
 
 
 def pixels(scene: Path, part: str, name: str) -> np.ndarray:
@@ -84,14 +86,11 @@ def test_a_distractor_in_the_background_s_colours_is_ambiguous(scene: Path, tmp_
 def test_without_a_background_colour_is_refused_or_left_out_on_request(scene: Path, tmp_path: Path) -> None:
     shutil.rmtree(scene / "truth/clean")
     assert "--background none" in error(scene, "-o", tmp_path / "out") and not (tmp_path / "out").exists()
-    words = [str(scene), "-o", str(tmp_path / "out"), "--background", "none"]
-    done = CliRunner().invoke(command, words, catch_exceptions=False)
-    assert "colour: no verdict, because no background of a distractor is known" in done.stdout
-    assert "100 % of the distractor pixels is unknown" in done.stdout
-    assert json.loads((tmp_path / "out/ambiguity.json").read_text())["class"] in (
-        "unknown",
-        "semantic, rest unknown",
-    )
+    text = printed(scene, "-o", tmp_path / "out", "--background", "none")
+    assert "colour: no verdict, because no background of a distractor is known" in text
+    assert "100 % of the distractor pixels is unknown" in text
+    facts = json.loads((tmp_path / "out/ambiguity.json").read_text())
+    assert facts["class"] in ("unknown", "semantic, rest unknown")
 
 
 def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> None:
@@ -103,8 +102,8 @@ def test_no_distractor_pixels_give_no_verdict(scene: Path, tmp_path: Path) -> No
     assert facts["occlusion"]["value"] == 0
     assert facts[COLOUR_METRIC]["value"] is None and facts[SEMANTIC_METRIC]["ambiguous"] is None
     assert facts["class"] == "no distractors"
-    done = CliRunner().invoke(command, [str(scene), "-o", str(tmp_path / "again")], catch_exceptions=False)
-    assert "photos are empty" in done.stdout and "missing" not in done.stdout
+    text = printed(scene, "-o", tmp_path / "again")
+    assert "photos are empty" in text and "missing" not in text
     assert "no distractors" in (tmp_path / "again/index.html").read_text()
 
 
@@ -121,41 +120,20 @@ def test_own_masks_and_what_is_said_where_there_are_none(scene: Path, tmp_path: 
     assert "another shape" in error(scene, "--distractor-masks", own, *blind)
 
 
-def test_scores_are_noted_in_scene_json_unless_told_not_to(scene: Path, tmp_path: Path) -> None:
+def test_nothing_but_scores_in_scene_json_change_and_files_repeat(scene: Path, tmp_path: Path) -> None:
     account = {"schema_version": 1, "name": "yard", "factor": 1, "files": {}}
     (scene / "scene.json").write_text(json.dumps(account))
-    report(scene, "-o", tmp_path / "out", "--no-record")
-    assert json.loads((scene / "scene.json").read_text()) == account
-    facts = report(scene, "-o", tmp_path / "out")
-    noted = load_scene(scene).info["ambiguity"]
-    assert noted["occlusion"] == facts["occlusion"] and noted["masks"] == "truth"
-    rest = json.loads((scene / "scene.json").read_text())
-    del rest["ambiguity"]
-    assert rest == account
-
-
-def test_nothing_but_scene_json_changes_and_the_same_call_gives_the_same_files(
-    scene: Path, tmp_path: Path
-) -> None:
-    (scene / "scene.json").write_text(
-        json.dumps({"schema_version": 1, "name": "y", "factor": 1, "files": {}})
-    )
     files = [p for p in sorted(scene.rglob("*")) if p.is_file() and p.name != "scene.json"]
     before = [sha256_file(p) for p in files]
-    report(scene, "-o", tmp_path / "a")
-    report(scene, "-o", tmp_path / "b")
+    report(scene, "-o", tmp_path / "a", "--no-record")
+    assert json.loads((scene / "scene.json").read_text()) == account
+    facts = report(scene, "-o", tmp_path / "b")
+    saved = json.loads((scene / "scene.json").read_text())
+    assert saved.pop("ambiguity")["occlusion"] == facts["occlusion"] and saved == account
+    assert load_scene(scene).info["ambiguity"]["masks"] == "truth"
     assert [sha256_file(p) for p in files] == before
     for name in ("ambiguity.json", "ambiguity.png", "index.html", "photos.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-
-
-def test_a_folder_that_is_no_report_is_not_replaced(scene: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/letter.txt").write_text("dear")
-    assert "letter.txt" in error(scene, "-o", tmp_path / "mine")
-    assert (tmp_path / "mine/letter.txt").read_text() == "dear"
-    assert "a file lies there" in error(scene, "-o", tmp_path / "mine/letter.txt")
-    assert (tmp_path / "mine/letter.txt").read_text() == "dear"
 
 
 def test_keep_masks_are_the_inverse(scene: Path, tmp_path: Path) -> None:
@@ -168,11 +146,6 @@ def test_keep_masks_are_the_inverse(scene: Path, tmp_path: Path) -> None:
     other = report(scene, "-o", tmp_path / "c", "--keep-masks", scene / "masks/train")
     assert kept["masks"] == "scene" and other["masks"] == "folder"
     assert kept[COLOUR_METRIC] == other[COLOUR_METRIC] == facts[COLOUR_METRIC]
-    both = ("--distractor-masks", "truth", "--keep-masks", scene / "masks/train")
-    assert "exclude each other" in error(scene, *both)
-    assert "needs --run" in error(scene, "--distractor-masks", "run") and "needs --run" in error(
-        scene, "--background", "run"
-    )
 
 
 def test_names_are_escaped_on_the_page() -> None:
@@ -192,31 +165,10 @@ def test_names_are_escaped_on_the_page() -> None:
     assert "<script>" not in text and "<b>x" not in text and '"><img src=x' not in text
 
 
-def test_the_report_never_goes_into_the_scene(scene: Path, tmp_path: Path) -> None:
-    before = sorted(scene.rglob("*"))
-    (tmp_path / "link").symlink_to(scene)
-    for out in (scene, scene / "report", tmp_path / "link" / "x"):
-        assert "would change the scene" in error(scene, "-o", out)
-    assert sorted(scene.rglob("*")) == before
-
-
-@pytest.mark.parametrize("out", ["/dev/null/x", "{}/file/x", "/proc/x"])
-def test_an_output_that_cannot_be_is_found_before_the_work(
-    out: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "file").write_text("x")
-    monkeypatch.setattr(
-        "ambiguous_wild.report.ambiguity_measure.measure", lambda *_, **__: pytest.fail("worked first")
-    )
-    assert "cannot write" in error(scene, "-o", out.format(tmp_path))
-
-
 def test_a_cosine_near_its_limit_is_told_apart_from_it(scene: Path, tmp_path: Path) -> None:
     summary = report(scene, "-o", tmp_path / "out")
     look = summary[SEMANTIC_METRIC] | {"value": 0.6964, "low": 0.6951, "high": 0.7049}
     real = summary | {"features": "dinov2-small", "semantic_cosine_dinov2_small": look}
     assert "cosine 0.696 [0.695, 0.705]" in "\n".join(describe(real))
-    assert (
-        "] of the distractor pixels lie in regions that resemble a static region of another photo"
-        in "\n".join(describe(summary))
-    )
+    resemble = "] of the distractor pixels lie in regions that resemble a static region of another photo"
+    assert resemble in "\n".join(describe(summary))

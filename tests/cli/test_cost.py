@@ -5,13 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-from click.testing import CliRunner
-
-from ambiguous_wild.cli.cost import command
-from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import cell_folder, grouped, plan_cells
 from ambiguous_wild.splat.pace import TrainConfig
+from tests.command_line import aw
 from tests.report.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene
 
@@ -20,25 +16,14 @@ def test_tables_on_standard_output_and_files_beside(tmp_path: Path) -> None:
     runs = tmp_path / "my runs"
     cost_run(runs, "a", psnr=(20.0,), train_s=300.0, probes=[(100.0, 15.0), (200.0, 19.0)])
     out = tmp_path / "out"
-    done = CliRunner().invoke(command, [str(runs), "--target", "17", "-o", str(out), "--no-plots"])
-    assert done.exit_code == 0, done.output
+    words = ("cost", runs, "--target", "17", "-o", out)
+    done = aw(*words)
+    assert done.returncode == 0, done.stderr
     assert "minutes of training to reach a test PSNR (yard)" in done.stdout and "2.50" in done.stdout
     assert f"command: aw cost '{runs}' -o {out} --target 17" in done.stdout
-    assert sorted(p.name for p in out.iterdir()) == [
-        "cost.csv",
-        "cost.json",
-        "time-to-psnr.csv",
-        "timelines.csv",
-    ]
-    printed = CliRunner().invoke(
-        command, [str(runs), "--target", "17", "-o", str(out), "--no-plots", "--json"]
-    )
-    assert json.loads(printed.stdout) == json.loads((out / "cost.json").read_text())
-
-
-def test_a_target_that_is_no_number_is_refused(tmp_path: Path) -> None:
-    done = CliRunner().invoke(command, [str(tmp_path), "--target", "nan"])
-    assert done.exit_code == 2 and "--target" in done.output
+    tables = [p.name for p in sorted(out.iterdir()) if p.suffix not in (".svg", ".png")]
+    assert tables == ["cost.csv", "cost.json", "time-to-psnr.csv", "timelines.csv"] and any(out.glob("*.svg"))
+    assert json.loads(aw(*words, "--json").stdout) == json.loads((out / "cost.json").read_text())
 
 
 def test_several_lengths_and_effects_have_folders_of_their_own(tmp_path: Path) -> None:
@@ -59,22 +44,10 @@ def test_several_lengths_and_effects_have_folders_of_their_own(tmp_path: Path) -
     assert grouped({"none": planned["none"]}) == planned["none"]
 
 
-@pytest.mark.parametrize("words", [[], ["absent"]])
-def test_no_runs_is_an_error(words: list[str]) -> None:
-    assert CliRunner().invoke(command, words).exit_code != 0
-
-
-def test_without_runs_nothing_is_left_behind(tmp_path: Path) -> None:
-    done = CliRunner().invoke(command, [str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")])
-    assert "no folder of runs" in str(done.exception)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_files_of_the_user_under_a_report_s_names_stay(tmp_path: Path) -> None:
     cost_run(tmp_path / "runs", "a", psnr=(20.0,), train_s=300.0, probes=[(100.0, 15.0), (200.0, 19.0)])
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "changes.csv").write_text("mine")
-    words = [str(tmp_path / "runs"), "-o", str(tmp_path / "out"), "--no-plots"]
-    error = CliRunner().invoke(command, words).exception
-    assert isinstance(error, AwError) and "changes.csv exists" in str(error)
+    done = aw("cost", tmp_path / "runs", "-o", tmp_path / "out")
+    assert done.returncode == 2 and "changes.csv exists" in done.stderr
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["changes.csv"]

@@ -3,16 +3,14 @@
 import sys
 
 import pytest
-from click.testing import CliRunner
 
-from ambiguous_wild.cli import doctor, main
+from ambiguous_wild.cli import doctor
 from ambiguous_wild.cli import options as devices
-from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.cli.doctor import Probe
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat import readiness
+from tests.command_line import aw
 from tests.splat.test_readiness import CASES, TORCH, found
-from tests.tiny_scene import write_tiny_scene
 
 
 @pytest.fixture
@@ -34,40 +32,21 @@ def test_auto_warns_on_stderr_and_takes_the_cpu(here, capsys):
     assert f"{sys.executable} -m pip install" in err and "[cuda]" in err
 
 
-def test_cuda_is_refused_with_exit_code_2_before_anything_is_made(here, tmp_path, monkeypatch, capsys):
+def test_cuda_is_refused_with_exit_code_2_before_anything_is_made(here, scene, tmp_path):
     here(CASES["no nvcc"][0])
-    scene = write_tiny_scene(tmp_path / "scene")
-    words = ["bench", "--method", "3dgs", "--scene", str(scene), "-o", str(tmp_path / "runs")]
-    monkeypatch.setattr(sys, "argv", ["aw", *words, "--device", "cuda"])
-    with pytest.raises(SystemExit) as end:
-        main.main()
-    assert end.value.code == 2
-    err = capsys.readouterr().err
-    assert (
-        err.startswith("error: --device cuda: gsplat needs nvcc to compile its kernels")
-        and err.count("\n") == 1
-    )
+    done = aw("bench", "--method", "3dgs", "--scene", scene, "-o", tmp_path / "runs", "--device", "cuda")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: --device cuda: gsplat needs nvcc to compile its kernels")
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_grid_falls_back_and_runs(here, tmp_path, monkeypatch):
+def test_a_grid_falls_back_and_runs(here, scene, tmp_path, monkeypatch):
     # it compiles all kernels
     monkeypatch.setattr("ambiguous_wild.splat.calibration.prepare_cpu", lambda *_: None)
     here(CASES["other gsplat"][0])
-    scene = write_tiny_scene(tmp_path / "scene")
-    words = [
-        "--method",
-        "3dgs",
-        "--scene",
-        scene,
-        "-o",
-        tmp_path / "runs",
-        "--iterations",
-        3,
-        "--no-pictures",
-    ]
-    done = CliRunner().invoke(bench, [str(w) for w in words], catch_exceptions=False)
-    assert done.exit_code == 0
+    words = ("--method", "3dgs", "--scene", scene, "--iterations", 3, "--no-pictures")
+    done = aw("bench", *words, "-o", tmp_path / "runs")
+    assert done.returncode == 0
     assert done.stderr.count("warning: the GPU is not used, the CPU is: gsplat 1.6.0 is installed") == 1
     assert "1 run: 1 trained" in done.stderr
 

@@ -5,21 +5,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-from click.testing import CliRunner
-
-from ambiguous_wild.cli.methods import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods import registry
+from tests.command_line import aw
 
 
-@pytest.fixture(autouse=True)
-def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "registered", {})
+def shown(*args: str) -> str:
+    return aw("methods", *args).stdout
 
 
 def test_every_method_is_listed_with_what_it_needs() -> None:
-    out = CliRunner().invoke(command, [], catch_exceptions=False).output
+    out = shown()
     for name, entry in registry.all_methods().items():
         block = out[out.index(name) :]
         assert entry.summary.split()[0] in block
@@ -28,7 +24,7 @@ def test_every_method_is_listed_with_what_it_needs() -> None:
 
 
 def test_json_holds_the_same_facts() -> None:
-    rows = json.loads(CliRunner().invoke(command, ["--json"], catch_exceptions=False).output)
+    rows = json.loads(shown("--json"))
     known = registry.all_methods()
     assert [r["name"] for r in rows] == sorted(known)
     for row in rows:
@@ -42,20 +38,11 @@ def test_a_plugin_is_listed(tmp_path: Path) -> None:
         "'About the file.'\nfrom ambiguous_wild.methods import MethodEntry, register\n"
         "register(MethodEntry(name='mine', summary='my own', recipe='x:y', needs='a GPU'))\n"
     )
-    out = CliRunner().invoke(command, ["--plugin", str(plugin)], catch_exceptions=False).output
+    out = shown("--plugin", str(plugin))
     assert "mine" in out and "needs: a GPU" in out
     plugin.write_text(plugin.read_text().replace("'x:y'", "lambda options: None"))
     full = shown("--plugin", str(plugin), "mine")
     assert "my own" in full and "About the file" not in full
-    error = CliRunner().invoke(command, ["--plugin", str(tmp_path / "no.py")]).exception
-    assert isinstance(error, AwError)
-
-
-# -- one in full, and the table --------------------------------------------------------------------
-
-
-def shown(*args: str) -> str:
-    return CliRunner().invoke(command, list(args), catch_exceptions=False).output
 
 
 def test_a_method_in_full_says_what_differs_and_its_options() -> None:

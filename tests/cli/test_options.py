@@ -1,4 +1,4 @@
-"""One name per option over all commands; names of the version before still work."""
+"""One name per option over all commands."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 import pytest
 
 from ambiguous_wild.cli.main import cli
+from ambiguous_wild.cli.options import PathName
 
 
 def _walk(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
@@ -61,6 +62,13 @@ def test_the_same_meaning_has_the_same_name() -> None:
     described = {flag: o.help or "" for options in OPTIONS.values() for flag, o in options.items()}
     white = {flag for flag, text in described.items() if "white =" in text}
     assert white == {"--keep-masks", "--distractor-masks", "--objects"}
+
+
+def test_every_path_refuses_an_empty_name() -> None:
+    paths = [
+        p.type for command in COMMANDS.values() for p in command.params if isinstance(p.type, click.Path)
+    ]
+    assert len(paths) > 30 and all(isinstance(kind, PathName) for kind in paths)
 
 
 @pytest.mark.parametrize("name", [name for name, options in OPTIONS.items() if "--overwrite" in options])

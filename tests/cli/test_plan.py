@@ -2,8 +2,6 @@
 
 import json
 
-import pytest
-
 from tests.command_line import aw
 
 
@@ -47,24 +45,3 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
     assert photo.read_bytes() == b"\xff\xd8 mine"
     for _ in range(2):  # an earlier plan is
         assert aw("plan", scene, "-o", tmp_path / "plan.json", "--no-probe").returncode == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["plan", "SCENE", "-o", "SCENE/plan.json"], "would change the scene"),
-        (["plan", "SCENE/nothing"], "there is no scene folder"),
-        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "poss"], "did you mean 'poses'"),
-        (["bench", "--method", "3dgs", "--scene", "SCENE", "--effects", "all,poses"], "cannot be combined"),
-        (["bench", "--method", "refinesplat", "--scene", "SCENE", "--plan", "gone"], "there is no plan gone"),
-        (
-            ["bench", "--method", "3dgs", "--scene", "SCENE", "--plan", "plan.json", "--effects", "none"],
-            "--plan plan.json would not be used: 3dgs with --effects none; add --effects auto",
-        ),
-    ],
-)  # fmt: skip
-def test_mistakes_get_one_line_and_exit_code_2(scene, arguments, message):
-    done = aw(*(a.replace("SCENE", str(scene)) for a in arguments))
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1

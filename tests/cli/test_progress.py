@@ -99,9 +99,8 @@ def test_quiet_verbose_and_the_log_of_a_run(words: list[str], tmp_path: Path) ->
     told = aw(*words, *effects, "--seed", "1", "-v").stderr
     assert "test PSNR" in told and told.count("measuring") == 1
     plain = aw(*words, *effects, "--seed", "2").stderr
-    assert re.search(
-        r"-> .*\n    setting up\n    training\n    measuring \d+ test views\n    drawing ", plain
-    )
+    phases = r"-> .*\n    setting up\n    training\n    measuring \d+ test views\n    drawing "
+    assert re.search(phases, plain)
     wrong = aw("table", tmp_path / "none", "-q")
     assert wrong.returncode == 2 and wrong.stderr.startswith("error: no folder of runs")
     assert "exclude each other" in aw("-q", "-v", "doctor").stderr

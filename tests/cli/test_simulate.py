@@ -1,4 +1,4 @@
-"""`aw simulate`: what it prints, refuses and leaves."""
+"""`aw simulate` and `aw composite`: what they print and leave; their mistakes are in test_mistakes.py."""
 
 from __future__ import annotations
 
@@ -7,78 +7,65 @@ import shlex
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from ambiguous_wild.cli.simulate import simulate_command as command
-from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import folder_lock
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.simulate.presets import PRESETS
+from tests.command_line import aw
+from tests.io.model_maker import write_scene
+
+TINY = ("simulate", "tiny", "--views", 4, "--width", 64)
+NAMES = [f"p{i}.png" for i in range(10)]
 
 
-def aw_simulate(*words: object) -> str:
-    return CliRunner().invoke(command, [str(w) for w in words], catch_exceptions=False).stdout
+@pytest.fixture
+def commands(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[object, ...]]:
+    base = tmp_path_factory.mktemp("base")
+    write_scene(base, NAMES, points=100)
+    return {"simulate": TINY, "composite": ("composite", base, "--patches")}
 
 
-def test_list_names_every_preset() -> None:
-    lines = aw_simulate("--list").splitlines()
-    assert [line.split()[0] for line in lines] == list(PRESETS)
-    assert [row["name"] for row in json.loads(aw_simulate("--list", "--json"))] == list(PRESETS)
+def printed(*words: object) -> str:
+    done = aw(*words)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
-def test_counts_and_the_next_command(tmp_path: Path) -> None:
-    words = ("tiny", "-o", tmp_path / "raw", "--views", 4, "--width", 64)
-    first = aw_simulate(*words)
-    assert "wrote" in first and "4 train and 2 test photos of 64x36" in first
-    assert f"next: aw build-scene {tmp_path / 'raw'}" in first
-    assert len(list((tmp_path / "raw/train").iterdir())) == 4
-    assert "already there, unchanged" in aw_simulate(*words)
-    said = json.loads(aw_simulate(*words, "--json"))
-    assert said["reused"] and said["preset"] == "tiny" and 0 < said["occlusion"]["mean"] < 1
+def test_without_a_name_every_preset_is_listed() -> None:
+    assert [line.split()[0] for line in printed("simulate").splitlines()] == list(PRESETS)
+    assert [row["name"] for row in json.loads(printed("simulate", "--json"))] == list(PRESETS)
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["courtyrad", "-o", "x"], "did you mean 'courtyard'"),
-        (["tiny"], "-o raw"),
-        ([], "name a capture"),
-        (["tiny", "-o", "x", "--views", "1"], "3 to 2000"),
-    ],
-)
-def test_errors_say_what_to_do(words: list[str], expected: str) -> None:
-    error = CliRunner().invoke(command, words).exception
-    assert isinstance(error, AwError) and expected in str(error)
-
-
-def test_the_next_command_can_be_pasted_where_the_path_has_spaces(tmp_path: Path) -> None:
+def test_a_capture_is_counted_and_the_next_command_can_be_pasted(tmp_path: Path) -> None:
     out = tmp_path / "my raw"
-    said = aw_simulate("tiny", "-o", out, "--views", 4, "--width", 64)
-    words = shlex.split(said.splitlines()[-1])
-    assert words[3] == str(out) and words[5] == f"{out}-scene"
+    first = printed(*TINY, "-o", out)
+    assert "wrote" in first and "4 train and 2 test photos of 64x36" in first
+    words = shlex.split(first.splitlines()[-1])
+    assert words[:4] == ["next:", "aw", "build-scene", str(out)] and words[5] == f"{out}-scene"
+    assert len(list((out / "train").iterdir())) == 4 and (out / "truth/sheet.jpg").is_file()
+    assert "already there, unchanged" in printed(*TINY, "-o", out)
+    facts = json.loads(printed(*TINY, "-o", out, "--json"))
+    assert facts["reused"] and facts["preset"] == "tiny" and 0 < facts["occlusion"]["mean"] < 1
 
 
-def test_what_a_killed_run_left_is_swept_but_nothing_else(tmp_path: Path) -> None:
-    for name in (".raw.tmp-a1", ".raw.old-b2", ".raw2.tmp-c3", ".raw.tmpl"):
-        (tmp_path / name / "train").mkdir(parents=True)
-    aw_simulate("tiny", "-o", tmp_path / "raw", "--views", 4, "--width", 64)
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".raw.tmpl", ".raw2.tmp-c3", "raw"]
+def test_a_composite_is_counted_and_its_facts_lie_in_the_scene(commands, tmp_path: Path) -> None:
+    out = tmp_path / "my out"
+    text = printed(*commands["composite"], "-o", out, "--coverage", 0.1, "--pose", "lying")
+    assert "8 train photos, 3 distractors cover" in text
+    assert f"--scene '{out}'" in text.splitlines()[-1]
+    assert len(load_scene(out).train) == 8
+    facts = json.loads(printed(*commands["composite"], "-o", tmp_path / "out", "--seed", 5, "--json"))
+    saved = json.loads((tmp_path / "out/truth/composite.json").read_text())
+    assert facts == {k: v for k, v in saved.items() if k != "photos"} and facts["config"]["seed"] == 5
 
 
-def test_two_runs_do_not_write_one_folder(tmp_path: Path) -> None:
-    (tmp_path / ".raw.tmp-a1").mkdir()
-    with folder_lock(tmp_path / "raw", "aw simulate tiny"):
-        done = CliRunner().invoke(command, ["tiny", "-o", str(tmp_path / "raw")])
-        assert isinstance(done.exception, AwError) and "being worked on" in str(done.exception)
-    assert (tmp_path / ".raw.tmp-a1").is_dir()
-
-
-@pytest.mark.parametrize("out", ["/dev/null/x", "{}/file/x", "/proc/x"])
-def test_an_output_that_cannot_be_is_found_before_the_work(
-    out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "file").write_text("x")
-    monkeypatch.setattr(
-        "ambiguous_wild.simulate.capture_writer.simulate", lambda *_: pytest.fail("worked first")
-    )
-    error = CliRunner().invoke(command, ["tiny", "-o", out.format(tmp_path)]).exception
-    assert isinstance(error, AwError) and "cannot write" in str(error)
+@pytest.mark.parametrize("name", ["simulate", "composite"])
+def test_what_a_killed_run_left_is_swept_but_nothing_else(name: str, commands, tmp_path: Path) -> None:
+    for folder in (".out.tmp-a1", ".out.old-b2", ".out2.tmp-c3", ".out.tmpl"):
+        (tmp_path / folder / "train").mkdir(parents=True)
+    with folder_lock(tmp_path / "out", f"aw {name}"):  # two runs do not write one folder
+        done = aw(*commands[name], "-o", tmp_path / "out")
+        assert done.returncode == 2 and "being worked on" in done.stderr
+    assert (tmp_path / ".out.tmp-a1").is_dir()
+    printed(*commands[name], "-o", tmp_path / "out")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".out.tmpl", ".out2.tmp-c3", "out"]

@@ -55,11 +55,3 @@ def test_a_scene_is_not_called_images(tmp_path: Path, folder: str, name: str) ->
         cv2.imwrite(str(tmp_path / folder / f"{i}.jpg"), np.full((48, 64, 3), 90 * i, np.uint8))
     done = aw("try", folder, "-o", "out", cwd=tmp_path)
     assert f"build-scene {folder} -o out/scene --name {name}\n" in done.stderr
-
-
-def test_what_is_neither_photos_nor_a_video_is_refused_first(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    for words, message in ((["empty"], "holds no photos"), (["empty", "--budget", "5"], "no duration")):
-        done = aw("try", *words, "-o", "out", cwd=tmp_path)
-        assert done.returncode == 2 and message in done.stderr and done.stderr.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["empty"]

@@ -238,8 +238,12 @@ def test_a_plain_scene_must_be_imported_first(tmp_path):
 
 
 def test_the_template_is_read_back(tmp_path):
-    done = aw("package", "--template", tmp_path / "release.yaml")
+    words = ("package", "--info", tmp_path / "release.yaml")
+    done = aw(*words)
     assert done.returncode == 0
+    again = aw(*words)
+    assert again.returncode == 2 and "exists; nothing is overwritten" in again.stderr
+    assert "name the scene folders" in aw(*words, "-o", tmp_path / "out").stderr
     info = read_release_info(tmp_path / "release.yaml")
     assert info.lacking == ["title", "description", "creators", "license", "consent", "contact"]
     (tmp_path / "b.yaml").write_text(

@@ -48,7 +48,7 @@ def _tiny_scene(inputs: Path) -> None:
 
 def _bench(inputs: Path, out: Path) -> list[str]:
     words = ["bench", "--method", "3dgs", "--scene", str(inputs / "scene"), "--iterations", "150"]
-    words += ["--threads", "1", "--checkpoint-every", "0.1", "--cache", str(inputs / "cache")]
+    words += ["--threads", "1", "--set", "train.checkpoint_every_s=0.1", "--cache", str(inputs / "cache")]
     return [*words, "-o", str(out / "runs")]
 
 
@@ -57,7 +57,8 @@ def _grid(inputs: Path, out: Path) -> list[str]:
     words = ["bench", "--scene", str(inputs / "scene"), "--iterations", "60", "--jobs", "2"]
     for method in ("3dgs", "robustsplat", "refinesplat"):
         words += ["--method", method]
-    return [*words, "--checkpoint-every", "0.1", "--cache", str(inputs / "cache"), "-o", str(out / "runs")]
+    words += ["--set", "train.checkpoint_every_s=0.1", "--cache", str(inputs / "cache")]
+    return [*words, "-o", str(out / "runs")]
 
 
 def _build(inputs: Path, out: Path) -> list[str]:

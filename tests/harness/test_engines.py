@@ -200,7 +200,7 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     assert left_alone(report.folder, "changed", {**job.config, "source": "0" * 64}) is None
     assert [p.name for p in (tmp_path / "node").rglob("scene")] == ["scene"]
     assert list((tmp_path / "node").rglob("run-*")) == []
-    with pytest.raises(AwError, match="--transfer-limit"):
+    with pytest.raises(AwError, match=r"engine\.transfer_limit"):
         send_scene(scene, 0.001)
 
 
@@ -211,7 +211,9 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
         (["--gpus-per-cell", "1", "--cpus-per-cell", "2"], "--cpus-per-cell, --gpus-per-cell is for"),
         (["--transfer", "store"], "--transfer is for a cluster"),
         (["--jobs", "0"], "--jobs"),
-        (["--retries", "-1"], "--retries"),
+        (["--set", "engine.retries=-1"], "setting retries is at least 0"),
+        (["--set", "engine.memory_per_cell=4"], "--set engine.memory_per_cell is for a cluster"),
+        (["--set", "engine.retrys=1"], "did you mean 'engine.retries'?"),
         (["--engine", "slurm"], "'local', 'ray'"),
         pytest.param(
             ["--engine", "ray", "--address", "auto", "--jobs", "2"], "--jobs is for this machine",

@@ -1,4 +1,4 @@
-"""--passes 2: the second training has the final masks of the first, and both are paid for."""
+"""METHOD+2passes: the second training has the final masks of the first, and both are paid for."""
 
 import json
 

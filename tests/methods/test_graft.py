@@ -282,9 +282,9 @@ def test_a_graft_is_refused_before_anything_is_trained_or_made(scene, tmp_path):
     arguments = ["--method", "3dgs", "--scene", scene, "--iterations", "5", "-o", tmp_path / "runs"]
     for more in (
         ["--method", "3dgs@mask=desplat"],
-        ["--mask", "desplat", "--passes", "2"],
+        ["--mask", "desplat", "--method", "3dgs+2passes"],
         ["--method", "3dgs@mask=gs-w"],
-        ["--regulariser", "mcmc"],
+        ["--method", "3dgs@regulariser=mcmc"],
     ):
         result = run(bench, *arguments, *more)
         assert isinstance(result.exception, AwError), result.output

@@ -106,7 +106,7 @@ def short(line: str) -> str:
     if re.match(r"(bench|ablate) (?!.*--(budget|iterations) )", line):
         line = line.replace(" ", " --iterations 20 ", 1)
     if line.startswith("bench "):
-        line = line.replace(" ", " --probes 1 --threads 1 ", 1)
+        line = line.replace(" ", " --set train.probes=1 --threads 1 ", 1)
     if re.match(r"simulate .* -o ", line):
         line = line.replace(" ", " --views 12 --width 320 ", 1)
     return line
@@ -157,7 +157,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, built: Path) -> Path:
 
 def supply(line: str, folder: Path) -> None:
     """What a person does between two lines of a block."""
-    if "--info release.yaml" in line:
+    if "--info release.yaml -o" in line:
         form = (folder / "release.yaml").read_text("utf-8")
         form = re.sub(
             r'^(title|description|license|consent|contact): ""', r"\1: as in the test", form, flags=re.M

@@ -94,7 +94,7 @@ def test_it_is_the_installed_package_that_runs(installed: Path, tmp_path: Path) 
 
 
 def test_light_commands_work_outside_a_checkout(installed: Path, tmp_path: Path) -> None:
-    assert "findings in" in run(installed, tmp_path, "audit", "--format", "csv").stderr
+    assert "findings in" in run(installed, tmp_path, "audit").stderr
     assert json.loads(run(installed, tmp_path, "methods", "--json").stdout)
 
 
@@ -105,7 +105,7 @@ def test_a_capture_becomes_a_scene_a_table_and_a_page(installed: Path, tmp_path:
         installed, tmp_path, "bench", "--method", "3dgs", "--scene", "scene", "--iterations", 20, "-o", "runs"
     )
     assert "3dgs" in run(installed, tmp_path, "table", "runs").stdout
-    run(installed, tmp_path, "cost", "runs", "--no-plots")
+    run(installed, tmp_path, "cost", "runs")
     run(installed, tmp_path, "leaderboard", "add", "runs", "--board", "board")
     run(installed, tmp_path, "leaderboard", "publish", "--board", "board", "-o", "page", "--reported")
     page = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")

@@ -204,13 +204,14 @@ def test_the_command_writes_every_format_and_tells_by_its_exit_code(tmp_path: Pa
     wrong_mean(rows)
     entry(rows)["ssim"]["method"] = entry(rows)["lpips"]["method"] = "=cmd|<b>"
     write([*rows, {**rows[0], "table": "again", "method": "=cmd|<b>", "value": "300.00"}], bad)
-    facts = json.loads(run(bad, "--format", "json"))
+    facts = json.loads(run(bad, "--json"))
     assert facts and set(facts[0]) == {"kind", "text", "tables", "where"}
     assert facts[0]["where"][0].startswith("bad.csv:")
-    table = list(csv.reader(run(bad, "--format", "csv").splitlines()))
+    for name in ("out.csv", "out.md", "out.txt"):
+        run(bad, "-o", tmp_path / name)
+    table = list(csv.reader((tmp_path / "out.csv").read_text().splitlines()))
     assert len(table) == len(facts) + 1 and not [c for line in table for c in line if c[:1] == "="]
-    assert "<b>" not in run(bad, "--format", "markdown")
-    run(bad, "-o", tmp_path / "out.txt")
+    assert "<b>" not in (tmp_path / "out.md").read_text()
     assert "mean: " in (tmp_path / "out.txt").read_text()
     assert CliRunner().invoke(audit_command, [str(bad), "--strict"]).exit_code == 1
     assert CliRunner().invoke(audit_command, [str(good), "--strict"]).exit_code == 0

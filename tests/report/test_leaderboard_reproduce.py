@@ -148,7 +148,7 @@ def test_the_commands_give_the_same_psnr_in_an_empty_folder(tmp_path: Path) -> N
         assert done.returncode == 0, done.stderr
 
     first, empty = tmp_path / "first", tmp_path / "empty"
-    bash("aw simulate tiny --views 8 --width 256 --no-pictures -o photos", first)
+    bash("aw simulate tiny --views 8 --width 256 -o photos", first)
     bash("aw build-scene photos -o small --factor 2", first)
     bash("aw bench --method 3dgs --scene small --iterations 20 --no-pictures -o runs", first)
     bash("aw leaderboard add runs --board board --images 0", first)

@@ -35,8 +35,8 @@ def test_a_suite_end_to_end(name, large, tmp_path):
     make, folders = SUITES[name]
     for folder in folders:
         make(tmp_path / "root" / folder)
-    words = ["bench", "--suite", name, "--root", tmp_path / "root", "--method", "3dgs", "--iterations", "10"]
-    done = aw(*words, "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1")
+    words = ["bench", "--suite", name, "--scene", tmp_path / "root", "--method", "3dgs", "--iterations", "10"]
+    done = aw(*words, "-o", tmp_path / "runs", "--set", "train.probes=0", "--no-pictures", "--threads", "1")
     assert done.returncode == 0, done.stderr
     suite = get_suite(name)
     assert done.stdout.count(suite.dataset) >= 1
@@ -53,7 +53,7 @@ def test_a_suite_end_to_end(name, large, tmp_path):
     assert info["factor"] == (suite.factor or 8)
     missing = [s for s in suite.scenes if scene_id(s) not in {p.name for p in (tmp_path / "runs").iterdir()}]
     assert (f"scenes not found: {', '.join(missing)}" in done.stdout) == bool(missing)
-    again = aw(*words, "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1")
+    again = aw(*words, "-o", tmp_path / "runs", "--set", "train.probes=0", "--no-pictures", "--threads", "1")
     assert again.returncode == 0 and "imported" not in again.stderr
 
 
@@ -63,7 +63,7 @@ def test_reported_numbers_stand_in_their_own_rows(large, tmp_path):
     prepared = prepare_suite(get_suite("drone"), tmp_path / "root", tmp_path / "runs")
     done = aw(
         "bench", "--method", "3dgs", "--scene", prepared.scenes["simingshan"], "--iterations", "5",
-        "-o", tmp_path / "runs", "--probes", "0", "--no-pictures", "--threads", "1",
+        "-o", tmp_path / "runs", "--set", "train.probes=0", "--no-pictures", "--threads", "1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     (table,) = suite_tables(prepared, tmp_path / "runs")
@@ -129,10 +129,10 @@ def test_a_scene_under_another_name_is_refused(large, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--suite", "on-the-go"], "--root DIR"),
-        (["--suite", "on-the-go", "--root", "absent"], "is no folder"),
-        (["--suite", "on-the-run", "--root", "."], "'on-the-run'"),
-        (["--root", ".", "--method", "3dgs", "--scene", "x"], "--root goes with --suite"),
+        (["--suite", "on-the-go"], "--scene DIR"),
+        (["--suite", "on-the-go", "--scene", "absent"], "is no folder"),
+        (["--suite", "on-the-run", "--scene", "."], "'on-the-run'"),
+        (["--suite", "on-the-go", "--scene", ".", "--scene", "x"], "--scene DIR once"),
         (["--scene", "x"], "--method is missing"),
         (["--method", "3dgs"], "--scene is missing"),
     ],

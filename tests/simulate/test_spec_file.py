@@ -46,7 +46,7 @@ def simulated(folder: Path, text: str) -> Result:
     """`aw simulate` of a spec in the folder."""
     path = folder / "spec.yaml"
     path.write_text(text)
-    return CliRunner().invoke(command, [str(path), "-o", str(folder / "raw"), "--no-pictures"])
+    return CliRunner().invoke(command, [str(path), "-o", str(folder / "raw")])
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_a_scene_is_measured_printed_and_simulated(built: Path, tmp_path: Path) 
     assert printed.returncode == 0, printed.stderr
     spec = parse_spec(printed.stdout)
     assert printed.stdout.startswith("# photos: ")
-    done = aw("simulate", "--like", scene, "--width", 96, "-o", tmp_path / "raw", "--no-pictures")
+    done = aw("simulate", "--like", scene, "--width", 96, "-o", tmp_path / "raw")
     assert done.returncode == 0, done.stderr
     assert len(list((tmp_path / "raw/train").iterdir())) == spec.train_views
     assert Image.open(next((tmp_path / "raw/train").iterdir())).size == (96, spec.height)

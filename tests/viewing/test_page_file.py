@@ -149,7 +149,6 @@ def test_what_cannot_be_shown_is_one_line(runs: Path, tmp_path: Path) -> None:
     for words, told in (
         ([tmp_path / "none"], "no folder of runs"),
         ([tmp_path], "no finished run with a point_cloud.ply"),
-        ([runs, "--only", "hall"], "unknown scene 'hall'"),
         ([runs, "--scene", tmp_path / "gone"], "take its folder: --scene"),
         ([], "no RUNS"),
         ([runs, "--live", runs.parent / "porch"], "leave RUNS out"),
@@ -180,8 +179,10 @@ def test_another_model_or_another_state_of_the_scene_is_refused(tmp_path: Path) 
 def test_runs_of_two_scenes_need_a_choice(runs: Path, tmp_path: Path) -> None:
     other = write_tiny_scene(tmp_path / "yard", distractors=False)
     write_shown_run(tmp_path / "runs", other, "3dgs")
-    with pytest.raises(AwError, match="choose one with --only"):
+    with pytest.raises(AwError, match="give those of one"):
         view_runs([runs, tmp_path / "runs"], tmp_path / "out")
+    with pytest.raises(AwError, match="unknown scene 'hall'"):
+        view_runs([runs], tmp_path / "out", scene="hall")
     page = view_runs([runs, tmp_path / "runs"], tmp_path / "out", scene="yard")
     assert len(facts(page.path.read_text())["models"]) == 1
 

@@ -116,7 +116,7 @@ def test_what_is_no_path_is_one_line(scene: Scene, tmp_path: Path, text: str) ->
 def test_a_video_of_two_methods(runs: Path, tmp_path: Path) -> None:
     done = aw(
         "video", runs, "-o", tmp_path / "v.mp4", "--seconds", 1, "--fps", 12, "--width", 96, "--threads", 1,
-        "--gif", tmp_path / "v.gif", "--gif-seconds", 0.5, "--gif-width", 128,
+        "--gif", tmp_path / "v.gif",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "12 frames, 1.0 s, 3dgs, refinesplat" in done.stderr.partition("drawing 12 frames of 3dgs, ")[2]
@@ -128,7 +128,7 @@ def test_a_video_of_two_methods(runs: Path, tmp_path: Path) -> None:
     from PIL import Image
 
     with Image.open(tmp_path / "v.gif") as gif:
-        assert gif.size[0] == 128 and gif.n_frames == 6 and gif.info["loop"] == 0
+        assert gif.size[0] == 196 and gif.n_frames == 12 and gif.info["loop"] == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["v.gif", "v.mp4"]
 
 

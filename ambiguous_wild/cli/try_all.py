@@ -80,7 +80,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         ["aw", "bench", "--method", ",".join(METHODS), "--scene", str(scene), "--budget", "30m"]
     )
     say(
-        f"\n{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
+        f"{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
         f"{output / 'comparison.png'}. To train longer: {longer} -o longer"
     )
 

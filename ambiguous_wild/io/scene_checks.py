@@ -147,7 +147,9 @@ def _odd_focal_lengths(scene: Scene) -> str:
 def _one_point(scene: Scene) -> str:
     if len(scene.points.xyz) < 2 or np.ptp(scene.points.xyz, axis=0).any():
         return ""
-    return "all points of the sparse model lie at one place: check the model"
+    return (
+        "all points of the sparse model lie at one place, so nothing can be learnt from it: check the model"
+    )
 
 
 def _no_point_in_view(scene: Scene) -> str:
@@ -170,13 +172,13 @@ CHECKS = (
     SceneCheck(True, _shared_photos),
     SceneCheck(True, _one_pose),
     SceneCheck(True, _hidden_by_alpha),
+    SceneCheck(True, _one_point),
+    SceneCheck(True, _no_point_in_view),
     SceneCheck(False, _few_train_photos),
     SceneCheck(False, _far_cameras),
     SceneCheck(False, _one_position),
     SceneCheck(False, _odd_principal_points),
     SceneCheck(False, _odd_focal_lengths),
-    SceneCheck(False, _one_point),
-    SceneCheck(False, _no_point_in_view),
 )
 
 

@@ -182,6 +182,12 @@ def main() -> None:
         if isinstance(error, ImportError) and not re.search("allocate memory|failed to map", str(error)):
             raise
         _fail(_LITTLE)
+    except RuntimeError as error:
+        if "start new thread" in str(error):
+            _fail(_LITTLE)
+        if "Symlink loop" in str(error):  # of Path.resolve in Python below 3.13
+            _fail(f"{error}: a link that leads to itself; give another path")
+        raise
 
 
 def _check_threads() -> None:

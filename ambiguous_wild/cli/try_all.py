@@ -56,7 +56,12 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         if done is not None and done.exists():
             say(f"done before: {done}")
             return
-        ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
+        try:
+            ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
+        except AwError as error:
+            if "--overwrite" not in str(error):
+                raise
+            raise AwError(f"{error} ('aw try' has no such option: give it to the step printed above)") from None
 
     if video:
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
@@ -90,7 +95,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         ["aw", "bench", "--method", ",".join(METHODS), "--scene", str(scene), "--budget", "30m"]
     )
     say(
-        f"\n{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
+        f"{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
         f"{output / 'comparison.png'}. To train longer: {longer} -o longer"
     )
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from ambiguous_wild.core.camera import Camera, rotation_from_quat
 from ambiguous_wild.core.config import Facts
-from ambiguous_wild.core.errors import shortlist
 
 Split = Literal["train", "test"]
 NO_PHOTO = Path()  # image path of views without a photo: of a splat file's scene, or hidden from methods
@@ -199,28 +198,6 @@ def near_others(centers: np.ndarray) -> np.ndarray:
     near = away <= _FAR_CAMERA * usual
     few = usual > 0.0 and (~near).sum() <= max(1, _FEW_CAMERAS * len(centers))
     return near if few else np.ones(len(centers), bool)
-
-
-def unlikely(scene: Scene) -> list[str]:
-    """Return warnings about cameras and points that are probably wrong."""
-    found = []
-    if far := {view.name for view in scene.train} - {view.name for view in together(scene.train)}:
-        found.append(
-            f"the cameras of {shortlist(sorted(far))} lie far from all others, so their poses are probably "
-            "wrong; the scene's size is measured without them: check them, or take them out of "
-            "train_list.txt"
-        )
-    cameras = [view.camera for view in scene.train]
-    if len(cameras) > 1 and not np.ptp([camera.center for camera in cameras], axis=0).any():
-        found.append("all cameras stand at one place, where photos show no depth: check the poses")
-    outside = [
-        v.name for v, c in zip(scene.train, cameras) if not (0 <= c.cx <= c.width and 0 <= c.cy <= c.height)
-    ]
-    if outside:
-        found.append(f"principal points outside of the photos: {shortlist(outside)}; check their cameras")
-    if len(scene.points.xyz) > 1 and not np.ptp(scene.points.xyz, axis=0).any():
-        found.append("all points of the sparse model lie at one place: check the model")
-    return found
 
 
 def _away(centers: np.ndarray) -> tuple[np.ndarray, float]:

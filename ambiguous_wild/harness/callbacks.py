@@ -131,7 +131,7 @@ def outcome_line(report: CellReport) -> str:
     effects = report.result["facts"].get("effect_facts", {})
     empty = [name for name, facts in effects.items() if facts.get("points") == 0]
     if empty:
-        parts.append(f"{' and '.join(empty)} added no point (no room under --max-gaussians?)")
+        parts.append(f"{' and '.join(empty)} added no point")
     timing = timing_of(cost)
     parts += [f"time not ranked: {timing.reason}"] if timing.verdict == "contended" else []
     return ", ".join(parts)

@@ -29,14 +29,16 @@ from ambiguous_wild.harness.cell import (
 from ambiguous_wild.harness.external_runs import run_program
 from ambiguous_wild.harness.pictures import ROWS
 from ambiguous_wild.harness.result_file import (
+    CONFIG,
     FAILED,
     RESULT,
     RunConfig,
-    model_hash,
+    artefact_hashes,
+    check_whole,
     read_result,
     write_result,
 )
-from ambiguous_wild.harness.store import CONFIG, read_config
+from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
 from ambiguous_wild.harness.training import STOPPED, train_and_measure
 from ambiguous_wild.io import plain_yaml
@@ -184,8 +186,20 @@ def refuse_other_code(folder: Path, cell: Cell) -> None:
 
 
 def refuse_other_config(folder: Path, cell: Cell) -> None:
-    """Raise AwError if the folder was made by another configuration; the error names what differs."""
+    """Raise AwError if the folder was made by another configuration; the error names what differs.
+
+    Raises:
+        AwError: also where a finished run lacks files.
+    """
     path = folder / CONFIG
+    if is_finished(folder):
+        result = read_result(folder / RESULT)
+        if not path.is_file() and result["config_hash"] != cell.identity:
+            raise AwError(
+                f"{folder} holds a run of another configuration, and lacks its {CONFIG}, which would say "
+                "what differs; choose another -o, or replace it with --overwrite always"
+            )
+        check_whole(folder, result)
     if not _is_begun(folder):
         return
     try:
@@ -227,7 +241,10 @@ def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = 
                         result = run_program(cell, place)
                     else:
                         result = train_and_measure(cell, place, options, tick)
-                    write_result(place / RESULT, {**result, **model_hash(place), **provenance(cell)})
+                    write_result(
+                        place / RESULT,
+                        {**result, **artefact_hashes(place, result["per_image"]), **provenance(cell)},
+                    )
                 except (Exception, SystemExit) as error:
                     record_failure(cell, place, error)
                     LOG.debug("failed: %s", error_line(error))

@@ -81,7 +81,7 @@ class Metric(Measure):
             if np.ndim(value) or value is None:
                 raise AwError(f"the function returned {type(value).__name__}, not one number")
             return float(value)
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a user's function may call sys.exit
             if isinstance(self.function, str) or isinstance(error, AwError):
                 raise
             raise AwError(f"{type(error).__name__}: {error}{error_location(error)}") from error

@@ -166,8 +166,10 @@ def _find_regions(scene: Scene) -> Regions:
     pixels: dict[str, dict[str, np.ndarray]] = {}
     missing: dict[str, str] = {}
     kept = {view.name: mask for view in scene.test if (mask := _user_keep(scene, view)) is not None}
-    if kept:
+    if any(mask.any() for mask in kept.values()):
         pixels[VALID] = kept
+    elif kept:
+        missing[VALID] = "the masks in masks/test leave no pixel to measure (white = measured)"
     else:
         missing[VALID] = "no test photo has a mask (masks/test/<stem>.png, white = measured)"
     masks_of_train = [true_distractor(scene, view) for view in scene.train]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, NotRequired, Required, TypedDict, cast
 
@@ -19,6 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, MetricRecord, measure, remember
 from ambiguous_wild.io.files import sha256_file, unique_keys, write_json
 from ambiguous_wild.metrics import stats
@@ -34,6 +35,9 @@ SCHEMA = 1
 RESULT = "metrics.json"
 FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
 MODEL = "point_cloud.ply"
+CONFIG = "config.yaml"
+RENDERS = Path("renders") / "test"
+RESTORE = "restore it, or train again with --overwrite always"
 
 
 def metrics_of(row: ImageRow) -> dict[str, float | None]:
@@ -159,6 +163,7 @@ class RunResult(TypedDict):
     rescored: NotRequired[list[Rescore]]
     metrics: NotRequired[dict[str, MetricRecord]]  # of metrics that are not of this package
     model_sha256: NotRequired[str]  # of point_cloud.ply; also absent where the run has none
+    render_sha256: NotRequired[dict[str, str]]  # test photo -> hash of its render
 
 
 class SceneConfig(TypedDict):
@@ -241,18 +246,47 @@ def read_result(path: Path | str) -> RunResult:
     return _checked(data, str(path))
 
 
-def model_hash(run: Path) -> dict[str, str]:
-    """Return `model_sha256` for the model in a run's folder; empty where it has no model."""
-    return {"model_sha256": sha256_file(run / MODEL)} if (run / MODEL).is_file() else {}
+def artefact_hashes(run: Path, rows: Sequence[ImageRow]) -> dict[str, str | dict[str, str]]:
+    """Return the hashes of a run's model and renders, as metrics.json keeps them."""
+    model = {"model_sha256": sha256_file(run / MODEL)} if (run / MODEL).is_file() else {}
+    return {
+        **model,
+        "render_sha256": {row["name"]: sha256_file(render_path(run, row["name"])) for row in rows},
+    }
+
+
+def render_path(run: Path, name: str) -> Path:
+    """Return where a run keeps the render of a test photo."""
+    return (run / RENDERS / name).with_suffix(".png")
+
+
+def check_render(run: Path, result: RunResult, name: str) -> Path:
+    """Return the path of a render; raise AwError where it is absent or not the one that was measured."""
+    path = render_path(run, name)
+    if not path.is_file():
+        raise AwError(f"{run} lacks its render {path.relative_to(run)}: {RESTORE}")
+    measured = result.get("render_sha256", {}).get(name)  # earlier versions kept no hash
+    if measured is not None and sha256_file(path) != measured:
+        raise AwError(
+            f"{path} is not the render that was measured (another hash than in {RESULT}): {RESTORE}"
+        )
+    return path
+
+
+def check_whole(run: Path, result: RunResult) -> None:
+    """Raise AwError where a finished run lacks its settings, or files that its result lists."""
+    needed = [run / CONFIG] + [run / MODEL] * ("model_sha256" in result)
+    needed += [render_path(run, name) for name in result.get("render_sha256", {})]
+    if lacking := [str(path.relative_to(run)) for path in needed if not path.is_file()]:
+        raise AwError(f"{run} is damaged, it lacks {shortlist(lacking)}: {RESTORE}")
 
 
 def check_model(run: Path, result: RunResult) -> None:
     """Raise AwError if the run's model is not the one that was measured; earlier versions kept no hash."""
     measured = result.get("model_sha256")
-    if measured is not None and model_hash(run).get("model_sha256") != measured:
+    if measured is not None and not ((run / MODEL).is_file() and sha256_file(run / MODEL) == measured):
         raise AwError(
-            f"{run / MODEL} is not the model that was measured (another hash than in {RESULT}): restore it, "
-            "or train again with --overwrite always"
+            f"{run / MODEL} is not the model that was measured (another hash than in {RESULT}): {RESTORE}"
         )
 
 

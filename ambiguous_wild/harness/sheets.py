@@ -13,6 +13,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.result_file import RESULT, check_render, read_result
 from ambiguous_wild.harness.store import Runs
 from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import atomic_path
@@ -209,12 +210,7 @@ def _test_row(view: View, folders: dict[str, Path]) -> list[np.ndarray]:
     photo = read_png_rgb(view.image_path)
     cells = [cell(f"test photo {view.name}", photo)]
     for method, folder in folders.items():
-        path = folder / "renders" / "test" / Path(view.name).with_suffix(".png")
-        if not path.is_file():
-            raise AwError(
-                f"the run {folder} lacks its render {path.relative_to(folder)}: restore it, or train again "
-                "with 'aw bench --overwrite always'"
-            )
+        path = check_render(folder, read_result(folder / RESULT), view.name)
         render = read_png_rgb(path)
         cells.append(cell(f"{method}  {psnr(render, photo):.2f} dB", render))
     return cells

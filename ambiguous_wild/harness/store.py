@@ -18,6 +18,7 @@ from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, own
 from ambiguous_wild.harness.result_file import (
+    CONFIG,
     FAILED,
     RESULT,
     Environment,
@@ -32,7 +33,6 @@ from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
-CONFIG = "config.yaml"
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",

@@ -13,8 +13,8 @@ from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
-from ambiguous_wild.harness.result_file import MODEL, RESULT, check_model, metrics_of, read_result
-from ambiguous_wild.harness.store import CONFIG, ReadConfig, read_config, run_folders, section
+from ambiguous_wild.harness.result_file import CONFIG, MODEL, RESULT, check_model, metrics_of, read_result
+from ambiguous_wild.harness.store import ReadConfig, read_config, run_folders, section
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene

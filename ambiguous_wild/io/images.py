@@ -143,7 +143,12 @@ def _black_and_white(grey: np.ndarray, slack: int) -> np.ndarray | None:
     top = grey.max(initial=0)
     if top <= 1:
         return grey * np.uint8(255)
-    if top >= 128 and not ((grey > slack) & (grey < top)).any():  # a single light grey stands for white
+    # A single light grey beside black stands for white.
+    if (
+        top >= 128
+        and (top >= 255 - slack or grey.min() <= slack)
+        and not ((grey > slack) & (grey < top)).any()
+    ):
         return np.where(grey == top, 255, 0).astype(np.uint8)
     between = (grey > slack) & (grey < 255 - slack)
     # The grey of edges is thin and uneven; labels are areas of one value.

@@ -13,11 +13,12 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.names import check_name, quoted
-from ambiguous_wild.core.scene import SceneInfo, Split, centred, unlikely
+from ambiguous_wild.core.scene import SceneInfo, Split, centred
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelImage
 from ambiguous_wild.io.files import sha256_file, unique_keys
 from ambiguous_wild.io.images import image_size
+from ambiguous_wild.io.scene_checks import check_masks, check_scene
 
 SCENE_SCHEMA = 1  # version of scene.json, raised when an older reader would misread it
 MOST_FACTOR = 1000  # largest downsampling factor; the builder allows 64
@@ -82,13 +83,8 @@ def load_scene(
     if read is None and (note := several_models(models_in(root), sparse)):
         info["warnings"].append(note)
     masks: dict[str, Path] = {}
-    if read is None and not (root / "masks" / OWN_MASKS).is_file():
+    if read is None and (root / "masks").is_dir() and not (root / "masks" / OWN_MASKS).is_file():
         masks = find_masks(root / "masks", [name for name, side in split.items() if side == "train"])
-    if masks:
-        info["warnings"].append(
-            f"keep masks of {len(masks)} train photos in {root / 'masks'} are used; "
-            "'aw import --no-masks' makes a scene without"
-        )
     views = tuple(
         _view(root, folder, model, image, split[image.name], masks.get(image.name))
         for image in sorted(model.images.values(), key=lambda i: i.name)
@@ -99,7 +95,10 @@ def load_scene(
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
     scene = Scene(root, name, views, _points(model, views), info)
-    info["warnings"] += unlikely(scene)
+    if verify and read is None:
+        info["warnings"] += _mask_warnings(root, scene)
+    if verify and not raw:
+        info["warnings"] += check_scene(scene)
     return scene if raw else centred(scene)
 
 
@@ -208,9 +207,8 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     photo's path or, if no other photo has this base name, directly in `folder`.
     """
     there: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in MASK_SUFFIXES and path.is_file():
-            there.setdefault(path.relative_to(folder).as_posix().casefold(), path)
+    for path in sorted(mask_files(folder)):
+        there.setdefault(path.relative_to(folder).as_posix().casefold(), path)
     photos = [PurePosixPath(name) for name in names]
     bases = Counter(pure.name for pure in photos)
     masks: dict[str, Path] = {}
@@ -222,6 +220,11 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
                 masks[str(pure)] = there[key]
                 break
     return masks
+
+
+def mask_files(folder: Path) -> set[Path]:
+    """Return all files below a folder that may be masks."""
+    return {p for p in folder.rglob("*") if p.suffix.lower() in MASK_SUFFIXES and p.is_file()}
 
 
 def models_in(root: Path, places: Iterable[str] = ("sparse", "colmap/sparse")) -> list[tuple[Path, int]]:
@@ -356,6 +359,16 @@ def _view(
     keep = root / "masks" / "train" / f"{without_suffix(image.name)}.png"
     keep_path = keep if side == "train" and keep.is_file() else mask
     return View(image.name, path, camera, side, keep_path, image.image_id)
+
+
+def _mask_warnings(root: Path, scene: Scene) -> list[str]:
+    folder = root / "masks"
+    if not folder.is_dir() or (folder / OWN_MASKS).is_file():
+        return []
+    used = {view.name: view.keep_path for view in scene.train if view.keep_path is not None}
+    names = [view.name for view in scene.test]
+    tests = {*find_masks(folder, names).values(), *find_masks(folder / "test", names).values()}
+    return check_masks(folder, mask_files(folder), used, tests, [view.name for view in scene.train])
 
 
 def _image_path(folder: Path, name: str) -> Path:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.result_file import RESULT, check_render, read_result, render_path
 from ambiguous_wild.harness.store import check_names, read_runs
 from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import write_json, write_text
@@ -120,7 +121,7 @@ def render_pairs(
 def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[PairQuestion]:
     if len(folders) < 2:
         return []
-    renders = {m: _renders(f / "renders/test") for m, f in folders.items()}
+    renders = {m: _renders(f) for m, f in folders.items()}
     common = set.intersection(*(set(r) for r in renders.values()))
     if not common:
         without = [m for m, r in renders.items() if not r]
@@ -139,9 +140,11 @@ def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[P
     ]
 
 
-def _renders(folder: Path) -> dict[str, Path]:
+def _renders(run: Path) -> dict[str, Path]:
     """Renders by the names of their views, which may lie in folders."""
-    return {_stem(p.relative_to(folder).as_posix()): p for p in sorted(folder.rglob("*.png"))}
+    result = read_result(run / RESULT)
+    names = [row["name"] for row in result["per_image"]]
+    return {_stem(n): check_render(run, result, n) for n in names if render_path(run, n).is_file()}
 
 
 def _test_photos(run: Path) -> dict[str, Path]:

@@ -49,8 +49,8 @@ def test_points_project_onto_their_tracks_at_the_loaded_size(tmp_path, factor):
 
 def test_intrinsics_follow_the_actual_size_per_axis(tmp_path):
     write_scene(tmp_path, NAMES)
-    for name in NAMES:  # rounding differs between tools
-        write_png(tmp_path / "images_2" / name, np.zeros((25, 32, 3), np.uint8))
+    for shade, name in enumerate(NAMES):  # rounding differs between tools
+        write_png(tmp_path / "images_2" / name, np.full((25, 32, 3), shade, np.uint8))
     camera = load_scene(tmp_path, factor=2).views[0].camera
     assert (camera.fx, camera.fy) == pytest.approx((60.0 * 32 / WIDTH, 62.0 * 25 / HEIGHT))
     assert (camera.cx, camera.cy) == pytest.approx((33.0 * 32 / WIDTH, 23.0 * 25 / HEIGHT))

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 MOST_GAUSSIANS = 150_000
 THIS_MACHINE = "127.0.0.1"
-FORMATS = ("compressed-ply", "spz", "sog", "gltf")
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 

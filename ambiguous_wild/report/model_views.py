@@ -19,7 +19,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import ExportedModel, ViewedModel, export, space_of
+from ambiguous_wild.viewing.model import ExportedModel, export, space_of
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 
 FOLDER = "export"  # in a run folder
-GIF_FPS = 12.0
 
 
 def export_runs(
@@ -80,22 +79,23 @@ def export_runs(
     trained, more = find_models(runs) if runs else ([], [])
     for note in (*notes, *more):
         say(note)
-    first = trained[0].scene if trained else ""
-    wanted: list[tuple[ViewedModel, Path | None, str, str]]
-    wanted = [(t.model, t.run, t.scene, t.model.label) for t in trained]
-    wanted += [(m, None, first, re.sub(r"(\.compressed)?\.\w+$", "", m.label)) for m in files]
-    names = _file_names([item[2] for item in wanted], [item[3] for item in wanted])
-    folders = [(run or model.ply.parent) / FOLDER if output is None else output for model, run, *_ in wanted]
+    models = [*(t.model for t in trained), *files]
+    homes = [t.run for t in trained] + [model.ply.parent for model in files]
+    scenes = [t.scene for t in trained] + [trained[0].scene if trained else ""] * len(files)
+    stems = [re.sub(r"(\.compressed)?\.\w+$", "", model.label) for model in files]
+    names = _file_names(scenes, [t.model.label for t in trained] + stems)
+    folders = [home / FOLDER if output is None else output for home in homes]
     for folder in folders:
         check_output(folder / "file")
-    for (_, run, *_), folder, name in zip(wanted, folders, names):
-        if not overwrite and (run is None or output is not None):  # files in RUN/export are replaced anyway
-            there = [name + FORMATS[form].suffix for form in formats if form in FORMATS]
-            refuse_files_there(folder, there, "--overwrite")
+    if not overwrite:  # files in RUN/export are replaced anyway
+        for folder, name in list(zip(folders, names))[len(trained) if output is None else 0 :]:
+            wanted = [name + FORMATS[form].suffix for form in formats if form in FORMATS]
+            refuse_files_there(folder, wanted, "--overwrite")
     if loss:
         prepare_cpu(threads, say)
     reports = []
-    for (model, run, *_), folder, name in zip(wanted, folders, names):
+    for number, (model, folder, name) in enumerate(zip(models, folders, names)):
+        run = homes[number] if number < len(trained) else None
         scene: Scene | None = None
         try:
             if run is not None and (loss or up is not None):
@@ -126,6 +126,9 @@ def _file_names(scenes: Sequence[str], labels: Sequence[str]) -> list[str]:
         taken[name] = taken.get(name, 0) + 1
         names.append(name if taken[name] == 1 else f"{name}-{taken[name]}")
     return names
+
+
+GIF_FPS = 12.0
 
 
 @dataclass(frozen=True)
@@ -194,8 +197,10 @@ def video_runs(
     labels = tuple(model.label for model in shown.models)
     say(f"drawing {frames} frames of {', '.join(labels)}")
     kept: list[Frame] = []
-    count = round(gif_seconds * GIF_FPS)
-    chosen = {round(k * (frames - 1) / max(1, count - 1)) for k in range(count)}
+    chosen = {
+        round(k * (frames - 1) / max(1, round(gif_seconds * GIF_FPS) - 1))
+        for k in range(round(gif_seconds * GIF_FPS))
+    }
 
     def watched() -> Iterator[Frame]:
         for number, frame in enumerate(draw_frames(shown.models, cameras, columns=columns, tick=tick)):

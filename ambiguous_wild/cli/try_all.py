@@ -61,7 +61,9 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         except AwError as error:
             if "--overwrite" not in str(error):
                 raise
-            raise AwError(f"{error} ('aw try' has no such option: give it to the step printed above)") from None
+            raise AwError(
+                f"{error} ('aw try' has no such option: give it to the step printed above)"
+            ) from None
 
     if video:
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)

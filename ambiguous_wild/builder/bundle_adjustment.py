@@ -16,6 +16,9 @@ from ambiguous_wild.builder.retrieval import FEW
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
+# Triangulation angle that a tenth of the points must have: 1.8 where a camera only turned, 12 where it walked.
+LEAST_ANGLE_DEG = 3.0
+MOST_ANGLES = 1000  # points of which it is computed
 UNSURE = np.array([np.radians(0.4), 0.02])  # 2.5 of these are 1 degree, and 5 % of the path's radius
 ROUNDS = 20  # of weighting the photos anew, at most
 TRIES = 3  # adjustments at most
@@ -35,6 +38,19 @@ def plausible(model: Any) -> bool:
     """Tell whether the distortion is that of a lens: few or flat photos leave it undetermined."""
     low, high = DISTORTIONS
     return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
+
+
+def shows_depth(model: Any) -> bool:
+    """Tell whether photos saw points from apart; a camera that only turned gives points at any depth."""
+    centres = {k: model.images[k].projection_center() for k in model.reg_image_ids()}
+    points = list(model.points3D.values())
+    angles = []
+    for point in points[:: len(points) // MOST_ANGLES + 1]:
+        seen_from = np.array([centres[e.image_id] for e in point.track.elements if e.image_id in centres])
+        rays = seen_from - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+    return bool(angles) and float(np.percentile(angles, 90)) >= LEAST_ANGLE_DEG
 
 
 def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:

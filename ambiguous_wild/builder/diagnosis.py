@@ -17,6 +17,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 MIN_SHARE = 0.3  # share of the readable photos that must be registered, or most of the scene is missing
+STILL_DEG = 0.5  # triangulation angle of pairs below which the camera did not move, ahead neither
 MIN_POINTS = 10  # per registered photo; fewer determine neither poses nor surfaces
 _STRONG_PAIRS = 60  # pairs with the most inliers, used for the diagnosis
 
@@ -48,7 +49,8 @@ class PairFacts:
             return "too little texture or too much blur; try --max-features 8000 or sharper photos"
         if self.verified < photos - 1:
             return "photos overlap too little; take more photos, each sharing two thirds with the next"
-        if math.isfinite(self.forward) and self.forward > 0.8:
+        still = math.isfinite(self.angle_deg) and self.angle_deg < STILL_DEG
+        if math.isfinite(self.forward) and self.forward > 0.8 and not still:
             return (
                 "the camera moved straight ahead, which fixes no depth; walk sideways or round the subject, "
                 "or try --mapper global"

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.builder.bundle_adjustment import pipeline_options, plausible
+from ambiguous_wild.builder.bundle_adjustment import pipeline_options, plausible, shows_depth
 from ambiguous_wild.builder.component_merging import merge
 from ambiguous_wild.builder.matched import Matched, connected_photos
 from ambiguous_wild.builder.records import ModelSummary, no_model
@@ -65,8 +65,10 @@ def run_mapping(job: MappingJob) -> None:
     for component in {*components[:1], *([chosen] if chosen else [])}:
         component.mark_provisional()
     reliable = len(components[0].poses.keys() - components[0].provisional) if components else 0
-    if chosen is None or len(chosen.poses) < LEAST_PHOTOS:
-        left_out = dict.fromkeys(matched.names, "no pair of photos to start from")
+    turned = chosen is not None and len(chosen.poses) >= LEAST_PHOTOS and not shows_depth(chosen.model)
+    if chosen is None or len(chosen.poses) < LEAST_PHOTOS or turned:
+        why = "the camera only turned, which shows no depth" if turned else "no pair of photos to start from"
+        left_out = dict.fromkeys(matched.names, why)
         left_out |= _left_out(components[0], components) if components else {}
         names = [_names(component, component.poses) for component in components if component.poses]
         write_json(
@@ -152,6 +154,8 @@ def _models(job: MappingJob, output: Path, matched: Matched, *, constant_focal: 
             shutil.rmtree(folder)
         if any(model.num_reg_images() >= enough for model in models):
             break
+    # The global mapper may return negative focal lengths.
+    models = [m for m in models if all(c.mean_focal_length() > 0 for c in m.cameras.values())]
     return [model for model in models if model.num_reg_images() >= LEAST_PHOTOS]
 
 

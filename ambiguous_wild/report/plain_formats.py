@@ -118,7 +118,7 @@ def to_markdown(tables: Sequence[Table]) -> str:
     for table, below in _with_below(tables):
         parts += [f"**{markdown_text(table.title)}**", ""] if table.title else []
         head = [
-            f"{markdown_text(c.group)} {c.measure.label} {ARROWS[c.measure.better]}".strip()
+            f"{markdown_text(c.group)} {markdown_text(c.measure.label)} {ARROWS[c.measure.better]}".strip()
             for c in table.columns
         ]
         parts.append(_markdown_row([table.head, *head]))

@@ -32,12 +32,28 @@ def machine_weights(monkeypatch):
 def scene(tmp_path_factory):
     """The folder of a tiny scene that is trained on within seconds; nobody changes it."""
     from tests.faults.compare import state
+    from tests.shared import made_once
     from tests.tiny_scene import write_tiny_scene
 
-    folder = write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
+    folder = made_once(tmp_path_factory, "tiny", lambda root: write_tiny_scene(root / "scene")) / "scene"
     before = state(folder)
     yield folder
     assert state(folder) == before, "a test changed the scene that all share"
+
+
+@pytest.fixture(scope="session")
+def finished(scene, tmp_path_factory):
+    """The runs folder of a short run of 3dgs on the tiny scene; nobody changes it."""
+    from ambiguous_wild.harness.grid import plan_cells, run_cells
+    from ambiguous_wild.splat.pace import TrainConfig
+    from tests.shared import made_once
+
+    def make(root):
+        cells = plan_cells(["3dgs"], [scene], [0], TrainConfig(iterations=20, probes=0))
+        (report,) = run_cells(cells, root / "runs")
+        assert report.outcome == "trained", report.error
+
+    return made_once(tmp_path_factory, "finished", make) / "runs"
 
 
 @pytest.fixture(scope="session")
@@ -48,10 +64,12 @@ def built(tmp_path_factory):
     """
     from ambiguous_wild.builder.pipeline import build_scene
     from tests.builder.capture_maker import SETTINGS, write_split_capture
+    from tests.shared import made_once
 
-    root = tmp_path_factory.mktemp("built")
-    build_scene(write_split_capture(root / "raw"), root / "scene", SETTINGS, jobs=2, keep_work=True)
-    return root
+    def make(root):
+        build_scene(write_split_capture(root / "raw"), root / "scene", SETTINGS, jobs=2, keep_work=True)
+
+    return made_once(tmp_path_factory, "built", make)
 
 
 def pytest_collection_modifyitems(config, items):

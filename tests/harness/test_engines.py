@@ -106,6 +106,7 @@ def test_processes_one_killed_in_the_middle_give_what_one_process_gives(scene, f
     assert "[3/3] frail on scene" in done.output and "3 runs: 3 trained" in done.output
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed: extra [ray]")
 def test_ray_one_worker_killed_in_the_middle_gives_what_one_process_gives(scene, frail, local, tmp_path):
     frail[1].write_text("1")

@@ -23,7 +23,6 @@ from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
-from tests.tiny_scene import write_tiny_scene
 
 CORES = 4
 
@@ -264,15 +263,10 @@ def test_the_kernel_does_the_same_work_every_time():
     assert all(torch.equal(before[name], tensor) for name, tensor in kernel.gaussians.items())
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
-
-
 def test_a_meter_changes_no_bit_of_a_run(scene, tmp_path):
     found = []
     for name in ("with", "without"):
-        data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
+        data = load_train_data(load_scene(scene), device=torch.device("cpu"), seed=0, cache_dir=tmp_path)
         trainer = Trainer(data, MethodHooks(), TrainConfig(iterations=60, probes=2), folder=tmp_path / name)
         if name == "with":
             trainer.meter = meter(tmp_path, kernel=[1.0] * 100)
@@ -287,9 +281,8 @@ def test_a_meter_changes_no_bit_of_a_run(scene, tmp_path):
 
 
 def test_every_run_records_its_time(scene, tmp_path):
-    (report,) = run_cells(
-        plan_cells(["3dgs"], [scene.root], [0], TrainConfig(iterations=30)), tmp_path / "runs"
-    )
+    cells = plan_cells(["3dgs"], [scene], [0], TrainConfig(iterations=30))
+    (report,) = run_cells(cells, tmp_path / "runs")
     cost = report.result["cost"]
     record = cost["timing"]
     assert record["kernel"] == "cpu-3" and record["runs"] >= 1

@@ -29,14 +29,14 @@ from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
-from tests.tiny_scene import HEIGHT, TRAIN, WIDTH, write_tiny_scene
+from tests.tiny_scene import HEIGHT, TRAIN, WIDTH
 
 ITERATIONS = 120
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
+def scene(scene):
+    return load_scene(scene)
 
 
 def trainer_for(scene, folder, parts=None) -> Trainer:

@@ -293,18 +293,13 @@ def test_every_method_that_can_takes_the_effects_of_the_scene():
         choose("auto", dataclasses.replace(scene, name="other"), methods, plan)
 
 
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory):
-    return write_tiny_scene(tmp_path_factory.mktemp("data") / "scene")
-
-
 SHORT = TrainConfig(iterations=40, probes=0)
 
 
-def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(tiny):
-    (none,) = plan_cells(["refinesplat"], [tiny], [0], SHORT)
-    (auto,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="auto", plan=EffectsPlan("scene", ()))
-    (listed,) = plan_cells(["refinesplat"], [tiny], [0], SHORT, effects="poses")
+def test_a_scene_that_calls_for_nothing_keeps_the_identity_of_its_runs(scene):
+    (none,) = plan_cells(["refinesplat"], [scene], [0], SHORT)
+    (auto,) = plan_cells(["refinesplat"], [scene], [0], SHORT, effects="auto", plan=EffectsPlan("scene", ()))
+    (listed,) = plan_cells(["refinesplat"], [scene], [0], SHORT, effects="poses")
     assert none.identity == auto.identity != listed.identity
     assert none.config == auto.config
 
@@ -320,9 +315,9 @@ def test_a_plan_of_another_state_of_the_scene_is_refused(tmp_path):
         plan_cells(["3dgs"], [scene], [0], SHORT, **given)
 
 
-def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_path):
+def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(scene, tmp_path):
     plan = EffectsPlan("scene", decide("scene", measured(zoom=3.0)).decisions)
-    cells = plan_cells(["3dgs"], [tiny], [0], SHORT, effects="auto", plan=plan, protocol="half")
+    cells = plan_cells(["3dgs"], [scene], [0], SHORT, effects="auto", plan=plan, protocol="half")
     (report,) = run_cells(cells, tmp_path, RunOptions(tmp_path / ".cache", pictures=False))
     assert report.outcome == "trained", report.error
     said = json.loads((cell_folder(tmp_path, cells[0]) / "effects.json").read_text())
@@ -333,7 +328,7 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(tiny, tmp_p
     assert facts["effect_facts"]["antialias"]["filter_size_median"] > 0
     assert not any(math.isnan(row["psnr"]) for row in report.result["per_image"])
     with pytest.raises(AwError, match="effects was"):
-        run_cells(plan_cells(["3dgs"], [tiny], [0], SHORT, protocol="half"), tmp_path)
+        run_cells(plan_cells(["3dgs"], [scene], [0], SHORT, protocol="half"), tmp_path)
 
 
 def test_options_are_checked_before_a_plan_is_made(tmp_path, monkeypatch):

@@ -50,9 +50,9 @@ def _methods(monkeypatch):
     register(MethodEntry("broken", "fails", explode))
 
 
-def bench(scene, output, *methods, train=SHORT, overwrite="missing", **kw):
+def bench(scene, output, *methods, train=SHORT, overwrite="missing", pictures=False, **kw):
     cells = plan_cells(methods, [scene], kw.pop("seeds", [0]), train, **kw)
-    return cells, run_cells(cells, output, RunOptions(output / ".cache", overwrite))
+    return cells, run_cells(cells, output, RunOptions(output / ".cache", overwrite, pictures=pictures))
 
 
 class NothingKept(MaskPolicy):
@@ -118,7 +118,7 @@ def test_what_to_do_where_a_default_followed_the_weights(scene, tmp_path):
 
 
 def test_a_run_folder_holds_everything_and_the_numbers_follow_from_it(scene, tmp_path):
-    (cell,), (report,) = bench(scene, tmp_path, "truth")
+    (cell,), (report,) = bench(scene, tmp_path, "truth", pictures=True)
     assert report.outcome == "trained", report.error
     run = cell_folder(tmp_path, cell)
     assert run == tmp_path / "scene" / "truth" / "seed0"
@@ -152,14 +152,16 @@ def test_exact_masks_beat_none(scene, tmp_path):
     assert masked > plain + 1.0
 
 
-def test_a_finished_run_is_kept_and_a_deleted_result_is_made_again(scene, tmp_path):
+def test_a_finished_run_is_kept_and_a_result_that_is_lost_or_damaged_is_made_again(scene, tmp_path):
     (cell,), _ = bench(scene, tmp_path, "3dgs")
     result = cell_folder(tmp_path, cell) / "metrics.json"
     before = json.loads(result.read_text())
-    assert bench(scene, tmp_path, "3dgs")[1][0].outcome == "kept"
-    result.unlink()
-    assert bench(scene, tmp_path, "3dgs")[1][0].outcome == "trained"
-    assert json.loads(result.read_text())["per_image"] == before["per_image"]
+    often = dataclasses.replace(SHORT, checkpoint_every_s=1.0, probes=0)  # makes no other run of it
+    assert bench(scene, tmp_path, "3dgs", train=often)[1][0].outcome == "kept"
+    for spoil in (result.unlink, lambda: result.write_text("{half")):
+        spoil()
+        assert bench(scene, tmp_path, "3dgs")[1][0].outcome == "trained"
+        assert json.loads(result.read_text())["per_image"] == before["per_image"]
 
 
 def test_another_configuration_is_refused_by_name_and_replaced_on_request(scene, tmp_path):
@@ -189,17 +191,15 @@ def test_a_checkpoint_of_another_run_is_refused_by_name(scene, tmp_path):
     assert same.outcome == "trained"
 
 
-def test_a_model_has_its_hash_in_the_result(scene, tmp_path):
-    _, (report,) = bench(scene, tmp_path, "3dgs")
-    result = read_result(report.folder / "metrics.json")
-    assert result["model_sha256"] == sha256_file(report.folder / "point_cloud.ply")
-    check_model(report.folder, result)
-
-
-def test_how_often_a_run_is_saved_does_not_make_it_another(scene, tmp_path):
-    bench(scene, tmp_path, "3dgs")
-    often = dataclasses.replace(SHORT, checkpoint_every_s=1.0, probes=0)
-    assert bench(scene, tmp_path, "3dgs", train=often)[1][0].outcome == "kept"
+def test_a_result_holds_the_hash_of_its_model_and_the_parts_of_its_cost(finished):
+    folder = finished / "scene" / "3dgs" / "seed0"
+    result = read_result(folder / "metrics.json")
+    assert result["model_sha256"] == sha256_file(folder / "point_cloud.ply")
+    check_model(folder, result)
+    cost = result["cost"]
+    assert 0 < sum(cost["ms_parts"].values()) <= cost["ms_per_iteration"]
+    assert 50 < cost["peak_rss_mb"] < 20_000
+    assert 0 < cost["fps_low"] <= cost["fps"] <= cost["fps_high"]
 
 
 def test_a_folder_that_is_not_ours_is_left_alone(scene, tmp_path):
@@ -276,15 +276,6 @@ def test_a_failure_before_the_first_checkpoint_does_not_block_another_configurat
     assert bench(scene, tmp_path, "broken", train=other)[1][0].outcome == "trained"
 
 
-def test_a_damaged_result_is_made_again(scene, tmp_path):
-    (cell,), _ = bench(scene, tmp_path, "3dgs")
-    result = cell_folder(tmp_path, cell) / "metrics.json"
-    before = json.loads(result.read_text())["per_image"]
-    result.write_text("{half")
-    assert bench(scene, tmp_path, "3dgs")[1][0].outcome == "trained"
-    assert json.loads(result.read_text())["per_image"] == before
-
-
 def test_a_folder_in_use_is_left_as_it_is(scene, tmp_path):
     (cell,) = plan_cells(["3dgs"], [scene], [0], SHORT)
     folder = cell_folder(tmp_path, cell)
@@ -293,14 +284,6 @@ def test_a_folder_in_use_is_left_as_it_is(scene, tmp_path):
         assert report.outcome == "failed"
         assert "being worked on by aw bench" in report.error
         assert not folder.exists()
-
-
-def test_parts_of_the_cost_are_those_of_training(scene, tmp_path):
-    _, (report,) = bench(scene, tmp_path, "3dgs")
-    cost = report.result["cost"]
-    assert 0 < sum(cost["ms_parts"].values()) <= cost["ms_per_iteration"]
-    assert 50 < cost["peak_rss_mb"] < 20_000
-    assert 0 < cost["fps_low"] <= cost["fps"] <= cost["fps_high"]
 
 
 def test_a_scene_named_twice_is_benched_once(scene):

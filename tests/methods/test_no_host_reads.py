@@ -1,4 +1,4 @@
-"""Methods on an accelerator: the CPU's numbers, and steps for which the host waits nowhere."""
+"""Masks of methods on an accelerator: the CPU's numbers, and a state that goes from one to the other."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -222,43 +222,7 @@ def test_dronesplats_state_holds_numbers(scene, cache, monkeypatch, tmp_path):
     assert again.facts() == policy.facts() and policy.facts()["masked_share"] > 0
 
 
-# -- without the host -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "method, nominal",
-    [
-        ("robustsplat", 10_000.0),
-        ("robustsplat", 25_000.0),
-        ("dronesplat", 10_000.0),
-        ("3dgs+truth", 10_000.0),
-        ("3dgs@mask=robustsplat", 10_000.0),
-    ],
-)
-def test_a_step_leaves_the_host_alone(scene, cache, monkeypatch, drawn, method, nominal):
-    policy, data = parts_of(method).mask, data_of(scene, cache)
-    with monkeypatch.context() as patch:
-        on_accelerator(patch)
-        policy.setup(data)
-        seen = list(renders(data))[:2]
-        steps = [step_at(data, *pair, nominal=nominal) for pair in seen]
-        steps += [step_at(data, view, image[::2, ::2].contiguous(), nominal=nominal) for view, image in seen]
-        for step in steps:
-            policy.keep(step)  # Adam's moments exist from its first step on
-    policy, steps = moved((policy, steps))
-    for step in steps:
-        policy.keep(step)  # what is kept by size is copied at its first use
-    with no_transfers():
-        for step in steps:
-            keep = policy.keep(step)
-            assert keep.shape == step.photo.shape[:2] and keep.device.type == "meta"
-            assert policy.cotangent(step, keep) is None
-            assert policy.predict(step).device.type == "meta"
-            policy.on_opacity_reset(step)
-        policy.keep(replace(steps[0], iteration=steps[0].iteration + 5000))
-    if method in ("robustsplat", "dronesplat"):
-        with pytest.raises((RuntimeError, NotImplementedError), match=READ):
-            policy.facts()  # where the host does read
+# -- what tests/splat/test_whole_step.py relies on ----------------------------------------------------
 
 
 @pytest.mark.parametrize(

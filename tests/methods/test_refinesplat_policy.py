@@ -12,6 +12,7 @@ import torch
 from ambiguous_wild.core import Camera, Scene, SparsePoints, View
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
+from ambiguous_wild.methods.refinesplat.pixels import GAPS
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.checkpoint import load, save
 from ambiguous_wild.splat.step import Step, TrainData
@@ -372,3 +373,34 @@ def test_features_that_learn_from_the_scene_are_given_its_tracks(scene):
     found = policy.inputs.semantics
     assert found.phi[0].shape == (HEIGHT // 4, WIDTH // 4, policy.features.channels)
     assert policy.keep(step_of(scene.data, 0, blurred(scene.clean[0], 0))) is not None
+
+
+# -- limits of a mask -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def walled(scene):
+    """The scene with points that every photo's first look can be told by."""
+    return SimpleNamespace(data=sparse_wall(scene))
+
+
+def test_a_mask_is_limited_by_the_photos_first_look(walled):
+    mask, shares = dataclasses.replace(FAST.mask, ceiling_least=0.0), []
+    for limit in (0.0, 1.0):
+        look = dataclasses.replace(FAST.first_look, most=limit, most_least=0.01)
+        policy = fresh(walled, dataclasses.replace(FAST, mask=mask, first_look=look))
+        shares.append(
+            (policy.keep(step_of(walled.data, 1, torch.zeros(HEIGHT, WIDTH, 3))) == 0).float().mean()
+        )
+    assert shares[1] <= GAPS * policy.looks[1].most < shares[0], shares
+
+
+def test_in_a_crowd_nothing_is_masked_that_the_first_look_keeps(walled):
+    mask, outside = dataclasses.replace(FAST.mask, ceiling_least=0.0), []
+    for crowd in (0.0, 1.0):  # the share from which there is one
+        look = dataclasses.replace(FAST.first_look, crowd=crowd, least=0.0, most=0.0)
+        policy = fresh(walled, dataclasses.replace(FAST, mask=mask, first_look=look))
+        masked = policy.keep(step_of(walled.data, 1, torch.zeros(HEIGHT, WIDTH, 3))) == 0
+        assert masked.any()
+        outside.append(bool((masked & (policy.first[1] > 0.5)).any()))
+    assert outside == [False, True]

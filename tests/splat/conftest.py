@@ -3,15 +3,14 @@
 import pytest
 
 from ambiguous_wild.io.scene_folder import load_scene
-from tests.tiny_scene import write_tiny_scene
 
 from . import fake_gsplat
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory):
+def scene(scene):
     """With distractors; read only."""
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+    return load_scene(scene)
 
 
 @pytest.fixture

@@ -17,7 +17,6 @@ from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.splat.training_records import SAMPLED, Clock, GpuClock, clock_for
 from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, NonFinite
-from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import with_points
 
 from . import fake_gsplat
@@ -63,16 +62,6 @@ def test_densification_and_reset_run_there_too(scene, tmp_path, fake):
     assert len(trainer.gaussians) > 150
     assert trainer.density.last_reset > 0
     assert all(bool(torch.isfinite(tensor).all()) for _, tensor in trainer.gaussians.items())
-
-
-class OnMeta(MaskPolicy):
-    """Keeps what is dark, and pulls the picture towards grey: both places of a policy, on the device."""
-
-    def keep(self, step):
-        return (step.photo.mean(dim=2) < 0.9).to(torch.float32)
-
-    def cotangent(self, step, keep):
-        return keep[..., None] * (step.rendered.image - 0.5) / step.photo.numel()
 
 
 class Fickle(MaskPolicy):
@@ -132,23 +121,6 @@ def test_what_weighed_the_broken_step_is_kept_whatever_the_sizes_after_it():
     sentinel.reset()
     sentinel.watch(4, 0, loss, broken, None)
     assert sentinel.first_broken().keep is None
-
-
-@pytest.mark.parametrize("mask", [MaskPolicy, OnMeta, Fickle])
-def test_no_host_read_in_the_loop_but_where_it_looks(scene, tmp_path, monkeypatch, mask):
-    """On torch's `meta` device reading a value raises, and so does mixing with the host's tensors."""
-    with fake_gsplat.installed(monkeypatch):
-        trainer = moved(
-            trainer_for(scene, tmp_path, parts=MethodHooks(mask=mask()), iterations=1000, probes=0)
-        )
-        for _ in range(12):  # two epochs: what is copied once, the cameras, is
-            trainer.timeline.loss(trainer.step())
-        assert trainer.iteration == 12
-        with no_transfers():
-            for _ in range(3):
-                trainer.timeline.loss(trainer.step())
-        with pytest.raises((RuntimeError, NotImplementedError), match=READ):
-            trainer.check_parameters()  # looking does read
 
 
 @pytest.mark.parametrize("bad", [7, 12])

@@ -1,7 +1,6 @@
-"""Effects on an accelerator: the CPU's numbers, and steps for which the host waits nowhere."""
+"""Effects on an accelerator: the CPU's numbers, poses on the device, steps that are skipped."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,9 +17,9 @@ from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.effects.poses import PoseRefinement, left_jacobian, turned
 from ambiguous_wild.splat.effects.smoothing import filter_sizes
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.rendered import NOTHING, Cotangents, Gradients, as_cotangents
+from ambiguous_wild.splat.rendered import NOTHING, Gradients, as_cotangents
 from ambiguous_wild.splat.step import TrainData, ViewContext
-from tests.host_reads import READ, moved, no_transfers
+from tests.host_reads import READ, moved
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import disturbed
 from tests.splat.scenes import gaussians as random_gaussians
@@ -235,55 +234,6 @@ def test_a_state_from_the_cpu_lands_where_the_run_is():
     there.load_state_dict(state)
     held = [e for e in tensors(there.state_dict()).items() if not e[0].endswith(("steps/", "at/", "stale/"))]
     assert held and all(t.device.type == "meta" for _, t in held)
-
-
-# -- without the host -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL], ids="+".join)
-def test_a_step_leaves_the_host_alone(monkeypatch, names):
-    with monkeypatch.context() as patch:
-        on_accelerator(patch)
-        data, g = data_of(), random_gaussians(3, n=30)
-        chain = chain_of(data, names)
-        for iteration in range(1, 4):
-            visit(chain, data, g, iteration)
-    off = torch.zeros(1)
-    chain, data, g, off, known = moved([chain, data, g, off, {}])
-    assert data.device.type == "meta"
-
-    def draw(gaussians, context, shade):
-        camera = context.camera
-        if not isinstance(camera, PosedCamera):  # a plain camera is copied where the renderer first meets it
-            if id(camera) not in known:
-                pose, centre = (torch.zeros(s, dtype=torch.float64).to("meta") for s in ((4, 4), 3))
-                size = {"width": camera.width, "height": camera.height}
-                known[id(camera)] = camera, SimpleNamespace(pose=pose, centre=centre, **size)
-            camera = known[id(camera)][1]
-        return Painted(gaussians, camera)
-
-    def step(iteration, divisor, skip_step):
-        view = iteration % len(data.photos)
-        context = shot_of(cameras[view, divisor], view, iteration)
-        camera = chain.camera(context)
-        assert isinstance(camera, PosedCamera) == ("poses" in names)
-        if "poses" in names:
-            camera = shrink_camera(camera, 2)  # as a policy's coarse render does
-        context = replace(context, camera=camera)
-        rendered = chain.render(g, context, draw)
-        extra = torch.zeros_like(rendered.image)
-        gradients = rendered.backward(Cotangents(rendered.image - 0.5, extra))
-        chain.step(gradients, context, skip_step)
-        chain.rows_changed()
-        assert gradients.means.device.type == "meta"
-
-    cameras = {(v, d): shrink_camera(data.cameras[v], d) for v in range(3) for d in (1, 2)}
-    plan = [(k, d, c) for k in range(3) for d in (1, 2) for c in (None, off)]
-    for one in plan:
-        step(*one)  # what is kept by camera is copied at its first use
-    with no_transfers():
-        for one in plan:
-            step(*one)
 
 
 def test_the_pose_for_anybody_else_is_read_when_asked_for():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import gsplat_seam
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
@@ -17,18 +16,12 @@ from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
-from tests.tiny_scene import write_tiny_scene
 
 from .scenes import camera, cotangents, gaussians, given
 from .test_losses import pictures
 
 pytestmark = pytest.mark.gpu
 GPU = torch.device("cuda")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene"))
 
 
 def trainer_for(scene, folder, method="3dgs", device=GPU, **config):

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ambiguous_wild.harness.cell_run import EFFECTS, ENVIRONMENT
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.measures import ImageRow, Metric, measure, measure_images, metrics
 from ambiguous_wild.harness.result_file import (
+    CONFIG,
     FAILED,
     MODEL,
     RESULT,
@@ -33,6 +34,7 @@ from ambiguous_wild.harness.store import impossible_values, read_config
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.report.board import ALONE, COST, FIRST, LAST, Entry, check_text
 from ambiguous_wild.report.board_reproduce import (
     Scenes,
@@ -85,6 +87,8 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
             f"{run}: {mixed}; build the scene with clean photos in test/ or --test-list FILE, and bench again"
         )
     _check_values(run, result, photos=scene is not None)
+    if not config["source"]:
+        _check_costs(run, result, dict(config["train"]))
     if scene is not None:
         half = config.get("protocol", "full") == "half"
         check_photos(run, scene, result["per_image"], renders, half=half, quick=quick)
@@ -260,6 +264,21 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
                 why = "is infinite only if picture and photo are equal, and the photos are not at hand: "
                 why = f"{why}name their scene with --scene" if about.infinite else "is finite"
                 _impossible(run, f"{metric} of {row['name']}", value, why)
+
+
+def _check_costs(run: Path, result: RunResult, train: Mapping[str, Any]) -> None:
+    """Compare costs with the model, the settings and each other; what is left of times is believed."""
+    cost = result["cost"]
+    if "gaussians" in cost and cost["gaussians"] != splat_count(run / MODEL):
+        _changed(run, f"{RESULT} has {cost['gaussians']} Gaussians, {MODEL} {splat_count(run / MODEL)}")
+    steps, asked = cost.get("iterations"), train.get("iterations")
+    if steps is not None and isinstance(asked, int) and not train.get("budget_s") and steps < asked:
+        _changed(run, f"{RESULT} has {steps} iterations, {CONFIG} asks for {asked}")
+    train_s, ms = cost.get("train_s"), cost.get("ms_per_iteration")
+    if steps is not None and train_s is not None and ms is not None:
+        taken = steps * ms / 1000
+        if not math.isclose(train_s, taken, rel_tol=0.01):
+            _changed(run, f"train_s is {train_s:g}, but {steps} iterations of {ms:g} ms take {taken:g} s")
 
 
 def _impossible(run: Path, what: str, value: float, why: str) -> NoReturn:

@@ -23,7 +23,7 @@ from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, read_r
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.grouping import grouped
-from ambiguous_wild.report.notes import incomparable, notes, untimed
+from ambiguous_wild.report.notes import incomparable, metric_versions, notes, scenes_apart, untimed
 from ambiguous_wild.report.plain_formats import to_text
 from ambiguous_wild.report.table_layout import Column, Row, State, Table, TableCell, ranks
 from ambiguous_wild.report.typeset import to_html
@@ -69,11 +69,14 @@ def comparison(
         images=runs.images[runs.images["scene"].isin(chosen)],
         missing=runs.missing[runs.missing["scene"].isin(chosen)],
     )
+    versions = metric_versions(runs.runs)
+    runs = replace(runs, images=_of_one_function(runs.images, versions))
     methods = sorted(runs.runs["method"].unique())
     index = _Index(runs)
     columns = _columns(runs, metrics)
     defined = {c.key: [s for s in chosen if index.can_have(s, c, methods)] for c in columns}
-    unranked = incomparable(runs.runs, columns)
+    unranked = incomparable(runs.runs, columns) | versions.keys()
+    apart, every = scenes_apart(runs), frozenset(column.key for column in columns)
     rows = {scene: [_scene_row(index, m, scene, columns) for m in methods] for scene in chosen}
     if len(chosen) > 1:
         mean = [_mean_row(index, k, m, chosen, columns, rows, defined) for k, m in enumerate(methods)]
@@ -83,7 +86,7 @@ def comparison(
         Table(
             scene or title,
             tuple(Column("", measure, scene) for measure in columns),
-            tuple(_ranked(of, columns, unranked)),
+            tuple(_ranked(of, columns, every if scene in apart or (apart and not scene) else unranked)),
             continued=True,
         )
         for scene, of in rows.items()
@@ -130,6 +133,15 @@ def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
         rows.append(replace(row, cells=(*row.cells, cell)))
     column = Column("", EFFECTS, table.columns[0].scene, words=True)
     return replace(table, columns=(*table.columns, column), rows=tuple(rows))
+
+
+def _of_one_function(images: pd.DataFrame, versions: Mapping[str, Mapping[str, set[str]]]) -> pd.DataFrame:
+    """Leave out the values of methods whose own runs measured a metric by different functions."""
+    mixed = {(key, method) for key, of in versions.items() for method, named in of.items() if len(named) > 1}
+    if not mixed:
+        return images
+    keep = [pair not in mixed for pair in zip(images["metric"], images["method"])]
+    return images.assign(value=images["value"].where(pd.Series(keep, index=images.index)))
 
 
 def _without_empty(tables: list[Table]) -> list[Table]:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
-from ambiguous_wild.harness.measures import Measure
+from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.result_file import Options
 from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
@@ -209,8 +209,32 @@ def _infinite(runs: Runs, columns: Sequence[Measure]) -> list[str]:
     return lines
 
 
+def metric_versions(frame: pd.DataFrame) -> dict[str, dict[str, set[str]]]:
+    """Return metrics that runs measured by different functions: key -> method -> functions of its runs."""
+    found: dict[str, dict[str, set[str]]] = {}
+    for method, of_run in zip(frame["method"], frame.get("metric_functions", ())):
+        for key, function in of_run.items():
+            found.setdefault(key, {}).setdefault(str(method), set()).add(function)
+    return {key: of for key, of in found.items() if len(set.union(*of.values())) > 1}
+
+
+def scenes_apart(runs: Runs) -> frozenset[str]:
+    """Return scenes on which runs measured different pixels: another protocol, other photos or files."""
+    ok, apart = runs.runs[runs.runs["status"] == "ok"], set()
+    for scene, group in ok.groupby("scene"):
+        images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
+        photos = {frozenset(names) for _, names in images}
+        if group["scene_hash"].nunique() > 1 or group["fit"].nunique() > 1 or len(photos) > 1:
+            apart.add(str(scene))
+    return frozenset(apart)
+
+
 def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
-    lines = []
+    lines = [
+        f"{UNEQUAL}: {measure(key).label} comes from different functions ({shortlist(sorted(of))}): it is "
+        "not ranked, and runs of a method that differ so have no mean"
+        for key, of in metric_versions(runs.runs).items()
+    ]
     ok = runs.runs[runs.runs["status"] == "ok"]
     for scene, group in ok.groupby("scene"):
         if group["scene_hash"].nunique() > 1:

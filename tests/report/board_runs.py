@@ -89,7 +89,10 @@ def write_run(
     run.mkdir(parents=True)
     write_text(run / "config.yaml", yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
     write_json(run / "env.json", {"cpu": cpu, "platform": "test"})
-    (run / "point_cloud.ply").write_bytes(b"p" * size_b)
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {1000 + seed}\nproperty float x\nend_header\n"
+    )
+    (run / "point_cloud.ply").write_bytes(head.encode().ljust(size_b, b"p"))
     rng = np.random.default_rng([seed, zlib.crc32(f"{method} {opened.name}".encode())])
     rows = []
     for view in opened.test:

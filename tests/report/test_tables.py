@@ -204,7 +204,7 @@ def test_an_infinite_psnr_enters_no_mean_and_no_rank(tmp_path: Path) -> None:
 
 def test_a_mean_over_a_missing_scene_is_missing_and_said(tmp_path: Path) -> None:
     runs = [fake_result(m, s) for m, s in (("a", "one"), ("a", "two"), ("c", "one"))]
-    table = table_of(tmp_path, *runs, fake_result("b", "one", psnr=(40.0,)))
+    table = table_of(tmp_path, *runs, fake_result("b", "one", psnr=(40.0, 40.0)))
     assert cell(table, "b", "psnr").state == "missing"
     assert cell(table, "a", "psnr").rank is None  # alone: nothing to be first of
     assert cell(table, "b", "psnr", 2).state == "absent"

@@ -18,7 +18,7 @@ from ambiguous_wild.io.images import load_image_float, read_alpha
 LEAST_TRAIN = 2  # photos: one shows no depth
 ASPECT = 2.0  # largest ratio of focal lengths; pixels of anamorphic lenses are 2:1
 SAME_POSE = 1e-6  # largest difference of two equal poses, relative to the scene's size
-SAME_PHOTO = 0.004  # mean difference of equal pictures that were compressed again, of 1
+SAME_PHOTO = 0.01  # mean difference of equal pictures that were compressed again, of 1
 MOST_POINTS = 5000  # points that are projected to find out whether photos show any
 
 

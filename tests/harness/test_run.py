@@ -23,6 +23,7 @@ from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.image import flip, psnr, psnr_affine
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
+from tests.command_line import aw
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 SHORT = TrainConfig(iterations=60, probes=2)
@@ -359,3 +360,29 @@ def test_photos_too_small_to_be_measured_are_said_before_training(scene, tmp_pat
     _, (report,) = bench(small, tmp_path / "runs", "3dgs")
     assert "smaller than SSIM" in report.error
     assert not list((tmp_path / "runs").rglob("last.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("lost", "iterations", "words"),
+    [
+        ("config.yaml", 21, "holds a run of another configuration, and lacks its config.yaml"),
+        ("config.yaml", 20, "is damaged, it lacks config.yaml"),
+        ("point_cloud.ply", 20, "is damaged, it lacks point_cloud.ply"),
+        ("renders/test/test_0.png", 20, "is damaged, it lacks renders/test/test_0.png"),
+    ],
+)
+def test_a_finished_run_that_lacks_a_file_is_not_kept(finished, scene, tmp_path, lost, iterations, words):
+    shutil.copytree(finished, tmp_path / "runs")
+    (tmp_path / "runs" / "scene" / "3dgs" / "seed0" / lost).unlink()
+    cells = plan_cells(["3dgs"], [scene], [0], TrainConfig(iterations=iterations, probes=0))
+    with pytest.raises(AwError, match=re.escape(words)):
+        run_cells(cells, tmp_path / "runs")
+
+
+def test_a_render_of_another_run_is_not_shown(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "runs")
+    run = tmp_path / "runs" / "scene" / "3dgs" / "seed0"
+    shutil.copy(run / "renders/test/test_1.png", run / "renders/test/test_0.png")
+    answer = aw("table", tmp_path / "runs", "--sheet", tmp_path / "sheet.png")
+    assert answer.returncode == 2 and "is not the render that was measured" in answer.stderr
+    assert not (tmp_path / "sheet.png").exists()

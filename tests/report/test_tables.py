@@ -412,3 +412,29 @@ def test_hostile_names_stay_text_in_every_format(tmp_path: Path) -> None:
     assert len(re.findall(r"(?<!\\)&", row)) == len(table[0].columns)
     rows = list(csv.reader(io.StringIO(to_wide_csv(table))))
     assert {len(r) for r in rows} == {len(rows[0])}
+
+
+def test_values_of_different_functions_are_neither_ranked_nor_averaged(tmp_path: Path) -> None:
+    """Two files define a metric of one name: two methods are not ranked, seeds of one method have no mean."""
+
+    def measured(method: str, seed: int, value: float, source: str) -> dict:
+        record = {"label": "|grey|", "better": "lower", "digits": 2, "partial": False, "source": source * 64}
+        result = fake_result(method, "one", seed)
+        rows = [row | {"grey": value} for row in result["per_image"]]
+        return result | {"per_image": rows, "metrics": {"grey": record}}
+
+    table = table_of(tmp_path / "two", measured("a", 0, 0.8, "1"), measured("b", 0, 80.0, "2"))
+    assert cell(table, "a", "grey").value == 0.8 and cell(table, "a", "grey").rank is None
+    assert any("|grey| comes from different functions (a, b)" in note for note in table[-1].notes)
+    assert r"\|grey\|" in to_markdown(table)
+    table = table_of(
+        tmp_path / "one", measured("a", 0, 0.8, "1"), measured("a", 1, 80.0, "2"), metrics=["grey"]
+    )
+    assert cell(table, "a", "grey").state == "missing"
+
+
+def test_methods_of_two_protocols_are_not_ranked(tmp_path: Path) -> None:
+    half = {"protocol": "half", "fitted": {"steps": 10}}
+    table = table_of(tmp_path, fake_result("a", psnr=(20.0, 20.0)), fake_result("b", facts=half))
+    assert {cell(table, m, "psnr").rank for m in "ab"} == {None}
+    assert any(note.startswith("not comparable: protocols differ") for note in table[-1].notes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,17 +83,13 @@ def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: b
         "projection": "perspective",
     }
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
-    x, y, z = place.centre
-    node = {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
-    if place.turn != UNMOVED.turn:  # the caller turned the model so that y is up
-        node = {"mesh": 0}
     extras = {"extras": place_facts(place)} if place != UNMOVED else {}
     head = {
         "asset": {"version": "2.0", "generator": "ambiguous_wild", **extras},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
+        "nodes": [_node(place)],
         "buffers": [{"byteLength": len(body)}],
         "bufferViews": views,
         "accessors": accessors,
@@ -105,6 +102,34 @@ def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: b
         raise AwError(f"a .glb holds at most 4 GiB, not {total:,} bytes; export as spz")
     head_bytes = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<II", len(text), _JSON) + text
     return [head_bytes, struct.pack("<II", len(body), _BIN), body]
+
+
+def _node(place: SceneTransform) -> dict[str, object]:
+    """Return the node that turns and moves the model to where glTF's viewers expect it."""
+    if place.turn != UNMOVED.turn:  # the caller turned the model so that y is up
+        return {"mesh": 0}
+    x, y, z = place.centre
+    return {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
+
+
+def _changed(head: dict[str, Any], place: SceneTransform) -> str:
+    """Name what a file has that ours have not, and that changes where or how Gaussians are read."""
+    primitives = [primitive for mesh in head["meshes"] for primitive in mesh["primitives"]]
+    named = {name: head["accessors"][index] for name, index in primitives[0]["attributes"].items()}
+    used = list(named.values())
+    views = [head["bufferViews"][accessor["bufferView"]] for accessor in used]
+    found = {
+        "nodes": head["nodes"] != [_node(place)],
+        "second mesh": len(primitives) > 1,
+        "external buffer": any("uri" in buffer for buffer in head["buffers"]) or len(head["buffers"]) > 1,
+        "stride of rows": any("byteStride" in view for view in views),
+        "types of numbers": any(
+            "sparse" in a or a["componentType"] != (_BYTE if name.startswith("COLOR") else _FLOAT)
+            for name, a in named.items()
+        ),
+        "offsets of columns": any(accessor.get("byteOffset", 0) for accessor in used),
+    }
+    return next((name for name, there in found.items() if there), "")
 
 
 def decode_gltf(data: bytes, path: Path | str) -> SplatFile:
@@ -120,13 +145,21 @@ def decode_gltf(data: bytes, path: Path | str) -> SplatFile:
         if (magic, version, kind) != (b"glTF", 2, _JSON):
             raise AwError(f"{path} is no binary glTF 2.0")
         attributes = head["meshes"][0]["primitives"][0]["attributes"]
+        place = place_from(head["asset"].get("extras"))
+        if changed := _changed(head, place):
+            raise AwError(
+                f"{path} was changed by another program, whose {changed} this reader does not follow; "
+                "export the model again, or save it as PLY there"
+            )
         body = 20 + length + 8
 
         def column(name: str) -> np.ndarray:
             accessor = head["accessors"][attributes[name]]
             width = next(k for k, v in _TYPES.items() if v == accessor["type"])
-            start = body + int(head["bufferViews"][accessor["bufferView"]]["byteOffset"])
-            count = int(accessor["count"])
+            view, count = head["bufferViews"][accessor["bufferView"]], int(accessor["count"])
+            if not 0 <= int(view["byteOffset"]) <= len(data) - body - 4 * count * width:
+                raise AwError(f"{path} is damaged: {name} lies outside of its data")
+            start = body + int(view["byteOffset"])
             rows = np.frombuffer(data, "<f4", count * width, start).reshape(count, width)
             return rows[:, 0] if width == 1 else rows
 
@@ -141,7 +174,7 @@ def decode_gltf(data: bytes, path: Path | str) -> SplatFile:
             "sh0": column(f"{EXTENSION}:SH_DEGREE_0_COEF_0"),
             "sh_rest": np.stack(higher, axis=1) if higher else np.zeros((len(means), 0, 3), np.float32),
         }
-        return SplatFile(arrays, place_from(head["asset"].get("extras")))
+        return SplatFile(arrays, place)
     except (
         struct.error,
         ValueError,

@@ -261,6 +261,36 @@ def test_gltf_follows_the_extension(tmp_path: Path) -> None:
     assert np.allclose(scale, np.exp(given["log_scales"]), rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda head: head["nodes"][0].update(translation=[5, 0, 0]), "whose nodes"),
+        (lambda head: head["nodes"].append({"mesh": 0}), "whose nodes"),
+        (lambda head: head["buffers"][0].update(uri="other.bin"), "whose external buffer"),
+        (lambda head: head["bufferViews"][0].update(byteStride=24), "whose stride of rows"),
+        (lambda head: head["accessors"][0].update(componentType=5123), "whose types of numbers"),
+        (lambda head: head["accessors"][0].update(byteOffset=4), "whose offsets of columns"),
+        (lambda head: head["bufferViews"][0].update(byteOffset=-4), "lies outside of its data"),
+        (lambda head: head["bufferViews"][0].update(byteOffset=10**6), "lies outside of its data"),
+    ],
+)
+def test_a_glb_that_another_program_changed_is_refused(tmp_path: Path, change, words: str) -> None:
+    path = tmp_path / "m.glb"
+    write("glb", path, model(6))
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    head = json.loads(data[20 : 20 + length])
+    change(head)
+    text = json.dumps(head).encode()
+    text += b" " * (-len(text) % 4)
+    path.write_bytes(
+        struct.pack("<4sII", b"glTF", 2, len(data) - length + len(text))
+        + struct.pack("<I4s", len(text), data[16:20]) + text + data[20 + length :]
+    )  # fmt: skip
+    with pytest.raises(AwError, match=words):
+        read("glb", path)
+
+
 @pytest.mark.parametrize("ending", FORMS)
 def test_damaged_files_are_one_line(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"bad.{ending}"

@@ -27,6 +27,7 @@ from ambiguous_wild.core.srgb import linear_to_srgb, srgb_to_linear
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.photos import MIN_SIDE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -163,8 +164,8 @@ def downsample_mask(
     height: int,  # px
 ) -> np.ndarray:  # [height, width] uint8 in {0, 255}
     """Reduce a mask: a pixel is white where at least half of its area is."""
-    share = cv2.resize((mask >= 128).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    return np.where(share >= 0.5, 255, 0).astype(np.uint8)
+    keep = smaller_keep((mask >= 128).astype(np.float32), (height, width), "majority")
+    return np.where(keep > 0, 255, 0).astype(np.uint8)
 
 
 def resample(

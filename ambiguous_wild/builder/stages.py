@@ -114,16 +114,16 @@ class Stages:
             lambda f: screen(capture, f, strict=settings.strict, jobs=self.jobs, bar=self.bar),
         )
         photos = [ScreenedPhoto(**fields) for fields in screened.facts["photos"]]
-        sides = sorted((min(photo.size), photo.name) for photo in photos)
+        sides = sorted((min(photo.size), photo.source, photo.name) for photo in photos)
         # Before the slow part the larger half of the photos; after it those that are registered.
-        check_factor(settings.factor or 1, sides[len(sides) // 2 :])
+        check_factor(settings.factor or 1, [side[:2] for side in sides[len(sides) // 2 :]])
         tests = read_test_list(self.test_list, photos) if self.test_list else None
         masks = self._masks(work, screened, photos)
         sfm = self._sfm(work, screened, photos, masks)
         mapping, matches = sfm.mapping, sfm.matches
         model = read_model(mapping.folder / "0")
         registered = {image.name for image in model.images.values()}
-        check_factor(settings.factor or 1, [side for side in sides if side[1] in registered])
+        check_factor(settings.factor or 1, [side[:2] for side in sides if side[2] in registered])
         split = split_photos(photos, registered, tests)
         masks = self._fixed_masks(work, photos, masks, matches)
         factor = settings.factor or auto_factor([photo.size for photo in photos])

@@ -62,8 +62,9 @@ def list_command(as_json: bool) -> None:
 
 @command.command(name="get")
 @click.argument("names", nargs=-1, required=True)
+@click.option("--overwrite", "again", is_flag=True, help="Download networks again that seem complete.")
 @json_option
-def get_command(names: tuple[str, ...], as_json: bool) -> None:
+def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     """Download networks into AW_WEIGHTS (by default ~/.cache/ambiguous_wild/weights).
 
     A network that is already there is checked, and downloaded again only if it is damaged. Hashes are checked;
@@ -72,7 +73,7 @@ def get_command(names: tuple[str, ...], as_json: bool) -> None:
     from ambiguous_wild.vision import weight_download, weight_registry
 
     wanted = weight_registry.chosen(names)
-    places = weight_download.get(wanted, lambda line: click.echo(line, err=True))
+    places = weight_download.get(wanted, lambda line: click.echo(line, err=True), again)
     if as_json:
         rows = [{"name": w.name, "where": str(place)} for w, place in zip(wanted, places)]
         click.echo(json.dumps(rows, indent=2))

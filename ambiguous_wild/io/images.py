@@ -19,6 +19,7 @@ from ambiguous_wild.io.files import write_bytes
 # Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
 MAX_PIXELS = 120_000_000
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
+_WHITE = 192  # least grey of a mask that keeps all
 _SLACK = {"JPEG": 8}  # tolerance of black and white; 2 in lossless formats
 
 
@@ -143,12 +144,8 @@ def _black_and_white(grey: np.ndarray, slack: int) -> np.ndarray | None:
     top = grey.max(initial=0)
     if top <= 1:
         return grey * np.uint8(255)
-    # A single light grey beside black stands for white.
-    if (
-        top >= 128
-        and (top >= 255 - slack or grey.min() <= slack)
-        and not ((grey > slack) & (grey < top)).any()
-    ):
+    # A single light grey stands for white; without black beside it, it must be lighter.
+    if top >= 128 and (top >= _WHITE or grey.min() <= slack) and not ((grey > slack) & (grey < top)).any():
         return np.where(grey == top, 255, 0).astype(np.uint8)
     between = (grey > slack) & (grey < 255 - slack)
     # The grey of edges is thin and uneven; labels are areas of one value.

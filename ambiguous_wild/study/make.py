@@ -14,7 +14,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.result_file import RESULT, check_render, read_result, render_path
+from ambiguous_wild.harness.result_file import RENDERS, RESULT, check_render, read_result
 from ambiguous_wild.harness.store import check_names, read_runs
 from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import write_json, write_text
@@ -142,9 +142,10 @@ def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[P
 
 def _renders(run: Path) -> dict[str, Path]:
     """Renders by the names of their views, which may lie in folders."""
-    result = read_result(run / RESULT)
-    names = [row["name"] for row in result["per_image"]]
-    return {_stem(n): check_render(run, result, n) for n in names if render_path(run, n).is_file()}
+    result, folder = read_result(run / RESULT), run / RENDERS
+    for name in result.get("render_sha256", {}):
+        check_render(run, result, name)
+    return {_stem(p.relative_to(folder).as_posix()): p for p in sorted(folder.rglob("*.png"))}
 
 
 def _test_photos(run: Path) -> dict[str, Path]:

@@ -15,7 +15,8 @@ from ambiguous_wild.harness.measures import Metric, load_metrics, measure, metri
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_png_rgb
 from tests.command_line import aw
-from tests.report.board_runs import write_run, write_scene
+from tests.report.board_runs import write_run
+from tests.tiny_scene import write_tiny_scene
 
 OWN = """
 from ambiguous_wild import Metric
@@ -46,7 +47,7 @@ def own(tmp_path: Path) -> Path:
 def test_it_is_measured_and_stands_in_table_cost_and_board_without_its_file(
     own: Path, tmp_path: Path
 ) -> None:
-    scene = write_scene(tmp_path / "scene")
+    scene = write_tiny_scene(tmp_path / "scene")
     runs = [
         write_run(tmp_path / "runs", scene, method, noise=noise)
         for method, noise in (("3dgs", 20.0), ("robustsplat", 5.0))
@@ -100,7 +101,7 @@ def test_what_is_wrong_with_it_is_said_before_anything_is_trained(
     own: Path, tmp_path: Path, text: str, said: str
 ) -> None:
     own.write_text(text)
-    scene = write_scene(tmp_path / "scene")
+    scene = write_tiny_scene(tmp_path / "scene")
     with pytest.raises(AwError) as error:
         bench("3dgs", scene, metrics=own, output=tmp_path / "runs", iterations=2, device="cpu")
     assert said in str(error.value) and not list((tmp_path / "runs").glob("**/config.yaml"))

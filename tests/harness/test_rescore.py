@@ -22,7 +22,8 @@ from ambiguous_wild.harness.store import could_be_measured
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.report.rescore import rescore
-from tests.report.board_runs import write_run, write_scene
+from tests.report.board_runs import write_run
+from tests.tiny_scene import write_tiny_scene
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def weights(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    return write_scene(tmp_path / "scene")
+    return write_tiny_scene(tmp_path / "scene")
 
 
 def test_what_was_missing_is_measured_from_the_pictures(tmp_path: Path, scene: Path, weights: None) -> None:

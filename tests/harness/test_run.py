@@ -75,26 +75,11 @@ def user_masks(root):
     return "3dgs"
 
 
-def points_behind(root):
-    path = root / "sparse/0/points3D.txt"
-    rows = [line.split() for line in path.read_text().splitlines()]
-    path.write_text("".join(" ".join([*r[:3], "-4.0", *r[4:]]) + "\n" for r in rows))
-    return "3dgs"
-
-
-def far_principal_point(root):
-    path = root / "sparse/0/cameras.txt"
-    path.write_text(" ".join([*path.read_text().split()[:-2], "1000000", "1000000"]) + "\n")
-    return "3dgs"
-
-
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
         (no_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
         (user_masks, "the loss stayed 0 .* 6 of 6 train photos are masked all over"),
-        (points_behind, "a single colour each: no Gaussian is in front"),
-        (far_principal_point, "a single colour each: no Gaussian is in front"),
     ],
 )
 def test_a_run_that_learns_or_shows_nothing_fails_with_the_reason(spoil, reason, tmp_path):

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from ambiguous_wild.builder.downsample import downsample_mask
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ambiguous_wild.builder.resample import downsample_mask
 from ambiguous_wild.io.keep_resize import smaller_keep
 
 

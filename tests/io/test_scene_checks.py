@@ -30,8 +30,8 @@ def train_photo_again_as_jpeg(root: Path) -> None:
     )
 
 
-def alpha(root: Path) -> None:
-    for name in TRAIN:
+def alpha(root: Path, *names: str) -> None:
+    for name in names:
         photo = cv2.imread(str(root / "images" / name))
         shown = np.full((HEIGHT, WIDTH), 255, np.uint8)
         shown[:9] = 0
@@ -74,7 +74,7 @@ def focal_lengths(root: Path) -> None:
     [
         (train_photo_as_test, "test photos are training photos (test_0.png is train_0.png)"),
         (train_photo_again_as_jpeg, "test photos are training photos (test_0.png is train_0.png)"),
-        (alpha, "alpha of 6 photos hides pixels"),
+        (lambda root: alpha(root, *TEST), "alpha of 2 test photos hides pixels"),
         (one_pose, "all 6 cameras have one pose"),
         (lambda root: points_at(root, "0 0 4"), "all points of the sparse model lie at one place"),
         (points_behind, "no point of the sparse model lies in any training photo"),
@@ -102,6 +102,7 @@ def test_a_scene_that_would_give_a_wrong_number_is_refused_everywhere(tmp_path, 
     [
         (lambda root: masks(root, TRAIN[0]), "without a mask, so all of them trains: train_1.png"),
         (lambda root: masks(root, TRAIN[0], "typo.png"), "masks that belong to no photo: typo.png"),
+        (lambda root: alpha(root, *TRAIN), "alpha of 6 training photos is used as a keep mask"),
         (focal_lengths, "focal lengths of x and y differ more than 2 times: "),
         (lambda root: (root / "train_list.txt").write_text(TRAIN[0]), "it has one training photo"),
     ],

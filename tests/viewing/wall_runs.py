@@ -10,7 +10,7 @@ import numpy as np
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
-from tests.report.board_runs import write_run
+from tests.report.board_runs import change_result, write_run
 from tests.tiny_scene import HEIGHT, TRAIN, WALL_Z, WIDTH, wall_colour
 
 SH_C0 = 0.28209479177387814
@@ -40,6 +40,7 @@ def write_shown_run(
     write_splat_ply(ply, wall_model(count, seed))
     run = write_run(root, scene, method, seed, size_b=ply.stat().st_size, **more)
     ply.replace(run / "point_cloud.ply")
+    change_result(run, lambda result: result["cost"].update(gaussians=count))
     for name in TRAIN[:2]:
         keep = np.full((HEIGHT, WIDTH), 255, np.uint8)
         keep[14:26, 14:26] = 0

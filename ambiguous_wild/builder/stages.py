@@ -253,7 +253,7 @@ class Stages:
                 self.bar.say(f"{registered} of {len(photos)} photos placed: trying harder")
             before = attempts[-1] if attempts else None
             attempts.append(self._attempt(work, screened, photos, masks, plan, before))
-        # Of attempts that register equally many photos the last is taken, which is the most precise.
+        # Of attempts that register as many photos reliably, the last is taken, which is the most precise.
         best = max(reversed(attempts), key=lambda a: (a.mapping.facts["reliable"], a.registered))
         sources, wanted = {photo.name: photo.source for photo in photos}, self.settings.part
         components = best.mapping.facts["components"]

@@ -84,7 +84,7 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float,
 
 
 def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
-    """Build the courtyard; arguments as in `capture.build_world`."""
+    """Build the courtyard; arguments as in `capture_writer.build_world`."""
     d = detail_px_per_m
     depth = BACK_M - FRONT_M
     statue = (float(rng.uniform(-0.15, 0.35)), float(rng.uniform(1.2, 1.5)), 0.95)

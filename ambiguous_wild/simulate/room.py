@@ -34,7 +34,7 @@ Circle = tuple[float, float, float]
 
 
 def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
-    """Build the room; arguments as in `capture.build_world`."""
+    """Build the room; arguments as in `capture_writer.build_world`."""
     d = detail_px_per_m
     wide, deep = PLAN.surfaces["wall_back"][0], PLAN.surfaces["wall_left"][0]
     hub = (float(rng.uniform(-0.1, 0.1)), float(rng.uniform(0.35, 0.5)), 0.0)

@@ -27,7 +27,7 @@ class DrawnEffects(TypedDict, total=False):
 
 
 class PlacedDistractor(TypedDict):
-    """One distractor in one photo: `distractors.Placement` with its name and its share of the photo."""
+    """One distractor in one photo: `distractors.DistractorPose` with its name and its share of the photo."""
 
     distractor: str
     occlusion: float

@@ -48,7 +48,7 @@ Circle = tuple[float, float, float]
 
 
 def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: WorldSpec) -> World:
-    """Build the yard; arguments as in `capture.build_world`."""
+    """Build the yard; arguments as in `capture_writer.build_world`."""
     d = detail_px_per_m
     hub = (float(rng.uniform(-0.4, 0.4)), float(rng.uniform(-0.4, 0.4)), 0.0)
     shapes, circles = _standing(rng)

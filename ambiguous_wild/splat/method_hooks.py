@@ -1,6 +1,7 @@
 """Hooks of the training loop that a method can implement, and their arguments.
 
-The loop is short and fixed (see `trainer.py`). A hook that is missing is never called and allocates nothing.
+The loop is short and fixed (see `training_loop.py` and `Trainer.step`). A hook that is missing is never
+called and allocates nothing.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ def render_reference(
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     screen = ray * focal + centre
 
-    # EWA: J at the centre clamped to the frustum widened by 0.3 of half its size (card gsplat.md, 3).
+    # EWA: J at the centre clamped to the frustum widened by 0.3 of half its size.
     margin = 0.15 * size / focal
     clamped = torch.minimum(torch.maximum(ray, -centre / focal - margin), (size - centre) / focal + margin)
     jacobian = means.new_zeros(len(means), 2, 3)

@@ -352,7 +352,7 @@ class Trainer:
             check_cotangents(method_cotangents, step)
             if changes != [picture._version for picture in shown]:
                 raise AwError(
-                    f"keep or cotangent of {type(self.hooks.mask).__name__} changed step.photo or "
+                    f"keep, loss or cotangent of {type(self.hooks.mask).__name__} changed step.photo or "
                     "step.rendered.image in place, which training reads: change a copy, .clone()"
                 )
         if self.device_check is None and keep is not None and not bool(keep.any()):

@@ -221,7 +221,7 @@ def _narrow(step):
         (
             "keep",
             lambda step: step.photo.mul_(0.99)[..., 0],
-            "keep or cotangent of MaskPolicy changed step.ph",
+            "keep, loss or cotangent of MaskPolicy changed step.ph",
         ),
         (
             "keep",

@@ -2,7 +2,7 @@
 reach.
 
 Visible Gaussians are sorted by depth once, then by tile in a counting sort. The tile test is exact
-(fast-training.md eq. 3): for each row of tiles it finds the interval of x that the 1/255 contour reaches
+(AccuTile of Speedy-Splat): for each row of tiles it finds the interval of x that the 1/255 contour reaches
 among the pixel centres of that row. Every loop splits into a fixed number of parts, so the lists do not
 depend on the number of threads.
 

@@ -1,6 +1,6 @@
 """From Gaussians to splats: activations, EWA projection, culls and colours, one record of 16 floats each.
 
-The projection is card gsplat.md eq. 1 to 6 with opacity-aware extents (fast-training.md eq. 1). The blurred
+The projection is that of gsplat, with opacity-aware extents. The blurred
 2D covariance S is stored in a form that needs no difference of large numbers: with ``k = Sxy / Syy``,
 ``v = det S / Syy`` (variance of x given y) and ``q = 1 / Syy``,
 

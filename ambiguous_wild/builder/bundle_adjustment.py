@@ -17,7 +17,7 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 # Triangulation angle that a tenth of the points must have: 1.8 where a camera only turned, 12 where not.
-LEAST_ANGLE_DEG = 3.0
+LEAST_ANGLE_DEG = 2.0
 MOST_ANGLES = 1000  # points of which it is computed
 UNSURE = np.array([np.radians(0.4), 0.02])  # 2.5 of these are 1 degree, and 5 % of the path's radius
 ROUNDS = 20  # of weighting the photos anew, at most

@@ -14,7 +14,7 @@ import numpy as np
 from ambiguous_wild.builder.bundle_adjustment import pipeline_options, plausible, shows_depth
 from ambiguous_wild.builder.component_merging import merge
 from ambiguous_wild.builder.matched import Matched, connected_photos
-from ambiguous_wild.builder.records import ModelSummary, no_model
+from ambiguous_wild.builder.records import TURNED, ModelSummary, no_model
 from ambiguous_wild.builder.registration import LEAST_PHOTOS, Registration
 from ambiguous_wild.builder.retrieval import FEW, RELATIVE_POSES
 from ambiguous_wild.builder.settings import ENOUGH
@@ -67,8 +67,9 @@ def run_mapping(job: MappingJob) -> None:
     reliable = len(components[0].poses.keys() - components[0].provisional) if components else 0
     turned = chosen is not None and len(chosen.poses) >= LEAST_PHOTOS and not shows_depth(chosen.model)
     if chosen is None or len(chosen.poses) < LEAST_PHOTOS or turned:
-        why = "the camera only turned, which shows no depth" if turned else "no pair of photos to start from"
+        why = TURNED if turned else "no pair of photos to start from"
         left_out = dict.fromkeys(matched.names, why)
+        components, reliable = ([], 0) if turned else (components, reliable)
         left_out |= _left_out(components[0], components) if components else {}
         names = [_names(component, component.poses) for component in components if component.poses]
         write_json(

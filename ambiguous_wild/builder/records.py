@@ -32,6 +32,9 @@ class ExifRecord(TypedDict, total=False):
     taken_at: str
 
 
+TURNED = "the camera only turned, which shows no depth"  # why no photo of a capture has a pose
+
+
 @dataclass(frozen=True)
 class ScreenedPhoto:
     """A photo of the capture that can be read."""

@@ -23,6 +23,7 @@ from ambiguous_wild.builder.map_drawing import draw_built
 from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
+    TURNED,
     BuildInputs,
     FeatureResult,
     KeyedRecord,
@@ -260,6 +261,7 @@ class Stages:
         parts = scene_record.part_lines(components, sources, wanted)
         if wanted > len(components) > 0:
             raise AwError(f"no part {wanted}: {'; '.join(parts) or 'the photos form one part'}; omit --part")
+        turned = {TURNED} & set(best.mapping.facts["left_out"].values())
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
         used = mask_warnings(masks.facts if masks else None) or used
         check_registered(
@@ -270,6 +272,7 @@ class Stages:
             best.matches.facts,
             self.settings.part,
             [
+                *turned,
                 *panorama_warnings(photos),
                 *used,
                 *scene_record.fixed_lines(best.matches.facts["fixed"]),

@@ -104,7 +104,7 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
     hooks = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
     hooks = with_effects(hooks, tuple(config.get("effects", ())))
     settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
-    scene = load_scene(path, factor=factor)
+    scene = load_scene(path, factor=factor, check=False)
     data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
     hooks = started(hooks, recorded_start(config.get("start")), scene)
     trainer = Trainer(data, hooks, settings, folder=folder)

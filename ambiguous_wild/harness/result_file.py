@@ -278,7 +278,10 @@ def check_whole(run: Path, result: RunResult) -> None:
     needed = [run / CONFIG] + [run / MODEL] * ("model_sha256" in result)
     needed += [render_path(run, name) for name in result.get("render_sha256", {})]
     if lacking := [str(path.relative_to(run)) for path in needed if not path.is_file()]:
-        raise AwError(f"{run} is damaged, it lacks {shortlist(lacking)}: {RESTORE}")
+        raise AwError(
+            f"{run} is damaged, it lacks {shortlist(lacking)}: restore it, or delete the folder, and "
+            "the same command trains it again"
+        )
 
 
 def check_model(run: Path, result: RunResult) -> None:

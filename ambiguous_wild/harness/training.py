@@ -233,7 +233,7 @@ def refuse_without_masks(name: str, hooks: MethodHooks) -> None:
     kind = type(policy)
     if kind.keep is MaskPolicy.keep and kind.predict is MaskPolicy.predict:
         raise AwError(
-            f"--passes 2 trains again with the final masks, and {name} has none: "
+            f"+2passes trains again with the final masks, and {name} has none: "
             "choose another method, or give it masks with --mask METHOD"
         )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +51,7 @@ def _few_train_photos(scene: Scene) -> str:
 
 
 def _shared_photos(scene: Scene) -> str:
-    pairs = dict([*_equal_views(scene), *_equal_files(scene)])
+    pairs = dict(_equal_files(scene))
     if not pairs:
         return ""
     named = shortlist(f"{test} is {train}" for test, train in sorted(pairs.items()))
@@ -62,17 +61,22 @@ def _shared_photos(scene: Scene) -> str:
     )
 
 
+def _alike_photos(scene: Scene) -> str:
+    pairs = dict(_equal_views(scene)).items() - dict(_equal_files(scene)).items()
+    named = shortlist(f"{test} and {train}" for test, train in sorted(pairs))
+    if not named:
+        return ""
+    return f"test and training photos of one pose that look alike: {named}; check that no test photo trains"
+
+
 def _equal_files(scene: Scene) -> Iterator[tuple[str, str]]:
-    sizes: dict[int, list[View]] = defaultdict(list)
-    for view in scene.train:
-        sizes[view.image_path.stat().st_size].append(view)
-    for test in scene.test:
-        alike = sizes.get(test.image_path.stat().st_size, [])
-        digest = sha256_file(test.image_path) if alike else ""
-        for view in alike:
-            # Pictures of a single colour are equal wherever they were taken.
-            if sha256_file(view.image_path) == digest and _varied(view):
-                yield test.name, view.name
+    sizes = {view.image_path.stat().st_size for view in scene.test}
+    train = [view for view in scene.train if view.image_path.stat().st_size in sizes]
+    known = {sha256_file(view.image_path): view for view in train}
+    for test in scene.test if known else ():
+        view = known.get(sha256_file(test.image_path))
+        if view is not None and _varied(view):  # pictures of a single colour are equal anywhere
+            yield test.name, view.name
 
 
 def _varied(view: View) -> bool:
@@ -118,8 +122,8 @@ def _hidden_test_pixels(scene: Scene) -> str:
 
 
 def _hidden_train_pixels(scene: Scene) -> str:
-    names = _with_alpha(scene, scene.train)
-    return f"alpha of {counted(len(names), 'training photo')} is used as a keep mask" if names else ""
+    found = next((v for v in scene.train if _with_alpha(scene, [v])), None)  # each is decoded for this
+    return "" if found is None else f"alpha of training photos is used as keep masks, as of {found.name}"
 
 
 def _with_alpha(scene: Scene, views: Sequence[View]) -> list[str]:
@@ -192,6 +196,7 @@ CHECKS = (
     SceneCheck(True, _hidden_test_pixels),
     SceneCheck(True, _one_point),
     SceneCheck(True, _no_point_in_view),
+    SceneCheck(False, _alike_photos),
     SceneCheck(False, _few_train_photos),
     SceneCheck(False, _hidden_train_pixels),
     SceneCheck(False, _far_cameras),

@@ -38,13 +38,15 @@ def load_scene(
     factor: int | None = None,
     verify: bool | Literal["quick"] = True,
     raw: bool = False,
+    check: bool = True,
 ) -> Scene:
-    """Open a scene folder; no pixels are read.
+    """Open a scene folder.
 
     Args:
         path: our scene folder, or a plain COLMAP scene (``images/`` and ``sparse/0``).
         factor: 1 opens ``images/``, n opens ``images_n/``; None: the factor of scene.json.
         verify: True compares the sha256 of every file in scene.json, "quick" the sizes, False nothing.
+        check: ask what `scene_checks` lists, for which photos may be read; not where a run is only looked at.
         raw: keep the files' coordinates; else a scene far from the origin, or too large or small for float32
             and the nearest depth, is moved and scaled (`Scene.place`).
 
@@ -97,7 +99,7 @@ def load_scene(
     scene = Scene(root, name, views, _points(model, views), info)
     if verify and read is None:
         info["warnings"] += _mask_warnings(root, scene)
-    if verify and not raw:
+    if verify and check and not raw:
         info["warnings"] += check_scene(scene)
     return scene if raw else centred(scene)
 

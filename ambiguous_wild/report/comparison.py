@@ -76,7 +76,8 @@ def comparison(
     columns = _columns(runs, metrics)
     defined = {c.key: [s for s in chosen if index.can_have(s, c, methods)] for c in columns}
     unranked = incomparable(runs.runs, columns) | versions.keys()
-    apart, every = scenes_apart(runs), frozenset(column.key for column in columns)
+    apart, quality = scenes_apart(runs), frozenset(c.key for c in columns if c.quality)
+    apart |= {""} if apart else set()  # the mean over scenes
     rows = {scene: [_scene_row(index, m, scene, columns) for m in methods] for scene in chosen}
     if len(chosen) > 1:
         mean = [_mean_row(index, k, m, chosen, columns, rows, defined) for k, m in enumerate(methods)]
@@ -86,7 +87,7 @@ def comparison(
         Table(
             scene or title,
             tuple(Column("", measure, scene) for measure in columns),
-            tuple(_ranked(of, columns, every if scene in apart or (apart and not scene) else unranked)),
+            tuple(_ranked(of, columns, unranked | (quality if scene in apart else frozenset()))),
             continued=True,
         )
         for scene, of in rows.items()

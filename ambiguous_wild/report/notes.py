@@ -224,7 +224,7 @@ def scenes_apart(runs: Runs) -> frozenset[str]:
     for scene, group in ok.groupby("scene"):
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         photos = {frozenset(names) for _, names in images}
-        if group["scene_hash"].nunique() > 1 or group["fit"].nunique() > 1 or len(photos) > 1:
+        if group["scene_hash"].nunique() > 1 or (group["fit"] == "full").nunique() > 1 or len(photos) > 1:
             apart.add(str(scene))
     return frozenset(apart)
 
@@ -232,7 +232,8 @@ def scenes_apart(runs: Runs) -> frozenset[str]:
 def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
     lines = [
         f"{UNEQUAL}: {measure(key).label} comes from different functions ({shortlist(sorted(of))}): it is "
-        "not ranked, and runs of a method that differ so have no mean"
+        "not ranked, and runs of a method that differ so have no mean; 'aw rescore RUNS --metric-file FILE' "
+        "measures all with one"
         for key, of in metric_versions(runs.runs).items()
     ]
     ok = runs.runs[runs.runs["status"] == "ok"]

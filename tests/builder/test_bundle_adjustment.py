@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
+import pytest
 
-from ambiguous_wild.builder.bundle_adjustment import UNSURE, adjustment_options, joint_covariance
+from ambiguous_wild.builder.bundle_adjustment import UNSURE, adjustment_options, joint_covariance, shows_depth
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PHOTOS, WEAK, NOISE_PX = 6, 3, 0.3
@@ -77,3 +78,22 @@ def test_deviations_are_those_of_many_adjustments():
     spread = np.einsum("spha,sphb->phab", errors, errors) / len(errors)
     measured = np.sqrt(np.linalg.eigvalsh(spread)[..., -1])
     assert np.allclose(measured, NOISE_PX * predicted, rtol=0.2)
+
+
+@pytest.mark.parametrize(("step_m", "shown"), [(0.03, False), (0.5, True)])
+def test_a_camera_that_only_turned_shows_no_depth(step_m, shown):
+    """Points 4 to 8 m away, six photos from 15 cm or from 2.5 m."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_PINHOLE", width=640, height=480, params=[400, 320, 240]
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for photo in range(PHOTOS):
+        at = np.column_stack([np.eye(3), [-step_m * photo, 0.0, 0.0]])
+        image = pycolmap.Image(
+            name=f"{photo}", keypoints=np.zeros((len(POINTS), 2)), camera_id=1, image_id=photo + 1
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(at))
+    for number, xyz in enumerate(POINTS):
+        model.add_point3D(xyz, pycolmap.Track([pycolmap.TrackElement(k + 1, number) for k in range(PHOTOS)]))
+    assert shows_depth(model) == shown

@@ -73,7 +73,6 @@ def focal_lengths(root: Path) -> None:
     ("spoil", "words"),
     [
         (train_photo_as_test, "test photos are training photos (test_0.png is train_0.png)"),
-        (train_photo_again_as_jpeg, "test photos are training photos (test_0.png is train_0.png)"),
         (lambda root: alpha(root, *TEST), "alpha of 2 test photos hides pixels"),
         (one_pose, "all 6 cameras have one pose"),
         (lambda root: points_at(root, "0 0 4"), "all points of the sparse model lie at one place"),
@@ -102,7 +101,8 @@ def test_a_scene_that_would_give_a_wrong_number_is_refused_everywhere(tmp_path, 
     [
         (lambda root: masks(root, TRAIN[0]), "without a mask, so all of them trains: train_1.png"),
         (lambda root: masks(root, TRAIN[0], "typo.png"), "masks that belong to no photo: typo.png"),
-        (lambda root: alpha(root, *TRAIN), "alpha of 6 training photos is used as a keep mask"),
+        (lambda root: alpha(root, *TRAIN), "alpha of training photos is used as keep masks"),
+        (train_photo_again_as_jpeg, "of one pose that look alike: test_0.png and train_0.png"),
         (focal_lengths, "focal lengths of x and y differ more than 2 times: "),
         (lambda root: (root / "train_list.txt").write_text(TRAIN[0]), "it has one training photo"),
     ],

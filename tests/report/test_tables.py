@@ -438,3 +438,7 @@ def test_methods_of_two_protocols_are_not_ranked(tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result("a", psnr=(20.0, 20.0)), fake_result("b", facts=half))
     assert {cell(table, m, "psnr").rank for m in "ab"} == {None}
     assert any(note.startswith("not comparable: protocols differ") for note in table[-1].notes)
+    # the same right halves
+    read = fake_result("b", psnr=(30.0, 30.0), facts=half | {"fitted": {"read_by": "gs-w"}})
+    table = table_of(tmp_path / "half", fake_result("a", facts=half), read)
+    assert {cell(table, m, "psnr").rank for m in "ab"} == {1, 2}

@@ -122,7 +122,8 @@ def test_extra_files_of_other_tools_do_not_matter(tmp_path):
     mark_as_ours(tmp_path)
     (tmp_path / "images_2_png").mkdir()
     (tmp_path / "notes.txt").write_text("mine")
-    load_scene(tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.info["loaded_factor"] == 2 and len(scene.views) == len(NAMES)
 
 
 def test_a_path_that_leaves_the_scene_is_refused(tmp_path):

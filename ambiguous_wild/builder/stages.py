@@ -261,7 +261,8 @@ class Stages:
         parts = scene_record.part_lines(components, sources, wanted)
         if wanted > len(components) > 0:
             raise AwError(f"no part {wanted}: {'; '.join(parts) or 'the photos form one part'}; omit --part")
-        turned = {TURNED} & set(best.mapping.facts["left_out"].values())
+        built = best.mapping.facts["model"] is not None
+        turned = set() if built else {TURNED} & set(best.mapping.facts["left_out"].values())
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
         used = mask_warnings(masks.facts if masks else None) or used
         check_registered(

@@ -65,11 +65,11 @@ def run_mapping(job: MappingJob) -> None:
     for component in {*components[:1], *([chosen] if chosen else [])}:
         component.mark_provisional()
     reliable = len(components[0].poses.keys() - components[0].provisional) if components else 0
-    turned = chosen is not None and len(chosen.poses) >= LEAST_PHOTOS and not shows_depth(chosen.model)
-    if chosen is None or len(chosen.poses) < LEAST_PHOTOS or turned:
-        why = TURNED if turned else "no pair of photos to start from"
+    why = "no pair of photos to start from"
+    if chosen is not None and len(chosen.poses) >= LEAST_PHOTOS and not shows_depth(chosen.model):
+        chosen, components, reliable, why = None, [], 0, TURNED
+    if chosen is None or len(chosen.poses) < LEAST_PHOTOS:
         left_out = dict.fromkeys(matched.names, why)
-        components, reliable = ([], 0) if turned else (components, reliable)
         left_out |= _left_out(components[0], components) if components else {}
         names = [_names(component, component.poses) for component in components if component.poses]
         write_json(

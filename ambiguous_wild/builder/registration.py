@@ -14,16 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ambiguous_wild.builder.bundle_adjustment import (
-    UNSURE,
-    JointCovariance,
-    adjustment_options,
-    joint_covariance,
-    pipeline_options,
-    plausible,
-)
+from ambiguous_wild.builder.bundle_adjustment import adjustment_options, pipeline_options, plausible
 from ambiguous_wild.builder.matched import Matched, PointLookup
 from ambiguous_wild.builder.overlap_graph import bridges, connected_components, graph_of
+from ambiguous_wild.builder.pose_covariance import UNSURE, JointCovariance, joint_covariance
 from ambiguous_wild.builder.pose_hypothesis import (
     AREA_NEW,
     LEAST_SUPPORT,

@@ -62,8 +62,7 @@ def _shared_photos(scene: Scene) -> str:
 
 
 def _alike_photos(scene: Scene) -> str:
-    pairs = dict(_equal_views(scene)).items() - dict(_equal_files(scene)).items()
-    named = shortlist(f"{test} and {train}" for test, train in sorted(pairs))
+    named = shortlist(f"{test} and {train}" for test, train in sorted(_equal_views(scene)))
     if not named:
         return ""
     return f"test and training photos of one pose that look alike: {named}; check that no test photo trains"
@@ -112,7 +111,7 @@ def _one_pose(scene: Scene) -> str:
 
 
 def _hidden_test_pixels(scene: Scene) -> str:
-    names = _with_alpha(scene, scene.test)
+    names = list(_with_alpha(scene, scene.test))
     if not names:
         return ""
     return (
@@ -122,14 +121,13 @@ def _hidden_test_pixels(scene: Scene) -> str:
 
 
 def _hidden_train_pixels(scene: Scene) -> str:
-    found = next((v for v in scene.train if _with_alpha(scene, [v])), None)  # each is decoded for this
-    return "" if found is None else f"alpha of training photos is used as keep masks, as of {found.name}"
+    name = next(_with_alpha(scene, scene.train), None)  # the first is enough: each is decoded
+    return f"alpha of training photos is used as keep masks, as of {name}" if name else ""
 
 
-def _with_alpha(scene: Scene, views: Sequence[View]) -> list[str]:
-    if "files" in scene.info:  # alpha became masks when the scene was made
-        return []
-    return [view.name for view in views if read_alpha(view.image_path) is not None]
+def _with_alpha(scene: Scene, views: Sequence[View]) -> Iterator[str]:
+    if "files" not in scene.info:  # else alpha became masks when the scene was made
+        yield from (view.name for view in views if read_alpha(view.image_path) is not None)
 
 
 def _far_cameras(scene: Scene) -> str:
@@ -152,9 +150,9 @@ def _one_position(scene: Scene) -> str:
 def _odd_principal_points(scene: Scene) -> str:
     cameras = [(view.name, view.camera) for view in scene.train]
     outside = [n for n, c in cameras if not (0 <= c.cx <= c.width and 0 <= c.cy <= c.height)]
-    return f"principal points outside of the photos: {shortlist(outside)}; check their cameras" * bool(
-        outside
-    )
+    if not outside:
+        return ""
+    return f"principal points outside of the photos: {shortlist(outside)}; check their cameras"
 
 
 def _odd_focal_lengths(scene: Scene) -> str:
@@ -181,7 +179,7 @@ def _no_point_in_view(scene: Scene) -> str:
         return ""
     for view in scene.train:
         camera = view.camera
-        local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        local = camera.to_camera(xyz)
         x, y, z = local[local[:, 2] > 0].T
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         if ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).any():

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.bundle_adjustment import UNSURE, adjustment_options, joint_covariance, shows_depth
+from ambiguous_wild.builder.bundle_adjustment import adjustment_options, shows_depth
+from ambiguous_wild.builder.pose_covariance import UNSURE, joint_covariance
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 PHOTOS, WEAK, NOISE_PX = 6, 3, 0.3

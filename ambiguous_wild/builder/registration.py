@@ -144,8 +144,8 @@ class Registration:
         """Return the components of the pose graph, the largest first.
 
         A single link between two groups of photos does not connect them: it may show a distractor, and it
-        gives no scale. Nor does a single photo whose inliers with one of them are clustered. A single link
-        does connect one or two photos with a group, and components that several pairs merged.
+        gives no scale. Nor does a single photo whose inliers with one of them cover little of it. A single
+        link does connect one or two photos with a group, and components that several pairs merged.
 
         Args:
             all_links: result of `find_links`.
@@ -157,7 +157,7 @@ class Registration:
         graph = graph_of(len(photos), links)
         weak = {pair for pair in bridges(graph) if not self._across_merge(*(photos[k] for k in pair))}
         graph.remove_edges_from(weak)
-        self._cut_clustered(graph, photos)
+        self._cut_small_areas(graph, photos)
         components = [set(group) for group in connected_components(graph)]
         for _, a, b in sorted((-n, a, b) for a, b, n in links if (a, b) in weak):
             first, second = (next(group for group in components if k in group) for k in (a, b))
@@ -167,7 +167,7 @@ class Registration:
         named = [{photos[k] for k in group} for group in components]
         return sorted(named, key=lambda group: (-len(group), min(group)))
 
-    def _cut_clustered(self, graph: nx.Graph, photos: Sequence[int]) -> None:
+    def _cut_small_areas(self, graph: nx.Graph, photos: Sequence[int]) -> None:
         """Remove the links of a photo with a group that it alone connects, if they may show a distractor."""
         import networkx as nx
 
@@ -183,7 +183,7 @@ class Registration:
                 sides.append((self.hypothesis(photo, self.poses[photo], of_side), side))
             sides.sort(key=lambda item: -item[0].weight)
             for hypothesis, side in sides[1:]:
-                if len(side) >= LEAST_PHOTOS and hypothesis.clustered and hypothesis.area < AREA_NEW:
+                if len(side) >= LEAST_PHOTOS and hypothesis.area < AREA_NEW:
                     graph.remove_edges_from([(k, j) for j in linked & side])
 
     def cameras(self) -> list[CameraFact]:

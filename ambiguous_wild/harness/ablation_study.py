@@ -23,8 +23,8 @@ from ambiguous_wild.harness.result_file import (
     TrainRecord,
     mask_scores,
     mean_of,
-    read_result,
 )
+from ambiguous_wild.harness.store import checked_result
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.methods.ablation_groups import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.describe import BACK_ENDS
@@ -311,10 +311,10 @@ def read_outcomes(cells: Sequence[Cell], output: Path) -> list[VariantResult]:
     for cell in cells:
         folder = cell_folder(output, cell)
         where = (cell.scene.name, cell.train.seed, folder)
-        if (folder / RESULT).is_file():
-            outcomes.append(VariantResult(*where, read_result(folder / RESULT)))
-        elif (folder / FAILED).is_file():
-            outcomes.append(VariantResult(*where, None, str(read_result(folder / FAILED)["error"])))
-        else:
+        if not (folder / RESULT).is_file() and not (folder / FAILED).is_file():
             outcomes.append(VariantResult(*where, None, "not run"))
+            continue
+        result = checked_result(folder)
+        done = result["status"] == "ok"
+        outcomes.append(VariantResult(*where, result if done else None, "" if done else str(result["error"])))
     return outcomes

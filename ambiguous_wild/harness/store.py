@@ -118,22 +118,45 @@ def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FolderResult]
     results: list[FolderResult] = []
     before = len(incomplete)
     for run in find_runs([root]):
-        paths = [run / name for name in (RESULT, FAILED) if (run / name).exists()]
         try:
-            if not paths:
-                raise AwError(
-                    f"no {RESULT}: still running, or stopped; run the same command again to finish it"
-                )
-            result = read_result(paths[0])
-            for what, value, why in impossible_values(result):
-                raise AwError(f"{paths[0]} was changed: {what} is {value:g}, but such a number {why}")
-            results.append((run, result))
+            results.append((run, checked_result(run)))
         except AwError as error:
             incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
     if not results and len(incomplete) == before:
         raise _no_run(root)
     _refuse_duplicates(results)
     return results
+
+
+def checked_result(run: Path) -> RunResult:
+    """Read the result of a run; raise AwError if there is none, or if it or config.yaml was changed."""
+    path = next((run / name for name in (RESULT, FAILED) if (run / name).exists()), None)
+    if path is None:
+        raise AwError(f"no {RESULT}: still running, or stopped; run the same command again to finish it")
+    result = read_result(path)
+    for contradiction in contradictions(read_config(run), result):
+        raise AwError(f"{run} was changed: {contradiction}")
+    for what, value, why in impossible_values(result):
+        raise AwError(f"{path} was changed: {what} is {value:g}, but such a number {why}")
+    return result
+
+
+def contradictions(config: ReadConfig, result: RunResult) -> Iterator[str]:
+    """Yield in what a result differs from the settings of its run, of those that config.yaml holds."""
+    train, scene = section(config, "train"), section(config, "scene")
+    facts = result["facts"]
+    pairs = {
+        "method": (config.get("method"), result["method"]),
+        "scene": (scene.get("name"), result["scene"]),
+        "scene hash": (scene.get("sha256"), result["scene_hash"]),
+        "seed": (train.get("seed"), result["seed"]),
+        "options": (config.get("options"), result["options"]),
+        "version": (config.get("version"), result["version"]),
+        "protocol": (config.get("protocol"), facts.get("protocol", "full")),
+    }
+    for what, (asked, got) in pairs.items():
+        if asked is not None and asked != got:
+            yield f"{what} is {str(asked)[:40]!a} in {CONFIG} and {str(got)[:40]!a} in {RESULT}"
 
 
 def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:

@@ -30,7 +30,7 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.store import impossible_values, read_config
+from ambiguous_wild.harness.store import contradictions, impossible_values, read_config
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.images import read_png_rgb
@@ -185,18 +185,8 @@ def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:
     for where, written in (("config.yaml", config["config_hash"]), (RESULT, result["config_hash"])):
         if written != computed:
             _changed(run, f"config.yaml hashes to {computed[:12]}, {where} says {str(written)[:12]}")
-    pairs = {
-        "method": (config["method"], result["method"]),
-        "scene": (config["scene"].get("name"), result["scene"]),
-        "scene hash": (config["scene"].get("sha256"), result["scene_hash"]),
-        "seed": (config["train"].get("seed"), result["seed"]),
-        "options": (config["options"], result["options"]),
-        "version": (config["version"], result["version"]),
-        "protocol": (config.get("protocol", "full"), result["facts"].get("protocol", "full")),
-    }
-    for what, (asked, got) in pairs.items():
-        if asked != got:
-            _changed(run, f"{what} is {str(asked)[:40]!a} in config.yaml and {str(got)[:40]!a} in {RESULT}")
+    for contradiction in contradictions(dict(config), result):
+        _changed(run, contradiction)
     source, method = config["source"], config["method"]
     # a variant "method@..." has the method's code and another setting
     named = method.split("@")[0] in {entry.name for entry in BUILTIN}

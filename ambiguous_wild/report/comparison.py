@@ -23,7 +23,14 @@ from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, read_r
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.grouping import grouped
-from ambiguous_wild.report.notes import incomparable, metric_versions, notes, scenes_apart, untimed
+from ambiguous_wild.report.notes import (
+    incomparable,
+    metric_versions,
+    mixed_runs,
+    notes,
+    scenes_apart,
+    untimed,
+)
 from ambiguous_wild.report.plain_formats import to_text
 from ambiguous_wild.report.table_layout import Column, Row, State, Table, TableCell, ranks
 from ambiguous_wild.report.typeset import to_html
@@ -172,7 +179,7 @@ class _Index:
         self.runs = dict(iter(runs.runs.groupby(["method", "scene"])))
         self.images = dict(iter(runs.images.groupby(["method", "scene", "metric"])))
         self.unfinished = {(i.method, i.scene) for i in runs.incomplete}
-        self.untimed = set(untimed(runs.runs))
+        self.untimed, self.mixed = set(untimed(runs.runs)), set(mixed_runs(runs.runs))
 
     def seeds(self, method: str, scene: str, column: Measure) -> pd.Series:
         """Return the value of each seed's run; NaN if it is missing."""
@@ -200,7 +207,9 @@ class _Index:
     def state(self, method: str, scene: str) -> State:
         if (method, scene) not in self.runs:
             return "absent"
-        return "failed" if (self.runs[method, scene]["status"] == "failed").any() else "ok"
+        if (self.runs[method, scene]["status"] == "failed").any():
+            return "failed"
+        return "missing" if (method, scene) in self.mixed else "ok"
 
 
 def _columns(runs: Runs, metrics: Sequence[str]) -> tuple[Measure, ...]:
@@ -268,7 +277,7 @@ def _mean_row(
         value = stats.mean([row.cells[i].value for row, s in zip(rows, scenes) if s in over])
         if "failed" in states:
             cells.append(TableCell(state="failed"))
-        elif math.isnan(value):
+        elif math.isnan(value) or (method, "") in index.mixed:
             cells.append(TableCell(state="missing"))
         elif any(row.cells[i].ranged for row in rows):
             own = [(c.low, c.high) if c.ranged else (c.value, c.value) for c in (r.cells[i] for r in rows)]

@@ -45,7 +45,7 @@ class Change:
     db_low: float  # 95 % bootstrap interval of the gain, over the test images of all pairs
     db_high: float
     minutes: MeanAndDeviation  # extra minutes of training, over pairs
-    ms_per_iteration: MeanAndDeviation  # extra ms
+    ms_per_iteration: MeanAndDeviation  # extra ms, of the reference machine if the minutes are
     db_per_minute: float  # NaN if it takes no longer, or a run was not alone
     same_time: bool
     not_ranked: str = ""  # why the minutes cannot be trusted; empty if they can
@@ -114,7 +114,7 @@ def _value(run: CostRun, option: str) -> str:
 
 def _change(key: Key, pairs: list[Pair]) -> Change:
     kind, name, method, length, before, after = key
-    ms = [b.numbers["ms_per_iteration"] - a.numbers["ms_per_iteration"] for a, b in pairs]
+    ms = [b.speed * b.numbers["ms_per_iteration"] - a.speed * a.numbers["ms_per_iteration"] for a, b in pairs]
     if kind not in ("effect", "part") and np.mean(ms) < 0.0:  # the change is towards the slower value
         before, after, pairs, ms = after, before, [(b, a) for a, b in pairs], [-extra for extra in ms]
     db = _summary([b.psnr - a.psnr for a, b in pairs])

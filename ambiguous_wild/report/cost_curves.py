@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_runs import CostRun, Length, why_unranked
@@ -145,7 +146,7 @@ class Point:
     not_ranked: str = ""  # why its time is not ranked
     pareto_front: bool = False  # no other curve reaches this PSNR in less time
     setup_s: MeanAndDeviation = MeanAndDeviation()
-    # ms per iteration, Gaussians, MB, frames per second, the user's metrics
+    # ms per iteration, Gaussians, MB, frames per second, the user's metrics; times only if they are ranked
     numbers: dict[str, MeanAndDeviation] = field(default_factory=dict)
 
 
@@ -163,7 +164,11 @@ def points(curves: Sequence[Curve]) -> list[Point]:
 
 
 def _point(curve: Curve, scenes: Sequence[str], names: Iterable[str]) -> Point:
+    unranked = why_unranked(curve.runs)
+
     def number(name: str) -> MeanAndDeviation:
+        if unranked and measure(name).timed:
+            return MeanAndDeviation()
         return summary(curve, scenes, lambda run: run.numbers.get(name, math.nan))
 
     return Point(
@@ -174,7 +179,7 @@ def _point(curve: Curve, scenes: Sequence[str], names: Iterable[str]) -> Point:
         summary(curve, scenes, lambda run: run.psnr),
         summary(curve, scenes, lambda run: run.minutes),
         *_range(run.minutes for run in curve.runs),
-        why_unranked(curve.runs),
+        unranked,
         setup_s=summary(curve, scenes, lambda run: run.setup_s),
         numbers={name: number(name) for name in names},
     )

@@ -265,7 +265,7 @@ def _points(report: CostReport) -> Table:
         ))  # fmt: skip
     took = f"{unit.name} with set-up" if report.setup else unit.name
     head = ("method", "trained for", "runs", "PSNR dB", took, "on the front", f"{kind}set-up s",
-            f"{kind}ms/iter", "Gaussians", "MB", f"{kind}FPS")  # fmt: skip
+            "ms/iter", "Gaussians", "MB", "FPS")  # fmt: skip
     return text_table(f"what each method reaches, and what it costs ({report.over})", head, rows)
 
 
@@ -311,7 +311,7 @@ def _time(minutes: MeanAndDeviation, row: Point | Reach, unit: TimeUnit) -> str:
 def _changed(title: str, rows: Sequence[Change], report: CostReport) -> Table:
     unit = report.unit
     head = ("change", "method", "trained for", "pairs", "dB gained", "95 % interval", f"extra {unit.name}",
-            "extra ms/iter", f"dB per extra {report.kind}min")  # fmt: skip
+            f"extra {report.kind}ms/iter", f"dB per extra {report.kind}min")  # fmt: skip
     lines = []
     for c in rows:
         interval = MISSING if math.isnan(c.db_low) else f"{c.db_low:+.2f} to {c.db_high:+.2f}"

@@ -17,8 +17,16 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.harness.result_file import FAILED, RESULT, Cost, Options, RunResult, mean_of, read_result
-from ambiguous_wild.harness.store import BOOKKEEPING, ReadConfig, check_names, find_runs, read_config, section
+from ambiguous_wild.harness.result_file import Cost, Options, RunResult, mean_of
+from ambiguous_wild.harness.store import (
+    BOOKKEEPING,
+    ReadConfig,
+    check_names,
+    checked_result,
+    find_runs,
+    read_config,
+    section,
+)
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.io.files import own_json
 from ambiguous_wild.metrics import stats
@@ -62,7 +70,7 @@ class CostRun:
     images: dict[str, float]  # PSNR by test image
     train_s: float
     setup_s: float  # features and masks before the first step; short if they were cached
-    numbers: dict[str, float]  # see NUMBERS, and the user's metrics; NaN = not measured
+    numbers: dict[str, float]  # see NUMBERS, and the user's metrics, as measured; NaN = not measured
     points: tuple[tuple[float, float], ...]  # (seconds of training, PSNR in dB), in order of time
     timing: Timing
     samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
@@ -73,6 +81,7 @@ class CostRun:
     error: str = ""
     unprobed: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
     added_s: float = 0.0  # added to times that are compared: the set-up, if it was asked for
+    speed: float = 1.0  # reference seconds in a second of the training; 1: times are wall seconds
 
     @property
     def minutes(self) -> float:
@@ -113,14 +122,10 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
     runs: list[CostRun] = []
     notes: list[str] = []
     for folder in find_runs(folders):
-        path = next((folder / n for n in (RESULT, FAILED) if (folder / n).exists()), None)
-        if path is None:
-            notes.append(f"not finished, left out: {folder}")
-            continue
         try:
-            runs.append(_run(folder, read_result(path)))
+            runs.append(_run(folder, checked_result(folder)))
         except AwError as error:
-            notes.append(f"left out: {error}")
+            notes.append(f"left out: {folder}: {error}")
     check_names("scene", scenes, sorted({run.scene for run in runs}))
     runs = [run for run in runs if not scenes or run.scene in scenes]
     if all(math.isnan(run.psnr) for run in runs):
@@ -152,20 +157,18 @@ def _all_calibrated(runs: Iterable[CostRun]) -> bool:
 
 
 def _in_reference(run: CostRun) -> CostRun:
-    """Return the run with every time in seconds of the reference machine."""
+    """Return the run with its training, set-up and probes in seconds of the reference machine."""
     if run.error:
         return run
     total = run.timing.reference_s
-    early = late = ratio = total / run.train_s if run.train_s > 0.0 else 1.0
+    early = ratio = total / run.train_s if run.train_s > 0.0 else 1.0
     walls = [at for at, _ in run.points]
     times = np.array(walls) * ratio
     if run.samples:
-        early, late = (run.kernel_reference_s / run.samples[i][1] for i in (0, -1))
+        early = run.kernel_reference_s / run.samples[0][1]
         times = in_reference_seconds(run.samples, run.kernel_reference_s, walls)
     points = tuple((float(at), psnr) for at, (_, psnr) in zip(times, run.points))
-    per_second = {"ms_per_iteration": ratio, "fps": 1.0 / late if late > 0.0 else math.nan}
-    numbers = {name: value * per_second.get(name, 1.0) for name, value in run.numbers.items()}
-    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points, numbers=numbers)
+    return replace(run, train_s=total, setup_s=run.setup_s * early, points=points, speed=ratio)
 
 
 def why_unranked(runs: Iterable[CostRun]) -> str:

@@ -29,6 +29,11 @@ CONDITIONS = {
     "start": "starts",
     "training": "settings of training",
 }
+IDENTITIES = CONDITIONS | {  # runs of one method on a scene that differ in one of them have no mean
+    "scene_hash": "version of the scene",
+    "source": "version of the method's file",
+    "options_hash": "options",
+}
 FITTED = {
     "fitted": "colours fitted on the left half of each test photo, the right half measured",
     "read": "colours read from the left half of each test photo, the right half measured",
@@ -218,6 +223,17 @@ def metric_versions(frame: pd.DataFrame) -> dict[str, dict[str, set[str]]]:
     return {key: of for key, of in found.items() if len(set.union(*of.values())) > 1}
 
 
+def mixed_runs(frame: pd.DataFrame) -> dict[tuple[str, str], list[str]]:
+    """Return by (method, scene) in what runs of a method differ beside the seed; "": between scenes."""
+    done = frame[frame["status"] == "ok"]
+    mixed = {}
+    for (method, scene), of in done.groupby(["method", "scene"]):
+        if differ := [what for column, what in IDENTITIES.items() if of[column].astype(str).nunique() > 1]:
+            mixed[str(method), str(scene)] = differ
+    of_file = done.groupby(["method", "scene"])["source"].first().groupby("method").nunique()
+    return mixed | {(str(method), ""): [IDENTITIES["source"]] for method in of_file.index[of_file > 1]}
+
+
 def scenes_apart(runs: Runs) -> frozenset[str]:
     """Return scenes on which runs measured different pixels: another protocol, other photos or files."""
     ok, apart = runs.runs[runs.runs["status"] == "ok"], set()
@@ -246,16 +262,11 @@ def _not_comparable(runs: Runs, columns: Sequence[Measure]) -> list[str]:
         images = runs.images[runs.images["scene"] == scene].groupby(["method", "seed"])["image"]
         if len({frozenset(names) for _, names in images}) > 1:
             lines.append(f"{UNEQUAL}: methods were measured on different test images of {scene}")
-    for _, group in ok.groupby(["method", "scene"]):
-        if group["options_hash"].nunique() > 1:
-            method, scene = group["method"].iloc[0], group["scene"].iloc[0]
-            lines.append(f"{UNEQUAL}: runs of {method} on {scene} have different options")
-    for method, group in ok.groupby("method"):
-        if group["source"].nunique() > 1:
-            lines.append(
-                f"{UNEQUAL}: results of {method!s} come from {group['source'].nunique()} versions of its "
-                "file (source in config.yaml differs); run them again with one"
-            )
+    for (of_method, on), differ in mixed_runs(runs.runs).items():
+        lines.append(
+            f"{UNEQUAL}: runs of {of_method} on {on or 'all scenes'} differ in {', '.join(differ)}, so they "
+            "have no mean: give their folders one at a time"
+        )
     if "iterations" in ok and not any("lengths differ" in line for line in unequal(ok)):
         lengths = ok["iterations"].astype(float)
         longest = lengths[np.isfinite(lengths)].groupby(ok["method"]).max()

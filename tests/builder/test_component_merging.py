@@ -202,9 +202,9 @@ def test_a_single_link_does_not_connect_two_groups_but_a_photo_with_one(across, 
     assert (2, 3) in component.find_links() and connected(component) == expected
 
 
-@pytest.mark.parametrize(("most", "whole"), [(None, True), (2, False)])
-def test_a_photo_connects_two_groups_only_if_its_inliers_are_not_clustered(most, whole):
-    """Photo 2 alone has links to the other group: with all its matches, or with those in one corner."""
+@pytest.mark.parametrize(("most", "whole"), [(None, True), (60, True), (20, False)])
+def test_a_photo_connects_two_groups_only_if_its_inliers_cover_much_of_it(most, whole):
+    """Photo 2 alone has links to the other group: with all its matches, or with those nearest to a corner."""
     component, _ = components_of({(2, 3): None, (2, 4): None, (2, 5): None})
     component.poses = {k: pose(k) for k in range(6)}
     for other in THERE:

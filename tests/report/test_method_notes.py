@@ -15,7 +15,7 @@ from tests.tiny_scene import write_tiny_scene
 
 
 def notes_of(root: Path, *methods: tuple[str, dict]) -> list[str]:  # type: ignore[type-arg]
-    save(root, *(fake_result(name) for name, _ in methods))
+    save(root, *(fake_result(name, options=options) for name, options in methods))
     for name, options in methods:
         folder = "".join(c if c.isalnum() else "_" for c in name)
         config = {"method": name, "options": options}

@@ -146,30 +146,33 @@ def test_settings_code_and_seeds_that_differ_are_said(tmp_path: Path) -> None:
     save(tmp_path, fake_result("a"), fake_result("a", seed=1, **other), fake_result("b"))
     (tmp_path / "yard/b/seed0/config.yaml").write_text("train: {max_gaussians: 50, iterations: 7, probes: 0}")
     notes = "\n".join(comparison(read_runs(tmp_path))[-1].notes)
-    assert "not comparable: runs of a on yard have different options" in notes
+    assert "not comparable: runs of a on yard differ in options, so they have no mean" in notes
     assert "not comparable: settings of training differ on yard" not in notes  # a has none on record
     assert "2 states of ambiguous_wild's code" in notes and "numbers of seeds: a 2, b 1" in notes
     for seed in (0, 1):
-        (tmp_path / f"yard/a/seed{seed}/config.yaml").write_text("train: {max_gaussians: null, seed: 1}")
+        settings = f"train: {{max_gaussians: null, seed: {seed}}}"
+        (tmp_path / f"yard/a/seed{seed}/config.yaml").write_text(settings)
     notes = "\n".join(comparison(read_runs(tmp_path))[-1].notes)
     assert "settings of training differ on yard: a: max_gaussians auto, b: max_gaussians 50" in notes
     layouts = to_wide_csv(comparison(read_runs(tmp_path))), to_long_csv(papers.paper(read_runs(tmp_path)))
     for row in (row for text in layouts for row in csv.DictReader(io.StringIO(text))):
-        for what in ("different options", "settings of training", "states of", "numbers of seeds"):
+        for what in ("differ in options", "settings of training", "states of", "numbers of seeds"):
             assert what in row["note"]
 
 
-def test_versions_of_a_methods_file_are_not_comparable(tmp_path: Path) -> None:
-    results = [fake_result(method, seed=seed) for method in "ab" for seed in (0, 1)]
+@pytest.mark.parametrize("scenes", [("yard",), ("room", "yard")])
+def test_runs_of_versions_of_a_methods_file_have_no_mean(tmp_path: Path, scenes: tuple[str, ...]) -> None:
+    results = [fake_result(method, s, seed) for method in "ab" for s in scenes for seed in (0, 1)]
     save(tmp_path, *results)
-    for result in results:  # b was edited between its seeds
-        source = f"{result['method']}{result['seed'] * (result['method'] == 'b')}"
-        folder = tmp_path / "yard" / result["method"] / f"seed{result['seed']}"
-        (folder / "config.yaml").write_text(f"source: {source}\n")
+    for result in results:  # b was edited, between its seeds or between the scenes
+        edited = result["scene"] == "room" if len(scenes) > 1 else result["seed"] == 1
+        folder = tmp_path / result["scene"] / result["method"] / f"seed{result['seed']}"
+        (folder / "config.yaml").write_text(f"source: {result['method']}{edited * (result['method'] == 'b'):d}")
     table = comparison(read_runs(tmp_path))
-    named = [note for note in table[-1].notes if note.startswith("not comparable")]
-    assert len(named) == 1 and "results of b come from 2 versions of its file" in named[0]
-    assert named[0] in to_text(table)
+    (named,) = {note for note in table[-1].notes if note.startswith("not comparable: runs of b on")}
+    assert "version of the method's file, so they have no mean" in named and named in to_text(table)
+    states = {row.name: row.cells[0].state for row in table[0].rows}
+    assert states == {"a": "ok", "b": "missing"}
 
 
 def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_path: Path) -> None:

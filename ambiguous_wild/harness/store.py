@@ -322,12 +322,12 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
         | cost
         | {"timing": timing.verdict, "timing_reason": timing.reason, "timing_kernel": timing.kernel}
         | {"hardware": _hardware(result)}
-        | {"metric_functions": _metric_functions(result)}
+        | {"metric_functions": metric_functions(result)}
         | {f"mask_{k}": masks.get(k, math.nan) for k in MASK_LABELS}
     )
 
 
-def _metric_functions(result: RunResult) -> dict[str, str]:
+def metric_functions(result: RunResult) -> dict[str, str]:
     """Return the identity of each metric that is not of this package: of its file, and what it claims."""
     records = result.get("metrics", {})
     return {key: f"{r['source']} {r['better']}" for key, r in records.items()}

@@ -32,6 +32,7 @@ LAST = (
     "missing", "device", "hardware", "version", "source", "code_hash", "config_hash", "scene_hash",
     "result_hash", "checked", "reproduce", "row_hash",
 )  # fmt: skip
+FUNCTIONS = "metric_functions"  # a column of boards with users' metrics, absent from others
 NO_TEXT = ("seed", "images", "missing", "checked", "row_hash")  # columns that are not plain text
 COST = "cost_"  # prefix of columns with costs; all other columns with numbers are qualities
 ALONE = "alone"  # the cost that is 1 if the run had the machine alone, else 0
@@ -164,6 +165,7 @@ class Entry:
     result_hash: str  # sha256 of metrics.json
     checked: Checked
     reproduce: str  # the command
+    metric_functions: str = ""  # "KEY HASH BETTER" of each user's metric, in order, separated by ", "
 
     @property
     def key(self) -> Key:
@@ -178,6 +180,7 @@ class Entry:
     def row_hash(self) -> str:
         """sha256 over the cells of the row, which reveals changes by hand or by a spreadsheet."""
         cells = {k: getattr(self, k) for k in (*FIRST, *LAST) if k != "row_hash"}
+        cells |= {FUNCTIONS: self.metric_functions} if self.metric_functions else {}
         values = {k: {m: number(v) for m, v in getattr(self, k).items()} for k in ("quality", "cost")}
         return config_hash(cells | values)
 
@@ -192,12 +195,13 @@ def wide(entries: Sequence[Entry]) -> tuple[list[str], list[list[CsvValue]]]:
     """Return the head and one row for each run."""
     quality = in_order({k for e in entries for k in e.quality})
     cost = in_order({k for e in entries for k in e.cost})
-    head = [*FIRST, *quality, *(COST + k for k in cost), *LAST]
+    last = (*LAST, FUNCTIONS) if any(e.metric_functions for e in entries) else LAST
+    head = [*FIRST, *quality, *(COST + k for k in cost), *last]
     rows: list[list[CsvValue]] = []
     for e in sorted(entries, key=lambda e: e.key):
         cells = vars(e) | {"missing": " ".join(e.missing), "row_hash": e.row_hash}
         numbers = [*(e.quality.get(k) for k in quality), *(e.cost.get(k) for k in cost)]
-        rows.append([*(cells[k] for k in FIRST), *numbers, *(cells[k] for k in LAST)])
+        rows.append([*(cells[k] for k in FIRST), *numbers, *(cells[k] for k in last)])
     return head, rows
 
 
@@ -207,7 +211,7 @@ def from_wide(head: Sequence[str], row: Mapping[str, str], where: str) -> Entry:
     Raises:
         AwError: a cell has an invalid value.
     """
-    text = {k: unguard(row[k]) for k in (*FIRST, *LAST)}
+    text = {k: unguard(row.get(k, "")) for k in (*FIRST, *LAST, FUNCTIONS)}
     numbers = {k: to_number(row[k], f"{where}, {k}") for k in head if k not in text}
     numbers = {k: value for k, value in numbers.items() if not math.isnan(value)}
     seed, images = (to_count(text[column], f"{where}: {column}") for column in ("seed", "images"))

@@ -30,7 +30,7 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.store import contradictions, impossible_values, read_config
+from ambiguous_wild.harness.store import contradictions, impossible_values, metric_functions, read_config
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.images import read_png_rgb
@@ -120,6 +120,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
         result_hash=sha256_file(run / RESULT),
         checked="files" if scene is None else "psnr" if quick else "photos",
         reproduce=reproduce,
+        metric_functions=", ".join(f"{key} {of}" for key, of in sorted(metric_functions(result).items())),
     )
     psnr = {row["name"]: _or_nan(row.get("psnr")) for row in result["per_image"]}
     return VerifiedRun(entry, run, tuple(sorted(renders)), psnr, scene)

@@ -96,11 +96,11 @@ def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], floa
 
     Args:
         curve: the runs.
-        scenes: scenes of the mean; if one has no run, the mean is missing.
+        scenes: scenes of the mean; if one has no run, or runs that differ beside the seed, it is missing.
         value: the number of a run; NaN = missing.
     """
     by_scene = [{run.seed: value(run) for run in curve.on(scene)} for scene in scenes]
-    if not all(by_scene):
+    if not all(by_scene) or any(len({run.rest for run in curve.on(s)}) > 1 for s in scenes):
         return MeanAndDeviation()
     mean = stats.mean([stats.mean(list(values.values())) for values in by_scene])
     seeds = by_scene[0].keys()

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from ambiguous_wild.harness.store import (
     check_names,
     checked_result,
     find_runs,
+    metric_functions,
     read_config,
     section,
 )
@@ -75,12 +77,14 @@ class CostRun:
     timing: Timing
     samples: tuple[tuple[float, float], ...] = ()  # (wall seconds of training, seconds of the calibration)
     kernel_reference_s: float = math.nan
+    metric_functions: dict[str, str] = field(default_factory=dict)  # of users' metrics, by key
     scene_hash: str = ""
     protocol: str = "full"
     reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
     unprobed: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
     added_s: float = 0.0  # added to times that are compared: the set-up, if it was asked for
+    apart: str = ""  # why no run on its scene is ranked: they measured other pixels
     speed: float = 1.0  # reference seconds in a second of the training; 1: times are wall seconds
 
     @property
@@ -136,18 +140,29 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
         )
     _refuse_twice(runs)
     notes += [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in runs if r.error]
+    runs = _without_mixed_metrics(runs, notes)
     for scene in sorted({run.scene for run in runs}):
         of = [run for run in runs if run.scene == scene and not run.error]
         if len({(run.scene_hash, run.protocol, *sorted(run.images)) for run in of}) > 1:
-            notes.append(
-                f"not comparable: runs on {scene} differ in the scene's version, protocol or test images"
-            )
+            apart = f"runs on {scene} differ in the scene's version, protocol or test images"
+            notes.append(f"not comparable: {apart}")
+            runs = [replace(run, apart=apart) if run.scene == scene else run for run in runs]
     reference = _all_calibrated(runs)
     if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
         notes.append(
             "times are wall seconds: some runs were not calibrated, or ran on another kind of device"
         )
     return CostRuns(tuple(map(_in_reference, runs) if reference else runs), tuple(notes), reference)
+
+
+def _without_mixed_metrics(runs: list[CostRun], notes: list[str]) -> list[CostRun]:
+    """Leave out the values of users' metrics that runs measured by different functions."""
+    pairs = {pair for run in runs for pair in run.metric_functions.items()}
+    mixed = {key: math.nan for key, count in Counter(key for key, _ in pairs).items() if count > 1}
+    if not mixed:
+        return runs
+    notes.append(f"not comparable, left out: {', '.join(sorted(mixed))} comes from different functions")
+    return [replace(run, numbers={k: mixed.get(k, v) for k, v in run.numbers.items()}) for run in runs]
 
 
 def _all_calibrated(runs: Iterable[CostRun]) -> bool:
@@ -172,7 +187,10 @@ def _in_reference(run: CostRun) -> CostRun:
 
 
 def why_unranked(runs: Iterable[CostRun]) -> str:
-    """Return why times of these runs are not ranked: a run was not alone; empty if they are ranked."""
+    """Return why these runs are not ranked: a run was not alone or is not comparable; empty if they are."""
+    runs = list(runs)
+    if apart := next((run.apart for run in runs if run.apart), ""):
+        return apart
     timings = [run.timing for run in runs if not run.error]
     wrong = [timing for timing in timings if timing.verdict != "alone"]
     return f"{len(wrong)} of {len(timings)} runs {wrong[0].verdict}: {wrong[0].reason}" if wrong else ""
@@ -218,6 +236,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         timing=timing_of(cost),
         samples=tuple((float(at), float(kernel)) for at, kernel in record.get("samples", ())),
         kernel_reference_s=_number(record.get("kernel_reference_s")),
+        metric_functions=metric_functions(result),
         scene_hash=result["scene_hash"],
         reproduce=str(result.get("reproduce", "")),
         error=result["error"] or "",

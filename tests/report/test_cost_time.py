@@ -218,3 +218,37 @@ def test_the_command_recommends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     error = CliRunner().invoke(command, words[:3])
     assert error.exit_code == 2 and "'--recommend' requires 2 arguments" in error.stderr
     assert not (tmp_path / "cost").exists()
+
+
+def test_fps_and_ms_are_those_of_the_result_and_absent_where_a_run_was_not_alone(tmp_path: Path) -> None:
+    samples = [[0.0, 0.5], [40.0, 0.02]]  # the last one alone would make 1500 frames a second of 30
+    rising(tmp_path, "a", timing=ALONE | {"samples": samples, "kernel_reference_s": 0.25}, reference_s=80.0)
+    rising(tmp_path, "b", timing=BUSY | {"samples": samples, "kernel_reference_s": 0.25}, reference_s=80.0)
+    report = cost_report(read(tmp_path))
+    numbers = {
+        p.curve: [p.numbers[key].mean for key in ("ms_per_iteration", "fps", "gaussians")]
+        for p in report.points
+    }
+    assert report.reference and numbers["a"] == [100.0, 30.0, 1234.0]
+    assert np.isnan(numbers["b"][:2]).all() and numbers["b"][2] == 1234.0
+    assert "ref FPS" not in to_text(report) and "ref ms/iter" not in to_text(report)
+
+
+def test_runs_of_another_scene_or_metric_are_neither_ranked_nor_averaged(tmp_path: Path) -> None:
+    record = {"label": "tint", "better": "lower", "digits": 2, "partial": False, "source": "1" * 64}
+    for method, seed, more in (("a", 0, {}), ("a", 1, {}), ("b", 0, {"scene_hash": "t"})):
+        record = record | {"source": str(seed) * 64}
+        run = cost_run(tmp_path, method, seed=seed, metrics={"tint": record}, probes=RISING, **more)
+        assert run.is_dir()
+    report = cost_report(read(tmp_path))
+    points = {p.curve: p for p in report.points}
+    assert not any(p.pareto_front for p in report.points)
+    assert "differ in the scene's version" in points["a"].not_ranked and math.isnan(
+        points["a"].numbers["tint"].mean
+    )
+    assert any("left out: tint comes from different functions" in note for note in report.notes)
+    cost_run(tmp_path / "2", "b", seed=1, probes=RISING)
+    report = cost_report(read(tmp_path))
+    assert math.isnan(
+        {p.curve: p for p in report.points}["b"].psnr.mean
+    )  # seeds of two versions of the scene

@@ -197,6 +197,29 @@ def test_an_edited_method_is_refused(tmp_path: Path) -> None:
     assert {e.source for e in read_board(board)} == {"ab" * 32} and check(board).problems == ()
 
 
+def test_a_metric_of_another_function_is_refused(tmp_path: Path) -> None:
+    scene, board = write_scene(tmp_path / "wall"), tmp_path / "board"
+
+    def run(method: str, source: str) -> Path:
+        record = {"label": "tint", "better": "lower", "digits": 2, "partial": False, "source": source * 64}
+
+        def add_metric(result: dict) -> None:
+            result["metrics"] = {"tint": record}
+            for row in result["per_image"]:
+                row["tint"] = 0.5
+
+        folder = write_run(tmp_path / source / method, scene, method)
+        change_result(folder, add_metric)
+        return folder
+
+    old, same, other = run("3dgs", "1"), run("refinesplat", "1"), run("refinesplat", "2")
+    assert add(board, old).exit_code == 0
+    done = add(board, other)
+    assert done.exit_code == 2 and "tint comes from another function than in 3dgs on wall" in done.stdout
+    assert add(board, same).exit_code == 0 and check(board).problems == ()
+    assert {e.metric_functions for e in read_board(board)} == {f"tint {'1' * 64} lower"}
+
+
 def test_without_its_scene_a_run_is_marked_and_needs_a_dataset(one: Path, tmp_path: Path) -> None:
     board, moved = tmp_path / "board", tmp_path / "scenes" / "wall"
     moved.parent.mkdir()

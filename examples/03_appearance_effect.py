@@ -25,7 +25,7 @@ class Lamps(Learnt):
 
     def leaves(self, data, rng):
         lamps = torch.zeros(len(data.photos), LAMPS, 3)
-        return {"lamps": Leaf(lamps, rate=0.01, final=0.1, per_photo=True, fit_rate=0.05)}
+        return {"lamps": Leaf(lamps, rate=0.01, lr_decay=0.1, per_photo=True, fit_rate=0.05)}
 
     def rows(self, gaussians):
         share = torch.zeros(len(gaussians), LAMPS, device=gaussians.device)

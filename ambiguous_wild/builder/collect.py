@@ -127,14 +127,6 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(p), p) if p.isascii() and p.isdigit() else (0, 0, p.casefold()) for p in parts]
 
 
-def identical(capture: Capture) -> list[list[str]]:
-    """Return the groups of photos with the same bytes."""
-    groups: dict[str, list[str]] = {}
-    for source in capture.sources:
-        groups.setdefault(source.sha256, []).append(source.source)
-    return [names for names in groups.values() if len(names) > 1]
-
-
 def _photo_folders(root: Path, masks: Path | None) -> list[tuple[Path, Side]]:
     sides: tuple[Side, Side] = ("train", "test")
     there = [side for side in sides if side and (root / side).is_dir()]

@@ -23,7 +23,7 @@ from ambiguous_wild.builder.workspace import Workspace
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.files import check_output, folder_lock, refuse_foreign_files
-from ambiguous_wild.io.scene_folder import read_scene_json, verify_files
+from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
 
 # Full disk, quota, permissions, read-only disk, broken disk: the user can repair these.
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
@@ -178,7 +178,9 @@ def _run(
     stages: Stages, work: Workspace, target: Path, started: float, keep_work: bool, earlier: bool
 ) -> None:
     try:
-        _publish(stages.run(work, time.perf_counter() - started), target, work)
+        scene = stages.run(work, time.perf_counter() - started)
+        load_scene(scene, verify=False)  # asks what every reader of the scene will ask
+        _publish(scene, target, work)
     except SfmCrash:
         raise
     except OSError as error:

@@ -16,7 +16,7 @@ LEAST_AREA = 0.2  # share of a photo that inliers must cover: what is smaller ma
 # The same if all registered photos that share a relative pose with it support the hypothesis, and the least
 # coverage of the inliers, relative to as many features drawn at random: those of a distractor are clustered.
 LITTLE_AREA, LITTLE_COVERAGE = 0.05, 0.2
-CLUSTERED = 0.28  # coverage of the inliers below which they must cover `AREA_NEW` of a photo
+LEAST_COVERAGE = 0.28  # coverage of the inliers below which they must cover `AREA_NEW` of a photo
 AREA_NEW = 0.3  # share of a photo that is not registered yet, from which on the support of two is enough
 
 
@@ -50,7 +50,7 @@ def reason_against(best: PoseHypothesis, competing: PoseHypothesis, needed: int)
         return "only one placed photo agrees with it on a pose"
     if len(best.support) < needed:
         return f"only {len(best.support)} placed photos agree with it on a pose"
-    if best.area < LEAST_AREA or (best.area < AREA_NEW and best.coverage < CLUSTERED):
+    if best.area < LEAST_AREA or (best.area < AREA_NEW and best.coverage < LEAST_COVERAGE):
         part = f"{best.area:.0%}, coverage {best.coverage:.2f}"
         return f"only a small part of it agrees with {len(best.support)} placed photos ({part})"
     if len(competing.support) >= LEAST_SUPPORT and competing.weight > COMPETING_WEIGHT * best.weight:

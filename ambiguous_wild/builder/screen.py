@@ -17,7 +17,7 @@ from typing import Generic, TypeVar, cast
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.collect import MIN_PHOTOS, VIDEO_SUFFIXES, Capture, PhotoSource, identical
+from ambiguous_wild.builder.collect import MIN_PHOTOS, VIDEO_SUFFIXES, Capture, PhotoSource
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     ExifRecord,
@@ -28,6 +28,7 @@ from ambiguous_wild.builder.records import (
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
 from ambiguous_wild.io.photos import Photo, UnreadablePhoto, read_photo
+from ambiguous_wild.io.scene_checks import SHARED
 
 BLUR_SIDE = 1024  # px, longer side: the Laplacian grows with resolution, so blur is compared at one size
 BLUR_RATIO = 0.2  # of the capture's median; a photo below it counts as blurred
@@ -77,7 +78,6 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     warnings = [
         *_skipped_warning(read.skipped, len(capture.sources)),
         *(f"{photo.source}: {note}" for photo in screened for note in photo.notes),
-        *(_identical_warning(group) for group in identical(capture) if capture.has_sides),
         *_near_duplicates(screened, read.thumbnails),
         *_burst_warnings(screened, read.thumbnails),
         *_live_photo_warnings(capture),
@@ -159,17 +159,22 @@ def photo_record(listed: PhotoSource, photo: Photo, pixels: np.ndarray) -> Scree
 def without_copies(capture: Capture) -> tuple[list[PhotoSource], dict[str, str]]:
     """Return the photos to use, and the copies to leave out: path -> first file with the same bytes.
 
-    One of two copies could be a training photo and the other a test photo, which leaks test data. In a
-    capture with train/ and test/ the copies stay, and a warning names them.
+    One of two copies could be a training photo and the other a test photo, which leaks test data.
+
+    Raises:
+        AwError: one is in train/ and the other in test/.
     """
-    if capture.has_sides:
-        return list(capture.sources), {}
     first: dict[str, PhotoSource] = {}
-    copies = {}
+    copies, shared = {}, []
     for listed in capture.sources:
         kept = first.setdefault(listed.sha256, listed)
-        if kept is not listed:
+        if kept.side != listed.side:
+            test, train = sorted((kept, listed), key=lambda photo: str(photo.side))
+            shared.append(f"{test.source} is {train.source}")
+        elif kept is not listed:
             copies[listed.source] = kept.source
+    if shared:
+        raise AwError(f"{capture.root}: {SHARED.format(names=shortlist(shared))}")
     return list(first.values()), copies
 
 
@@ -362,12 +367,6 @@ def _attributes(photo: Photo) -> dict[str, str | int | float]:
         if (a.name.startswith("Exif:") or a.name in ("Make", "Model"))
         and isinstance(a.value, (str, int, float))
     }
-
-
-def _identical_warning(group: list[str]) -> str:
-    sides = {name.partition("/")[0] for name in group}
-    leak = ": in train/ and in test/, which leaks test data into training" if len(sides) > 1 else ""
-    return f"identical files: {shortlist(group)}{leak}"
 
 
 def _copy_rows(copies: dict[str, str]) -> list[SkippedPhoto]:

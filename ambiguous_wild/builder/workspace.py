@@ -1,7 +1,8 @@
 """The hidden work folder of a build: one folder a stage, complete or absent, so a kill costs one stage.
 
 The name of a stage's folder holds a key: the hash of its inputs, its settings, the code's version and the
-keys of the stages it reads. A changed setting changes the keys of later stages only.
+keys of the stages it reads. A changed setting changes the keys of later stages only. The stage's record holds
+the key too, so that a folder under the name of another is made anew.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from typing import Any, Generic, TypeVar
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, installed
-from ambiguous_wild.io.files import atomic_dir, write_json
+from ambiguous_wild.io.files import atomic_dir, own_json, write_json
 
-BUILDER = 21  # raised when a stage gives another result for the same input
+BUILDER = 22  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 _RESULT = "stage.json"
 _LEAST_FREE = 2**20  # bytes; with less, a stage that fails is taken to fail for lack of space
@@ -77,7 +78,7 @@ class Workspace:
         """
         key = content_key(name, inputs)
         folder = self.root / f"{name}-{key[:16]}"
-        reused = (folder / _RESULT).is_file()
+        reused = own_json(folder / _RESULT).get("key") == key
         if not reused:
             started = time.perf_counter()
             with atomic_dir(folder) as temporary:
@@ -88,7 +89,7 @@ class Workspace:
                         raise
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)) from error
                 spent = round(time.perf_counter() - started, 3)
-                write_json(temporary / _RESULT, {"facts": facts, "seconds": spent})
+                write_json(temporary / _RESULT, {"key": key, "facts": facts, "seconds": spent})
         stored = json.loads((folder / _RESULT).read_text(encoding="utf-8"))
         result: StageResult[Facts] = StageResult(
             name, key, folder, stored["facts"], stored["seconds"], reused

@@ -70,7 +70,7 @@ def command(
     aw ablate --method my.py:trimmed --scene scene --sweep share=0.7,0.9 -o ablation
     """
     from ambiguous_wild.methods.ablation_groups import choose_groups, sweep_groups
-    from ambiguous_wild.methods.registry import get_method, load_plugin, register
+    from ambiguous_wild.methods.registry import get_method, load_plugin, registered
 
     for plugin in plugins:
         load_plugin(plugin)
@@ -78,7 +78,8 @@ def command(
     method = entry.name  # FILE.py:RECIPE would read the file again
     if sweeps:
         swept = sweep_groups(entry.options(), sweeps)
-        entry = register(dataclasses.replace(entry, ablations=(*entry.ablation_groups(), *swept)))
+        entry = dataclasses.replace(entry, ablations=(*entry.ablation_groups(), *swept))
+        registered[method] = entry  # `register` refuses the names of built-in methods
         groups = (*groups, *(group.name for group in swept))
     chosen = choose_groups(method, entry.ablation_groups(), groups)
     if not scenes:

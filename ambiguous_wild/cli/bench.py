@@ -119,7 +119,7 @@ def parse_budget(text: str) -> float:
 @click.option(
     "--start",
     type=PathName(dir_okay=False),
-    help="Start from this splat file (PLY, compressed PLY, SPZ, SOG) or point cloud (PLY) in the scene's "
+    help="Start from this splat file (PLY, compressed PLY, SPZ, SOG, glTF) or point cloud (PLY) in the scene's "
     "coordinates.  [default: the scene's points]",
 )
 @metric_file_option

@@ -10,6 +10,8 @@ import logging
 import os
 import re
 import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -157,7 +159,9 @@ def main() -> None:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     try:
         _check_threads()
-        cli.main(standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = _one_line_each()
+            cli.main(standalone_mode=False)
     except AwError as error:
         _fail(str(error))
     except click.exceptions.NoArgsIsHelpError as error:  # `aw` and `aw study` alone ask for help
@@ -188,6 +192,19 @@ def main() -> None:
         if "Symlink loop" in str(error):  # of Path.resolve in Python below 3.13
             _fail(f"{error}: a link that leads to itself; give another path")
         raise
+
+
+def _one_line_each() -> Callable[..., None]:
+    """Return a function that prints a warning as one line, once, without its place in the code."""
+    printed: set[str] = set()
+
+    def show(message: Warning | str, *_: object) -> None:
+        line = "warning: " + plain(" ".join(str(message).split()))
+        if line not in printed:
+            click.echo(line, err=True)
+        printed.add(line)
+
+    return show
 
 
 def _check_threads() -> None:

@@ -17,7 +17,7 @@ from ambiguous_wild.core.errors import AwError, counted
 
 if TYPE_CHECKING:
     from ambiguous_wild.simulate.spec import CaptureSpec
-    from ambiguous_wild.simulate.truth_records import PhotoTruth, Spread
+    from ambiguous_wild.simulate.truth_records import PhotoTruth, Summary
 
 
 @click.command("simulate")
@@ -137,7 +137,7 @@ def simulate_command(
     click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
 
 
-def _range(share: Spread) -> str:
+def _range(share: Summary) -> str:
     return f"{100 * share['min']:.0f} to {100 * share['max']:.0f} % (mean {100 * share['mean']:.1f} %)"
 
 

@@ -130,7 +130,7 @@ def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
     from ambiguous_wild.io.scene_folder import load_scene
 
     prepare_cpu(threads)
-    camera = load_scene(scene).train[0].camera
+    camera = load_scene(scene, verify=False, check=False).train[0].camera
     pixels = camera.width * camera.height
     one = IN_3DGS * expected_s(1, pixels, pixels) * slowness()
     most = round(TRAINING * seconds / one, -2)

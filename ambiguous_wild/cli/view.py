@@ -93,7 +93,7 @@ def view_command(
     **training: Any,  # the other arguments of `watch`, by their names
 ) -> None:
     """Write a page that shows the models of RUNS (run folders, folders of them, or splat files of any tool: PLY,
-    compressed PLY, SPZ, SOG), all of one scene.
+    compressed PLY, SPZ, SOG, glTF), all of one scene.
 
     The page is one file that needs no server and no network. It shows models side by side or under a slider
     with the same camera, the cameras of the photos, masks over photos, and the PSNR of each test view.
@@ -214,7 +214,7 @@ def export_command(
     **options: Any,  # the other arguments of `export_runs`, by their names
 ) -> None:
     """Write the models of RUNS (run folders, folders of them, or splat files of any tool: PLY, compressed
-    PLY, SPZ, SOG) as compressed PLY, SPZ, SOG, glTF and PLY.
+    PLY, SPZ, SOG, glTF) as compressed PLY, SPZ, SOG, glTF and PLY.
 
     Prints the size of each file and the loss by rounding: PSNR against the renders of the model, and dB lost
     against the test photos. The plain point_cloud.ply is not changed.

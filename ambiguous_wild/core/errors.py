@@ -12,6 +12,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 _LONGEST = 2000  # characters of a message; ours have fewer than 700
+# what to do where a file does not fit on the disk, in the user's share of it, or under the limit of its size
+_ROOM = {errno.ENOSPC: "free space", errno.EDQUOT: "free space", errno.EFBIG: "raise ulimit -f"}
 
 
 def installed(package: str) -> str | None:
@@ -65,15 +67,14 @@ class AwError(Exception):
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 300]} ... {text[-290:]}")
 
 
-def disk_line(error: OSError) -> str:
-    """Return the error of a disk as one line: the file, the reason, and what to do where the disk is full."""
-    room = "; free space, or choose another folder" if is_full(error) else ""
-    return f"{error.filename or 'input or output'}: {error.strerror or error}{room}"
+def disk_line(error: OSError, otherwise: str = "") -> str:
+    """Return the error of a disk as one line: the file, the reason, and what to do.
 
-
-def is_full(error: OSError) -> bool:
-    """Tell whether there is no space left on the disk, or in the user's share of it."""
-    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    `otherwise` is the advice where there is room.
+    """
+    advice = _ROOM.get(error.errno or 0, otherwise)
+    what = f"; {advice}, or choose another folder" if advice else ""
+    return f"{error.filename or 'input or output'}: {error.strerror or error}{what}"
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwError:

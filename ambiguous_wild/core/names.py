@@ -7,6 +7,7 @@ import unicodedata
 from ambiguous_wild.core.errors import AwError
 
 LONGEST = 100  # bytes of UTF-8; file systems allow 255, and suffixes are added to names
+SIGNS = " ._-+=,@()'&#!~"  # beside letters and digits; paths of all systems may hold them
 
 
 def check_name(kind: str, name: str) -> str:
@@ -17,19 +18,20 @@ def check_name(kind: str, name: str) -> str:
         name: as the user gave it.
 
     Raises:
-        AwError: empty, longer than 100 bytes, starting with a dot, or holding ``/``, ``\\`` or a character
-            that cannot be printed (control characters, text-direction marks, lone surrogates).
+        AwError: empty, longer than 100 bytes, starting with a dot or a minus sign, or holding a character
+            other than letters and digits of any language, and `SIGNS`.
     """
     stripped = name.strip()
     size = len(stripped.encode("utf-8", errors="replace"))
     shown = quoted(stripped, 40)
     if not stripped:
         raise AwError(f"the {kind} is empty; give it at least one letter")
-    bad = next((c for c in stripped if c in "/\\" or _unprintable(c)), None)
+    bad = next((c for c in stripped if c not in SIGNS and unicodedata.category(c)[0] not in "LMN"), None)
     if bad is not None:
-        raise AwError(f"{kind} {shown} holds {bad!a}; leave out '/', '\\' and control characters")
-    if stripped.startswith("."):
-        raise AwError(f"{kind} {shown} starts with a dot, which hides files; leave out the dot")
+        signs = " ".join(SIGNS.strip())
+        raise AwError(f"{kind} {shown} holds {bad!a}; use letters, digits, blanks and {signs}")
+    if stripped[0] in ".-":
+        raise AwError(f"{kind} {shown} starts like a hidden file or an option; leave out {stripped[0]!r}")
     if size > LONGEST:
         raise AwError(f"{kind} {shown} has {size} bytes; at most {LONGEST} are allowed")
     return stripped

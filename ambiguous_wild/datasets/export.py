@@ -179,7 +179,7 @@ def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
     if factor > 1 and (scene.root / "images").is_dir():
         for view in scene.views:
             place(view.image_path, folder / f"images_{factor}" / flat(view))
-        scene = load_scene(scene.root, factor=1, verify=False, raw=True)
+        scene = load_scene(scene.root, factor=1, verify=False, raw=True, check=False)
     if len({flat(v) for v in scene.views}) < len(scene.views):
         raise AwError(f"{scene.root}: two photos have one name, which On-the-go's layout cannot tell apart")
     views = sorted(scene.views, key=flat)

@@ -24,7 +24,7 @@ from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
 from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
 from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable, write_json
-from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files, without_suffix
+from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, without_suffix
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
@@ -117,14 +117,13 @@ def _open(root: Path) -> tuple[Path, str, SceneInfo]:
         raise AwError(
             f"{root} has no scene.json: import it with 'aw import', or build it with 'aw build-scene'"
         )
-    verify_files(root, info)
-    load_scene(root, verify=False)
+    load_scene(root)
     return root, check_name("scene name", str(info.get("name", root.name))), info
 
 
 def _people(root: Path, jobs: int, bar: Bar) -> dict[str, str]:
     """Run the detectors: photo -> "person", "face" or both, of photos with a detection."""
-    views = load_scene(root, verify=False).views
+    views = load_scene(root, verify=False, check=False).views
     bar.start("looking for people", len(views))
 
     def one(path: Path) -> str:

@@ -32,7 +32,7 @@ from ambiguous_wild.datasets.imported_photos import (
     plan_photos,
 )
 from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_points, triangulate
-from ambiguous_wild.datasets.readers import read_foreign
+from ambiguous_wild.datasets.readers import read_foreign, with_masks
 from ambiguous_wild.datasets.suites import differences, suite_of
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
@@ -46,7 +46,7 @@ from ambiguous_wild.io.files import (
     write_text,
 )
 from ambiguous_wild.io.images import read_gray
-from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, SIDES, read_scene_json, verify_files
+from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, SIDES, load_scene, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
 LARGER = 1.5  # times; cameras that are this much larger than their photos belong to other files
@@ -133,16 +133,7 @@ def import_scene(
             f"{target} and the dataset {root} lie inside each other; choose a folder outside for -o"
         )
     foreign, why = read_foreign(root, settings.kind, settings.model)
-    if not settings.masks:
-        foreign = dataclasses.replace(foreign, masks={})
-    elif foreign.masks:
-        folders = sorted({mask.parent.relative_to(root).as_posix() for mask in foreign.masks.values()})
-        trained = sum(side == "train" for side in foreign.split.values())
-        note = (
-            f"keep masks of {len(foreign.masks)} of {trained} training photos in {shortlist(folders)} are "
-            "used; --no-masks leaves them out"
-        )
-        foreign = dataclasses.replace(foreign, notes=(*foreign.notes, note))
+    foreign = with_masks(foreign) if settings.masks else dataclasses.replace(foreign, masks={})
     for side in SIDES:
         if side not in foreign.split.values():
             raise AwError(
@@ -273,6 +264,7 @@ def _write_scene(
     record["files"] = list_files(folder, jobs)
     record["seconds"] = {"import": round(time.perf_counter() - begun, 3)}
     write_json(folder / "scene.json", record)
+    load_scene(folder, verify=False)  # asks what every reader of the scene will ask
 
 
 def _with_points(

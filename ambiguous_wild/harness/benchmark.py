@@ -348,7 +348,7 @@ def _check_effects(
 
 
 def _remarks(cells: Sequence[Cell]) -> list[str]:
-    """Return a line for each set of effects, each method that cannot take them, each warning of a scene."""
+    """Return a line for each set of effects, and for each method that cannot take them."""
     from ambiguous_wild.harness.chosen_effects import EXTERNAL_NO_EFFECTS, takes_effects
 
     lines = []
@@ -356,8 +356,6 @@ def _remarks(cells: Sequence[Cell]) -> list[str]:
     lines += [f"{scene}: all methods train with the effects {', '.join(names)}" for scene, names in effects]
     without = {c.method.name: c.method for c in cells if effects and not takes_effects(c.method)}
     lines += [f"{name} trains without effects: {EXTERNAL_NO_EFFECTS}" for name in without]
-    for scene in {cell.scene.name: cell.scene for cell in cells}.values():
-        lines += [f"warning: {scene.name}: {warning}" for warning in scene.info.get("warnings", ())]
     return lines
 
 

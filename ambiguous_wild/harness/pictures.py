@@ -40,7 +40,7 @@ class Recorder:
     """
 
     def __init__(self, trainer: Trainer, folder: Path) -> None:
-        self.views = sheets.spread(range(len(trainer.data.scene.train)), VIEWS)
+        self.views = sheets.evenly_spaced(range(len(trainer.data.scene.train)), VIEWS)
         self.folder = folder
         self.passed = self._passed(trainer)
 

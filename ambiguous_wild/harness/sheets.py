@@ -74,7 +74,7 @@ def grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
     return stack([stack(cells[k : k + columns], 1) for k in range(0, len(cells), columns)], 0)
 
 
-def spread(items: Sequence[Item], count: int) -> list[Item]:
+def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
     """Return at most `count` of the items, evenly spaced, with the first and the last."""
     if not items:
         return []
@@ -104,13 +104,13 @@ def write_capture_sheet(raw: Path) -> None:
     test = sorted(p.name for p in (raw / "test").iterdir())
     cells = [
         cell(_caption(name, photos[name]), read_png_rgb(raw / "train" / name), WIDTH)
-        for name in spread(train, 2 * CAPTURE_COLUMNS)
+        for name in evenly_spaced(train, 2 * CAPTURE_COLUMNS)
     ]
-    for name in spread(train, 2):
+    for name in evenly_spaced(train, 2):
         cells += _truth(raw, name)
     cells += [
         cell(f"test {name}", read_png_rgb(raw / "test" / name), WIDTH)
-        for name in spread(test, CAPTURE_COLUMNS)
+        for name in evenly_spaced(test, CAPTURE_COLUMNS)
     ]
     write_jpeg(raw / "truth" / NAME, grid(cells, CAPTURE_COLUMNS))
 
@@ -157,7 +157,7 @@ def write_contact(scene: Scene, masks: Path, path: Path) -> list[Path]:
     if not views:
         return []
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_jpeg(path, grid([_tinted(scene, view, masks) for view in spread(views, MOST_MASKS)], MASK_COLUMNS))
+    write_jpeg(path, grid([_tinted(scene, view, masks) for view in evenly_spaced(views, MOST_MASKS)], MASK_COLUMNS))
     return [path]
 
 
@@ -199,8 +199,8 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None) -> int:
     first = chosen.sort_values("seed").drop_duplicates("method").sort_values("method")
     folders = {str(row.method): Path(str(row.folder)) for row in first.itertuples()}
     source = open_scene(next(iter(folders.values())), verify=False)
-    rows = [_test_row(view, folders) for view in spread(source.test, VIEWS)]
-    rows += [_train_row(view, folders) for view in spread(source.train, VIEWS)]
+    rows = [_test_row(view, folders) for view in evenly_spaced(source.test, VIEWS)]
+    rows += [_train_row(view, folders) for view in evenly_spaced(source.train, VIEWS)]
     sheet = stack([stack(row, 1) for row in rows], 0)
     (write_jpeg if path.suffix.lower() == ".jpg" else write_png)(path, sheet)
     return len(folders)

@@ -148,10 +148,11 @@ def open_scene(
         run: the run's folder.
         folder: where the scene lies; None = where the run says.
         verify: compare the files with their hashes, and the scene with the one that the run used.
-        opened: verified scenes of earlier calls, which are not opened again.
+        opened: verified scenes of earlier calls, which are not opened again. Who gives it measures runs, so
+            the scene is asked what it is asked before training.
 
     Raises:
-        AwError: the scene is absent, damaged, or in another state than the run used.
+        AwError: the scene is absent, damaged, in another state than the run used, or refused by a check.
     """
     config = read_config(run).get("scene")
     if not isinstance(config, dict):
@@ -163,9 +164,10 @@ def open_scene(
             "('aw view', 'aw video', 'aw export' and 'aw rescore' take its folder: --scene)"
         )
     factor = config.get("factor")
-    key, opened = (path, factor if isinstance(factor, int) else None), {} if opened is None else opened
+    key, measured = (path, factor if isinstance(factor, int) else None), opened is not None
+    opened = {} if opened is None else opened
     if key not in opened:
-        scene = load_scene(path, factor=key[1], verify=verify, check=False)
+        scene = load_scene(path, factor=key[1], verify=verify, check=measured)
         opened[key] = scene, scene_identity(scene) if verify else ""
     scene, identity = opened[key]
     if verify and identity != (before := str(config.get("sha256"))):

@@ -5,7 +5,6 @@ From top to bottom: the whole run, its trainer, its measurements; then the first
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import time
@@ -34,7 +33,7 @@ from ambiguous_wild.harness.run_cost import (
     reset_peak,
 )
 from ambiguous_wild.harness.start import started
-from ambiguous_wild.io.files import atomic_dir, write_json
+from ambiguous_wild.io.files import atomic_dir, own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
@@ -48,6 +47,7 @@ from ambiguous_wild.splat.training_loop import Stopped, Tick, train
 LOG = logging.getLogger(__name__)
 FOLDER = "first-pass"  # in the run folder; holds a checkpoint while it trains, then masks/ and cost.json
 COST, MASKS = "cost.json", "masks"
+HASHES = "masks_sha256"  # in cost.json, in the order of the train views
 STOPPED = "stopped"  # folder with the model as it was when Ctrl-C came; removed when the run ends
 
 
@@ -239,22 +239,22 @@ def refuse_without_masks(name: str, hooks: MethodHooks) -> None:
 
 
 def first_pass(cell: Cell, folder: Path, cache_dir: Path, tick: Tick | None) -> FirstPass:
-    """Train the first pass, or resume it; if it is finished, read its masks and cost."""
+    """Train the first pass, or resume it; if it is finished, read its unchanged masks and its cost."""
     place = folder / FOLDER
-    if not (place / COST).is_file():
-        _train_first_pass(cell, place, cache_dir, tick)
     masks = [place / MASKS / Path(view.name).with_suffix(".png") for view in cell.scene.train]
-    size = [(view.camera.height, view.camera.width) for view in cell.scene.train]
+    cost = own_json(place / COST)
+    if cost.get(HASHES) != _hashes(masks):
+        cost = _train_first_pass(cell, place, cache_dir, tick) | {HASHES: _hashes(masks)}
+        write_json(place / COST, cost)  # written last: this file marks the pass as finished
     keeps = [torch.from_numpy(read_keep_map(path).astype(np.float32)) for path in masks]
-    for path, keep, wanted in zip(masks, keeps, size):
-        if tuple(keep.shape) != wanted:
-            raise AwError(
-                f"{path} is {list(keep.shape)}, its photo {list(wanted)}; bench with --overwrite always"
-            )
-    return FirstPass(keeps, cast(Cost, json.loads((place / COST).read_text(encoding="utf-8"))))
+    return FirstPass(keeps, cast(Cost, cost))
 
 
-def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | None) -> None:
+def _hashes(files: Sequence[Path]) -> list[str]:
+    return [sha256_file(path) if path.is_file() else "" for path in files]
+
+
+def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | None) -> dict[str, object]:
     trainer = _make_trainer(replace(cell, train=replace(cell.train, probes=0)), place, cache_dir)
     trainer.resume()
     train(trainer, tick=tick)
@@ -268,4 +268,4 @@ def _train_first_pass(cell: Cell, place: Path, cache_dir: Path, tick: Tick | Non
             yield view, np.ones(step.photo.shape[:2], bool) if keep is None else (keep > 0.5).cpu().numpy()
 
     evaluate.write_keeps(cell.scene, keeps(), place / MASKS)
-    write_json(place / COST, cost)  # written last: this file marks the pass as finished
+    return dict(cost)

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from ambiguous_wild.core.errors import AwError, is_full
+from ambiguous_wild.core.errors import AwError, disk_line
 
 # Time to try again, for the case that the holder unlinked the file between our open and our lock.
 _TRY_S, _AGAIN_S = 0.05, 0.005
@@ -76,10 +76,8 @@ def folder_lock(folder: Path | str, doing: str) -> Iterator[None]:
             busy.holder = holder
             raise busy from None
         except OSError as error:
-            advice = "free space" if is_full(error) else "make it writable"
-            raise AwError(
-                f"cannot write beside {folder}: {error.strerror}; {advice}, or choose another folder"
-            ) from error
+            named = OSError(error.errno, error.strerror, str(folder))
+            raise AwError(f"cannot write beside {disk_line(named, 'make it writable')}") from error
         yield
 
 
@@ -194,29 +192,45 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         raise AwError(f"cannot write the file {path}: a folder lies there; choose another -o")
     folder = Path(tempfile.gettempdir()) if into else target.parent
     folder.mkdir(parents=True, exist_ok=True)
+    start = f".{target.stem}."
+    with _named_errors(folder / start, target):
+        suffix = f".tmp{target.suffix}"
+        handle, name = tempfile.mkstemp(prefix=f"{start}{os.getpid()}-", suffix=suffix, dir=folder)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            yield temporary
+            with open(temporary, "rb") as f:
+                os.fsync(f.fileno())
+            share(temporary)
+            if into:
+                _write_into(temporary, target)
+                temporary.unlink()
+            else:
+                os.replace(temporary, target)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
+def _named_errors(start: Path, target: Path) -> Iterator[None]:
+    """Raise errors of the disk with the name of `target` for temporary names, which begin with `start`."""
+    beginning = os.path.abspath(start)
     try:
-        start = f".{target.stem}.{os.getpid()}-"
-        handle, name = tempfile.mkstemp(prefix=start, suffix=f".tmp{target.suffix}", dir=folder)
-    except OSError as error:
-        raise _named(error, target) from None
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        with open(temporary, "rb") as f:
-            os.fsync(f.fileno())
-        share(temporary)
-        if into:
-            _write_into(temporary, target)
-            temporary.unlink()
-        else:
-            os.replace(temporary, target)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno and error.filename in (None, name, temporary):
-            raise _named(error, target) from error
-        if full := re.search(r"Os \{ code: (\d+)", str(error)):  # safetensors' class for OSError
-            raise OSError(int(full[1]), os.strerror(int(full[1])), str(target)) from error
+        yield
+    except AwError:
+        raise
+    except Exception as error:
+        # safetensors has a class of its own
+        words = re.search(r"(?:Os \{ code: |\(os error )(\d+)", str(error))
+        number = error.errno if isinstance(error, OSError) else words and int(words[1])
+        # of a copy the second name is the target
+        for name in (getattr(error, "filename2", None), getattr(error, "filename", None) or start):
+            path = os.path.abspath(str(name))
+            if number and path.startswith(beginning):
+                below = path.removeprefix(beginning).partition(os.sep)[2]
+                raise OSError(number, os.strerror(number), str(target / below)) from error
         raise
 
 
@@ -236,16 +250,8 @@ def _write_into(source: Path, target: Path) -> None:
             raise
         raise AwError(f"cannot write {target}: nobody reads this pipe; choose another -o") from None
     os.set_blocking(handle, True)
-    try:
-        with open(source, "rb") as f, open(handle, "wb", buffering=0) as out:
-            shutil.copyfileobj(f, out)
-    except OSError as error:
-        raise _named(error, target) from error
-
-
-def _named(error: OSError, target: Path) -> OSError:
-    """Return the same error with the target's name; OSError chooses the subclass."""
-    return OSError(error.errno, error.strerror, str(target))
+    with open(source, "rb") as f, open(handle, "wb", buffering=0) as out:
+        shutil.copyfileobj(f, out)
 
 
 @contextmanager
@@ -260,24 +266,26 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
     target = Path(os.path.realpath(place_of(path)[0]))
     refuse_file(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.tmp-", dir=target.parent))
-    share(temporary)
-    try:
-        yield temporary
-        if not replace:
-            try:
-                os.rename(temporary, target)  # fails unless the target is absent or an empty folder
-            except OSError as error:
-                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                    raise
-                raise AwError(
-                    f"another command made {path} meanwhile; nothing of it is replaced: choose another -o"
-                ) from None
-        else:
-            replace_folder(temporary, target)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+    start = target.parent / f".{target.name}."
+    with _named_errors(start, target):
+        temporary = Path(tempfile.mkdtemp(prefix=f"{start.name}tmp-", dir=target.parent))
+        share(temporary)
+        try:
+            yield temporary
+            if not replace:
+                try:
+                    os.rename(temporary, target)  # fails unless the target is absent or an empty folder
+                except OSError as error:
+                    if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                        raise
+                    raise AwError(
+                        f"another command made {path} meanwhile; nothing of it is replaced: choose another -o"
+                    ) from None
+            else:
+                replace_folder(temporary, target)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
 
 
 def replace_folder(source: Path, target: Path) -> None:

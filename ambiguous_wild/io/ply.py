@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 import itertools
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
+from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE
 from ambiguous_wild.io.files import write_bytes
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, checked_place
 from ambiguous_wild.io.untrusted import read_bytes
@@ -130,10 +132,11 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
 
     A model of a scene that was moved is returned in the scene's inner coordinates. Columns may have any order
-    and scalar type; unknown ones are ignored.
+    and precision; unknown ones are ignored.
 
     Raises:
-        AwError: no splat PLY, cut short, missing columns, or harmonics of a degree above 3.
+        AwError: no splat PLY, cut short, columns that are missing or whole numbers, or harmonics of a degree
+            above 3.
     """
     return decode_ply(read_bytes(path), path).gaussians
 
@@ -153,7 +156,7 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
         raise AwError(f"{path} is no splat PLY: it lacks {', '.join(missing[:6])}{hint}")
 
     def columns(names: list[str]) -> np.ndarray:
-        return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+        return _floats(table, names, path).astype(np.float32)
 
     higher = np.zeros((count, 0, 3), np.float32)
     if rest:
@@ -163,11 +166,20 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
         "means": columns(["x", "y", "z"]),
         "quats": columns([f"rot_{i}" for i in range(4)]),
         "log_scales": columns([f"scale_{i}" for i in range(3)]),
-        "opacity_logits": table["opacity"].astype(np.float32),
+        "opacity_logits": columns(["opacity"])[:, 0],
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
     return SplatFile(dict(rescaled(arrays, place.scale)), place)
+
+
+def _floats(table: np.ndarray, names: Sequence[str], path: Path | str) -> np.ndarray:
+    """Return these properties, [M, len(names)] float64; whole numbers, which they cannot be, are refused."""
+    for name in names:
+        if table.dtype[name].kind != "f":
+            kind = table.dtype[name].name
+            raise AwError(f"{path}: its property {name} is {kind}, not float or double; export it again")
+    return np.stack([table[name].astype(np.float64) for name in names], axis=1)
 
 
 def has_chunks(data: bytes) -> bool:
@@ -196,9 +208,9 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     names = table.dtype.names or ()
     if not all(axis in names for axis in "xyz"):
         raise AwError(f"{path} has no x, y and z")
-    xyz = np.stack([table[a].astype(np.float64) for a in "xyz"], axis=1)
-    if not np.isfinite(xyz).all():
-        raise AwError(f"{path} holds positions that are not finite")
+    xyz = _floats(table, "xyz", path)
+    if not (np.abs(xyz) < LARGEST_COORDINATE).all():
+        raise AwError(f"{path} holds positions that are not finite or above {LARGEST_COORDINATE:g}")
     spelt = [of for of in _SPELLINGS if all(c in names for c in of)]
     if not spelt:
         return xyz, np.full(xyz.shape, 128, np.uint8)

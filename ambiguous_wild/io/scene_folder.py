@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
@@ -46,17 +47,19 @@ def load_scene(
         path: our scene folder, or a plain COLMAP scene (``images/`` and ``sparse/0``).
         factor: 1 opens ``images/``, n opens ``images_n/``; None: the factor of scene.json.
         verify: True compares the sha256 of every file in scene.json, "quick" the sizes, False nothing.
-        check: ask what `scene_checks` lists, for which photos may be read; not where a run is only looked at.
+        check: ask what `scene_checks` lists, for which photos may be read, and warn; not where a run is only
+            looked at, or the scene was asked before.
         raw: keep the files' coordinates; else a scene far from the origin, or too large or small for float32
             and the nearest depth, is moved and scaled (`Scene.place`).
 
     Returns:
         The scene: views ordered by name, intrinsics at the size of the loaded files, tracks in px of these
-        files. ``info["warnings"]`` counts listed photos that the model lacks. Observations in photos
-        without 2D points in the model have view -1.
+        files. ``info["warnings"]`` holds what it warned of. Observations in photos without 2D points in the
+        model have view -1.
 
     Raises:
-        AwError: no scene, an invalid name, a changed file, or lists that do not fit the model.
+        AwError: no scene, an invalid name, a changed file, lists that do not fit the model, or a scene that
+            would give a wrong result.
     """
     root = Path(path)
     if root.is_file():
@@ -75,9 +78,10 @@ def load_scene(
     name = check_name(f"scene name in {root}", info.get("name", root.resolve().name))
     model = read_model(sparse)
     info["loaded_factor"] = chosen
-    split, missing = _split(root, [image.name for image in model.images.values()])
+    split, missing, repeated = _split(root, [image.name for image in model.images.values()])
     info["missing"] = missing
-    info["warnings"] = [
+    info["warnings"] = [f"the lists name photos twice, which are used once: {repeated}"] if repeated else []
+    info["warnings"] += [
         f"{len(names)} {side} photos of the list are not in the model: {shortlist(names)}"
         for side, names in missing.items()
         if names
@@ -86,7 +90,7 @@ def load_scene(
         info["warnings"].append(note)
     masks: dict[str, Path] = {}
     if read is None and (root / "masks").is_dir() and not (root / "masks" / OWN_MASKS).is_file():
-        masks = find_masks(root / "masks", [name for name, side in split.items() if side == "train"])
+        masks = side_masks(root / "masks", [n for n, side in split.items() if side == "train"], "train")
     views = tuple(
         _view(root, folder, model, image, split[image.name], masks.get(image.name))
         for image in sorted(model.images.values(), key=lambda i: i.name)
@@ -97,10 +101,10 @@ def load_scene(
     if not any(v.split == "train" for v in views):
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
     scene = Scene(root, name, views, _points(model, views), info)
-    if verify and read is None:
-        info["warnings"] += _mask_warnings(root, scene)
-    if verify and check and not raw:
-        info["warnings"] += check_scene(scene)
+    if check:
+        info["warnings"] += [*(_mask_warnings(root, scene) if read is None else ()), *check_scene(scene)]
+        for warning in info["warnings"]:
+            warnings.warn(f"{name}: {warning}", stacklevel=2)
     return scene if raw else centred(scene)
 
 
@@ -224,6 +228,11 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     return masks
 
 
+def side_masks(folder: Path, names: Iterable[str], side: Split) -> dict[str, Path]:
+    """Find the masks of one side's photos in `folder`, or in its folder of that side."""
+    return find_masks(folder, names) | find_masks(folder / side, names)
+
+
 def mask_files(folder: Path) -> set[Path]:
     """Return all files below a folder that may be masks."""
     return {p for p in folder.rglob("*") if p.suffix.lower() in MASK_SUFFIXES and p.is_file()}
@@ -308,13 +317,13 @@ def _image_folder(root: Path, factor: int) -> Path:
     return folder
 
 
-def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[str, list[str]]]:
-    """Return name -> side of the registered photos, and per side the listed names that the model lacks."""
+def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[str, list[str]], str]:
+    """Return name -> side of registered photos, by side the names that the model lacks, repeated names."""
     paths: dict[Split, Path] = {"train": root / "train_list.txt", "test": root / "test_list.txt"}
     present = [p for p in paths.values() if p.is_file()]
     if not present:
         ordered = sorted(registered)
-        return {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(ordered)}, {}
+        return {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(ordered)}, {}, ""
     if len(present) == 1:
         raise AwError(f"{root} has {present[0].name} but not the other list; write both or neither")
     # Some published scenes list names with their extension, some without.
@@ -322,15 +331,17 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
     in_model = set(registered)
     split: dict[str, Split] = {}
     missing: dict[str, list[str]] = {}
-    for side, path in paths.items():
+    listed = {side: Counter(read_list(path)) for side, path in paths.items()}
+    for side, names in listed.items():
         missing[side] = []
-        for name in read_list(path):
+        for name in names:
             match = name if name in in_model else by_stem.get(name)
             if match is None:
                 missing[side].append(name)
             elif split.setdefault(match, side) != side:
                 raise AwError(f"{root}: {name!r} is in train_list.txt and in test_list.txt; keep it in one")
-    return split, missing
+    repeated = shortlist(name for names in listed.values() for name, count in names.items() if count > 1)
+    return split, missing, repeated
 
 
 def refuse_same_stems(root: Path, names: Iterable[str]) -> None:
@@ -368,8 +379,7 @@ def _mask_warnings(root: Path, scene: Scene) -> list[str]:
     if not folder.is_dir() or (folder / OWN_MASKS).is_file():
         return []
     used = {view.name: view.keep_path for view in scene.train if view.keep_path is not None}
-    names = [view.name for view in scene.test]
-    tests = {*find_masks(folder, names).values(), *find_masks(folder / "test", names).values()}
+    tests = side_masks(folder, [view.name for view in scene.test], "test").values()
     return check_masks(folder, mask_files(folder), used, tests, [view.name for view in scene.train])
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
+from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE
 from ambiguous_wild.io.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from ambiguous_wild.io.files import write_bytes
 from ambiguous_wild.io.gltf import decode_gltf, encode_gltf
@@ -64,7 +65,7 @@ def read_splats(path: Path) -> SplatFile:
     """Read the Gaussians of a file in one of `FORMATS` whose values are all finite, at least one.
 
     Raises:
-        AwError: no such file, another format, damaged, or no Gaussian is finite.
+        AwError: no such file, another format, damaged, no Gaussian is finite, or one is too far for float32.
     """
     data = read_bytes(path)
     form = next((form for form in FORMATS.values() if form.starts(data)), None)
@@ -74,6 +75,8 @@ def read_splats(path: Path) -> SplatFile:
     kept = finite(splats.gaussians)
     if not len(kept["means"]):
         raise AwError(f"{path} holds no Gaussian that is finite")
+    if not (np.abs(kept["means"]) < LARGEST_COORDINATE).all():
+        raise AwError(f"{path} holds a Gaussian with a coordinate above {LARGEST_COORDINATE:g}; remove it")
     return replace(splats, gaussians=kept, left_out=len(splats.gaussians["means"]) - len(kept["means"]))
 
 

@@ -32,7 +32,8 @@ from ambiguous_wild.io.splat_arrays import (
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 _FOURTH = b"NGSP"  # first bytes of version 4; earlier versions are one gzip stream
-_VERSION, _ANTIALIASED = 3, 1
+_VERSION, _ANTIALIASED, _EXTENDED = 3, 1, 2  # extensions, which are not read, follow the Gaussians
+_TOO_LONG = "goes on after the Gaussians that its header announces: damaged, or two files; export it again"
 _FINEST = 18  # fractional bits: 4 micrometres where a unit is a metre
 _COLOUR = 0.15  # codes cover coefficients of +-3.3
 _REST = (0, 3, 8, 15)  # coefficients beyond the constant one, by degree
@@ -92,6 +93,9 @@ def decode_spz(packed: bytes, path: Path | str) -> SplatFile:
         # No more than the header announces is unpacked, whatever the stream holds.
         if zipped:
             data = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
+            more = inflater.decompress(inflater.unconsumed_tail, 1) and not flags & _EXTENDED
+            if len(data) == size and (more or inflater.unused_data):
+                raise AwError(f"{path} {_TOO_LONG}")
         else:
             data = _unpacked(packed, streams, [n * width for width in widths], path)
     except (zlib.error, struct.error) as error:
@@ -147,6 +151,8 @@ def _unpacked(packed: bytes, streams: int, sizes: Sequence[int], path: Path | st
         except zstandard.ZstdError as error:
             raise AwError(f"{path} is damaged: {error}") from None
         at += length
+    if streams <= len(sizes) and at < len(packed):
+        raise AwError(f"{path} {_TOO_LONG}")
     return b"".join(parts)
 
 

@@ -2,7 +2,7 @@
 
 recipe.py:my_recipe     a function, or a MethodEntry, in a Python file, which is loaded as a module
 external:my.yaml        a program with commands of its own, see external.py
-nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see nerfbaselines.py
+nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see nerfbaselines_methods.py
 """
 
 from __future__ import annotations

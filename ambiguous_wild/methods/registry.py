@@ -12,6 +12,7 @@ import importlib.metadata
 from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.names import check_name
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry, second_pass, trained_once
 from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
@@ -42,10 +43,9 @@ def register(entry: MethodEntry) -> MethodEntry:
     """Add a method; a later one of the same name replaces the earlier, unless that is built in.
 
     Raises:
-        AwError: the name cannot name a folder, or is that of a built-in method.
+        AwError: `check_name` refuses the name, or it is that of a built-in method.
     """
-    if not entry.name or any(c in entry.name for c in "/\\\0") or entry.name.startswith("."):
-        raise AwError(f"method name {entry.name!r} cannot name a folder: leave out '/' and a leading '.'")
+    entry = dataclasses.replace(entry, name=check_name("method name", entry.name))
     if entry.name.casefold() in {known.name.casefold() for known in BUILTIN}:
         raise AwError(f"the method {entry.name!r} is built in: register yours under another name")
     registered[entry.name] = entry

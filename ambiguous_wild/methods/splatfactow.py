@@ -96,7 +96,7 @@ class SplatfactoColours(Learnt):
         for name, (widths, rate, final) in nets.items():
             for key, leaf in mlp_leaves(name, widths, rng, rate).items():
                 values = torch.zeros_like(leaf.values) if name.endswith("rest") else leaf.values
-                leaves[key] = replace(leaf, values=values, final=final)
+                leaves[key] = replace(leaf, values=values, lr_decay=final)
         return leaves
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:

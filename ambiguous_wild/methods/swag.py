@@ -199,7 +199,7 @@ class GatedColours(Learnt):
         last[:3], last[3] = 0.0, c.start_logit
         net["net_weight3"] = replace(net["net_weight3"], values=0.1 * net["net_weight3"].values)
         net["net_bias3"] = replace(net["net_bias3"], values=last)
-        net = {name: replace(leaf, final=0.01, made_for=NOMINAL_ITERATIONS) for name, leaf in net.items()}
+        net = {name: replace(leaf, lr_decay=0.01, made_for=NOMINAL_ITERATIONS) for name, leaf in net.items()}
         codes = Leaf(photo, c.lr_photo, 0.01, per_photo=True, made_for=NOMINAL_ITERATIONS)
         return {"grid": Leaf(grid, c.lr_grid, 0.01), "photo": codes, **net}
 

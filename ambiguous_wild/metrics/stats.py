@@ -35,7 +35,7 @@ def mean(values: Sequence[float] | np.ndarray) -> float:
     return float(finite.mean()) if len(finite) and not np.isnan(array).any() else math.nan
 
 
-def spread(values: Sequence[float] | np.ndarray) -> float:
+def sample_std(values: Sequence[float] | np.ndarray) -> float:
     """Sample standard deviation (n - 1); NaN for fewer than two values or if one is not finite."""
     array = _checked(values)
     if len(array) < 2 or not np.isfinite(array).all():

@@ -106,7 +106,7 @@ def _networks(row: Planned) -> list[str]:
 
 def _summary(values: list[float | None]) -> SummaryRecord:
     numbers = [math.nan if v is None else float(v) for v in values]
-    mean, spread = stats.mean(numbers), stats.spread(numbers)
+    mean, spread = stats.mean(numbers), stats.sample_std(numbers)
     return {"mean": _number(mean), "spread": _number(spread)}
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
-from ambiguous_wild.harness.sheets import spread
+from ambiguous_wild.harness.sheets import evenly_spaced
 from ambiguous_wild.io.images import load_image_float
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
@@ -254,7 +254,7 @@ def _fitted(scene: Scene, spec: str) -> Any:
 
     backend = make_features(spec)
     views = list(scene.train)
-    views = views if isinstance(backend, SceneConv) else spread(views, FIT_PHOTOS)
+    views = views if isinstance(backend, SceneConv) else evenly_spaced(views, FIT_PHOTOS)
     photos = [torch.from_numpy(seen_by(spec, load_image_float(v.image_path))) for v in views]
     if isinstance(backend, SceneConv):
         backend.fit_scene(photos, train_tracks(scene), None)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.harness.sheets import spread
+from ambiguous_wild.harness.sheets import evenly_spaced
 from ambiguous_wild.io.files import (
     atomic_dir,
     atomic_path,
@@ -67,7 +67,7 @@ _HEADS = {
 def chosen(measured: list[PhotoMeasures], most: int = PHOTOS) -> list[int]:
     """Return indices of photos spread evenly over the range of occlusion, from little to much."""
     order = sorted(range(len(measured)), key=lambda i: measured[i].counts.occlusion)
-    return spread(order, most)
+    return evenly_spaced(order, most)
 
 
 def overlay(photo: np.ndarray, distractor: np.ndarray) -> np.ndarray:

@@ -255,7 +255,7 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
                 means[np.isfinite(means)] if np.isfinite(means).any() else means
             )
             low, high = interval.low, interval.high
-        cells.append(TableCell(value, stats.spread(values), low, high))
+        cells.append(TableCell(value, stats.sample_std(values), low, high))
     ranked = (method, scene) not in index.unfinished and not knows_truth(method)
     return Row(method, tuple(cells), runs=len(index.runs[method, scene]), ranked=ranked)
 
@@ -286,7 +286,7 @@ def _mean_row(
         else:
             # means over scenes for each seed, whose spread is shown; they need the same seeds on all scenes
             by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
-            cells.append(TableCell(value, stats.spread(by_seed.mean(axis=1))))
+            cells.append(TableCell(value, stats.sample_std(by_seed.mean(axis=1))))
     return Row(
         method, tuple(cells), runs=sum(row.runs for row in rows), ranked=all(row.ranked for row in rows)
     )

@@ -145,4 +145,4 @@ def _interval(pairs: Sequence[Pair]) -> tuple[float, float]:
 
 
 def _summary(values: Sequence[float]) -> MeanAndDeviation:
-    return MeanAndDeviation(stats.mean(values), stats.spread(values))
+    return MeanAndDeviation(stats.mean(values), stats.sample_std(values))

@@ -107,7 +107,7 @@ def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], floa
     if any(values.keys() != seeds for values in by_scene):
         return MeanAndDeviation(mean)  # scenes have different seeds: no seed has a mean over all scenes
     return MeanAndDeviation(
-        mean, stats.spread([stats.mean([v[seed] for v in by_scene]) for seed in sorted(seeds)])
+        mean, stats.sample_std([stats.mean([v[seed] for v in by_scene]) for seed in sorted(seeds)])
     )
 
 

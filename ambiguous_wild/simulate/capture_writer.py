@@ -55,7 +55,7 @@ from ambiguous_wild.simulate.truth_records import (
     PhotoTruth,
     PlacedDistractor,
     SimulatedCapture,
-    spread,
+    summary,
 )
 from ambiguous_wild.simulate.world import World
 from ambiguous_wild.simulate.yard import yard
@@ -373,7 +373,7 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
         "mask": "255 where any part of a pixel shows a distractor; distractors cast no shadow on the scene",
         "clean": "same camera, same effects, no distractors and no moving shadow, before JPEG",
         "test": "no distractors; of the effects only specular and lens_distortion",
-        "occlusion": spread(shares),
+        "occlusion": summary(shares),
         "photos": photos,
         "licence": "CC0; textures from photographs in scikit-image that are CC0 or in the public domain",
     }

@@ -47,7 +47,7 @@ from ambiguous_wild.simulate.placement import (
     longest_side,
     natural_heights,
 )
-from ambiguous_wild.simulate.truth_records import spread
+from ambiguous_wild.simulate.truth_records import summary
 
 _TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos
 _MOST_PIECES = 3  # largest number of pieces in a photo
@@ -140,7 +140,7 @@ def composite_photos(
             "config": {k: v for k, v in to_plain(config).items() if k not in ("pose", "shadow")},
             "mask": "255 where a distractor covers at least a quarter of the pixel; no others change",
             "cutouts": [{"name": c.name, "sha256": c.source} for c in shapes],
-            "occlusion": spread(shares),
+            "occlusion": summary(shares),
             "photos": photos,
         }
         write_json(folder / "truth" / "composite.json", facts)

@@ -45,7 +45,7 @@ from ambiguous_wild.simulate.placement import (
     solve_heights,
     visible_points,
 )
-from ambiguous_wild.simulate.truth_records import spread
+from ambiguous_wild.simulate.truth_records import summary
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,8 @@ def _write_photos(
 
 def _pictures(scene: Scene, folder: str) -> dict[str, Path]:
     factor = 1 if folder == "images" else int(folder.removeprefix("images_"))
-    return {v.name: v.image_path for v in load_scene(scene.root, factor=factor, verify=False).views}
+    views = load_scene(scene.root, factor=factor, verify=False, check=False).views
+    return {view.name: view.image_path for view in views}
 
 
 def _copy(path: Path, root: Path, folder: Path) -> None:
@@ -227,7 +228,7 @@ def _facts(scene: Scene, plan: _PastePlan, config: CompositeConfig, photos: dict
             {"name": c.name, "sha256": c.source, "height": float(h)}
             for c, h in zip(plan.cutouts, plan.heights, strict=True)
         ],
-        "occlusion": spread(shares),
+        "occlusion": summary(shares),
         "photos": photos,
     }
 

@@ -14,6 +14,7 @@ import yaml
 
 from ambiguous_wild.core.config import from_plain, to_plain
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
@@ -177,8 +178,7 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
         AwError: the first wrong value, with its place and what is allowed.
     """
     plan = PLANS[spec.world.place]
-    if not spec.name or not all(c.isalnum() or c in "-_" for c in spec.name):
-        raise AwError(f"name: letters, digits, - and _ only, got {spec.name!r}")
+    check_name("name", spec.name)
     _within("", spec, {**_SPEC, **_WALKS[spec.walk], "eye_m": (0.2, plan.highest_m)})
     if not 1 <= spec.samples <= 64 or math.isqrt(spec.samples) ** 2 != spec.samples:
         raise AwError(f"samples: a square number from 1 to 64, got {spec.samples}")

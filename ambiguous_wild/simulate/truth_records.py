@@ -6,7 +6,7 @@ from typing import NotRequired, TypedDict
 
 import numpy as np
 
-Spread = dict[str, float]  # mean, min and max of a figure over the training photos
+Summary = dict[str, float]  # mean, min and max of a figure over the training photos
 
 
 class DrawnEffects(TypedDict, total=False):
@@ -47,7 +47,7 @@ class PhotoTruth(TypedDict):
     effects: NotRequired[DrawnEffects]
 
 
-def spread(shares: list[float]) -> Spread:
+def summary(shares: list[float]) -> Summary:
     """Summarise a share over the training photos."""
     return {"mean": float(np.mean(shares)), "min": min(shares), "max": max(shares)}
 
@@ -65,7 +65,7 @@ class CaptureTruth(TypedDict):
     mask: str  # what the masks mark, in words
     clean: str
     test: str
-    occlusion: Spread
+    occlusion: Summary
     photos: dict[str, PhotoTruth]
     licence: str
     files: NotRequired[dict[str, str]]  # path -> sha256, added last

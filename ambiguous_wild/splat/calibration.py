@@ -20,7 +20,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.processes import python_meanwhile
 from ambiguous_wild.splat import backend
-from ambiguous_wild.splat.cpu.compile import one_thread
+from ambiguous_wild.splat.cpu.compile import how_often, one_thread
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
@@ -156,7 +156,7 @@ def warm_up(announce: Callable[[str], None] = lambda text: None, helper: bool = 
     begin = time.perf_counter()
     with ExitStack() as stack:
         if not _cached():
-            announce(f"compiling CPU kernels (about {COLD_S} s, once per machine)...")
+            announce(f"compiling CPU kernels (about {COLD_S} s, {how_often()})...")
             if helper:
                 code = f"from {__name__} import warm_losses; warm_losses()"
                 stack.enter_context(python_meanwhile(code, finish=True))

@@ -31,7 +31,7 @@ from ambiguous_wild.splat.rendered import (
     ShadeVjp,
     as_cotangents,
     check_needs,
-    spread,
+    scatter_gradients,
 )
 
 
@@ -161,7 +161,7 @@ class RenderedCuda:
         )
         gradients = Gradients(*values, **screens, visible=self.visible, effect_grads=given.effect_grads)
         if shaded is not None and through is not None:
-            gradients = spread(gradients, through, slice(None), shaded.gaussians)
+            gradients = scatter_gradients(gradients, through, slice(None), shaded.gaussians)
         return gradients
 
     def _leaves_of_the_cut(self) -> list[Tensor]:

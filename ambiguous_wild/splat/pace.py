@@ -112,7 +112,7 @@ class TrainConfig:
             raise AwError(f"--iterations {self.iterations} is not from 1 to 100 000 000")
 
 
-def room(
+def cap(
     config: TrainConfig, schedule: Schedule, sizes: Sequence[tuple[int, int]], most: int, start: int = 0
 ) -> int:
     """Gaussians that a run may have, on photos of these sizes (height, width); `most` is the method's own."""
@@ -205,7 +205,7 @@ class Pace:
         RefineSplat 30.3, 31.1, 31.3 and 30.7 dB at 9.5, 11.3, 13.6 and 19.6 ms an iteration.
         """
         sizes = [(photo.shape[0], photo.shape[1]) for photo in data.photos]
-        return room(self.config, self.schedule, sizes, most, self.start)
+        return cap(self.config, self.schedule, sizes, most, self.start)
 
     def _levels(self, data: TrainData) -> tuple[Level, ...]:
         resolution: str = self.config.resolution

@@ -1,6 +1,7 @@
 """Features and instances of all photos, computed before training; each photo is one entry of a cache on disk.
 
-An entry is computed once, shared between runs, and checked when it is read.
+An entry is computed once and shared between runs. It carries a hash over its key and its arrays: one that was
+damaged, changed or put under the name of another is computed anew.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.config import config_hash, to_plain
 from ambiguous_wild.io.files import atomic_path, sha256_array
 from ambiguous_wild.io.progress_bar import terminal_bar
 from ambiguous_wild.vision.label_maps import LabelMaps
@@ -27,6 +28,7 @@ from ambiguous_wild.vision.protocols import Features, Instances, SceneInstances
 
 Arrays = dict[str, np.ndarray]
 STALE_S = 24 * 3600.0  # older temporary files are leftovers of a killed process
+_SEAL = "sha256"  # member of an entry with the hash over its key and its arrays
 
 
 def cache_key(kind: str, backend: str, settings: Any, *arrays: np.ndarray) -> str:
@@ -58,13 +60,17 @@ def cached(
     """
     _tidy(folder)
     path = folder / f"{key}.npz"
-    stored = _load(path, expected)
+    stored = _load(path, key, expected)
     if stored is not None:
         return stored
     arrays = compute()
     with atomic_path(path) as temporary, open(temporary, "wb") as f:
-        np.savez_compressed(f, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(f, **arrays, **{_SEAL: np.array(_seal(key, arrays))})  # type: ignore[arg-type]
     return arrays
+
+
+def _seal(key: str, arrays: Arrays) -> str:
+    return config_hash([key, {name: sha256_array(array) for name, array in arrays.items()}])
 
 
 @functools.cache  # once per process and folder, because it lists every entry
@@ -76,19 +82,15 @@ def _tidy(folder: Path) -> None:
                 left.unlink()
 
 
-def _load(path: Path, expected: Mapping[str, type | str]) -> Arrays | None:
+def _load(path: Path, key: str, expected: Mapping[str, type | str]) -> Arrays | None:
     try:
         with np.load(path, allow_pickle=False) as entry:
-            if set(entry.files) != set(expected):
-                return None
-            arrays = {name: entry[name] for name in entry.files}
+            arrays = {name: entry[name] for name in expected}
+            whole = str(entry[_SEAL]) == _seal(key, arrays)
     # np.load, zipfile, zlib and tokenize raise many types for a damaged entry
     except Exception:
         return None
-    # np.load returns a member with damaged first bytes as bytes, not as an array
-    if any(getattr(a, "dtype", None) != np.dtype(expected[name]) for name, a in arrays.items()):
-        return None
-    return arrays
+    return arrays if whole and all(arrays[name].dtype == expected[name] for name in expected) else None
 
 
 @dataclass(frozen=True)

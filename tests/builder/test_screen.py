@@ -5,6 +5,7 @@ import pytest
 
 from ambiguous_wild.builder.checks import focal_length
 from ambiguous_wild.builder.collect import collect
+from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.screen import drift_warnings, exposure_stops, screen, sharpness, thumbnail
@@ -92,16 +93,15 @@ def test_identical_and_near_duplicates_are_told_apart(tmp_path):
     assert "p00.jpg = p01.jpg" not in near
 
 
-def test_copies_in_train_and_test_are_kept_and_named(tmp_path):
+def test_copies_in_train_are_left_out_and_those_in_test_refused(tmp_path):
     paths = write_capture(tmp_path / "raw" / "train", 4)
     (tmp_path / "raw" / "test").mkdir()
-    (tmp_path / "raw" / "test" / "t.jpg").write_bytes(paths[0].read_bytes())
     (tmp_path / "raw" / "train" / "z.jpg").write_bytes(paths[1].read_bytes())
     facts = run(tmp_path)[0]
-    assert len(facts["photos"]) == 6 and facts["skipped"] == []
-    leak = next(w for w in facts["warnings"] if "test/t.jpg" in w)
-    assert leak.startswith("identical files: train/p00.jpg, test/t.jpg: in train/ and in test/")
-    assert "identical files: train/p01.jpg, train/z.jpg" in facts["warnings"]
+    assert "1 of 5 photos skipped: train/z.jpg (the same file as train/p01.jpg)" in facts["warnings"]
+    (tmp_path / "raw" / "test" / "t.jpg").write_bytes(paths[0].read_bytes())
+    with pytest.raises(AwError, match=r"test photos are training photos \(test/t.jpg is train/p00.jpg\)"):
+        build_scene(tmp_path / "raw", tmp_path / "scene")
 
 
 def test_sharpness_falls_with_blur_and_not_with_resolution():

@@ -31,6 +31,18 @@ def test_a_stage_runs_once_for_the_same_inputs(tmp_path):
     assert other.folder != first.folder
 
 
+def test_a_stage_under_the_name_of_another_is_made_anew(tmp_path):
+    def work(folder):
+        return {"n": len(folder.name)}
+
+    first, other = (Workspace(tmp_path).run("stage", a, work) for a in (1, 2))
+    shutil.rmtree(other.folder)
+    shutil.copytree(first.folder, other.folder)
+    assert [Workspace(tmp_path).run("stage", a, work).reused for a in (1, 2, 2)] == [True, False, True]
+    (first.folder / "stage.json").write_text("{")
+    assert not Workspace(tmp_path).run("stage", 1, work).reused
+
+
 def test_time_of_a_result_that_is_used_again_counts_once(tmp_path):
     def slow(folder):
         time.sleep(0.01)

@@ -139,7 +139,7 @@ MISTAKES = [
     *((f"build-scene raw -o {out}", "cannot write") for out in ("file/scene", "/dev/null/x", "/proc/x")),
     ("build-scene raw -o file", "file"),
     *((BUILD + shlex.join(["--name", name]), "scene name")
-      for name in ("", " ", "a/b", "..", ".x", "a\nb", "\x1b[31m", "x" * 101)),
+      for name in ("", " ", "a/b", "..", ".x", "-rf", "a<b>", "a\nb", "\x1b[31m", "x" * 101)),
     (f"{BUILD} --factor 64", "px a side, too small to train on ... p02.jpg (4)"),
     (f"{BUILD} --factor 0", "--factor must be"),
     (f"{BUILD} --max-features 3", "--max-features"),

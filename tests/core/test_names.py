@@ -4,7 +4,20 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name
 
 
-@pytest.mark.parametrize("name", ["scene", "Garten im März", "a.b-c_1", "花園", "x" * 100, "é" * 50])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "scene",
+        "Garten im März",
+        "a.b-c_1",
+        "花園",
+        "हिन्दी",
+        "St. Peter's & Paul #2",
+        "3dgs@mask=a,density=b+2passes (2)",
+        "x" * 100,
+        "é" * 50,
+    ],
+)
 def test_a_fit_name_comes_back_as_it_is(name):
     assert check_name("scene name", name) == name
 
@@ -29,6 +42,13 @@ def test_blanks_around_a_name_are_dropped():
         "\u202etxt",
         "\ud800",
         ".x",
+        "-rf",
+        "evil<b>",
+        "a|b",
+        "a`b`",
+        "a;b",
+        "[a](b)",
+        "a:b",
         "..",
         "x" * 101,
         "é" * 51,

@@ -382,6 +382,7 @@ REFUSED = {
     "short line": ("realityscan", edit(CSV, (LENS, ",0")), "not as RealityScan"),
     "nan": ("realityscan", edit(CSV, ("34.5", "nan")), "nan"),
     "no rotation": ("record3d", edit(R3D, ('"poses": [[', '"poses": [[0, 0, 0, 0, 1, 1, 1], [')), "Record3D"),
+    "texts": ("record3d", edit(R3D, (', 1], "poses"', ', "1"], "poses"')), "not as Record3D"),
     "lenses": ("record3d", edit(R3D, ('Coeffs": [', 'Coeffs": [[1, 2, 3, 4], ')), "not as Record3D"),
     "no t_00": ("polycam", edit("172540.json", ("t_00", "u_00")), "172540.json is not as Polycam"),
     "no cameras": ("polycam", lambda r: shutil.rmtree(r / "keyframes/corrected_cameras"), "developer mode"),

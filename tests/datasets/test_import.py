@@ -238,6 +238,11 @@ def _matrix(data):
     data["frames"][0]["transform_matrix"] = [[1, 2], [3, 4]]
 
 
+def _texts(data):
+    rows = data["frames"][0]["transform_matrix"]
+    data["frames"][0]["transform_matrix"] = [[str(value) for value in row] for row in rows]
+
+
 def _far(data):
     data["frames"][1]["transform_matrix"][0][3] = 1e300
 
@@ -308,6 +313,7 @@ def _picture(name, *size):
         (ngp(_transposed), "transposed"),
         (ngp(_outside), "leads out of"),
         (ngp(_matrix), "clutter000.png"),
+        (ngp(_texts), "transform_matrix is not [4, 4] numbers"),
         (lambda root: root.mkdir(), "no known layout"),
     ],
 )

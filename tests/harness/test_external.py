@@ -297,9 +297,10 @@ def test_files_for_the_scene_stay_in_the_copy(scene, tmp_path):
 
 
 def test_values_stay_within_their_argument(scene, tmp_path):
-    """No shell: a scene called like a command is a name and nothing else."""
-    hostile = write_tiny_scene(tmp_path / "s; touch pwned $(touch pwned) {seed} *")
-    _, report = run(describe(tmp_path, cwd=str(tmp_path)), hostile, tmp_path / "runs")
+    """No shell: a folder called like a command is a name and nothing else."""
+    hostile = tmp_path / "s; touch pwned $(touch pwned) {seed} *"
+    scene = write_tiny_scene(hostile / "scene")
+    _, report = run(describe(tmp_path, cwd=str(tmp_path)), scene, hostile / "runs")
     assert report.outcome == "trained", report.error
     assert not (tmp_path / "pwned").exists()
 

@@ -60,8 +60,8 @@ class Stop(Exception):
     pass
 
 
-@pytest.mark.parametrize("at", [25, ITERATIONS + 25])
-def test_it_goes_on_in_either_pass_with_the_same_bits(scene, whole, tmp_path, monkeypatch, at):
+@pytest.mark.parametrize(("at", "swapped"), [(25, False), (ITERATIONS + 25, False), (ITERATIONS + 25, True)])
+def test_it_goes_on_in_either_pass_with_the_same_bits(scene, whole, tmp_path, monkeypatch, at, swapped):
     from ambiguous_wild.splat.trainer import Trainer
 
     steps, true_step = [0], Trainer.step
@@ -76,6 +76,11 @@ def test_it_goes_on_in_either_pass_with_the_same_bits(scene, whole, tmp_path, mo
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "step", step)
         assert run(scene, tmp_path).outcomes == {"failed": 1}
+    if swapped:  # masks that are not those of the first pass are made again
+        one, other = (next(tmp_path.rglob(f"first-pass/masks/{name}")) for name in (TRAIN[0], TRAIN[-1]))
+        first = one.read_bytes()
+        one.write_bytes(other.read_bytes())
+        assert one.read_bytes() != first
     counted = [0]
 
     def counting(self):

@@ -42,7 +42,7 @@ class Heard(Callbacks):
         self.starts.append(trainer.pace.start)
 
 
-def wall_points(path: Path, count: int, shift: float = 0.0) -> Path:
+def wall_points(path: Path, count: int, shift: float | np.ndarray = 0.0) -> Path:
     wall = wall_model(count)
     write_point_ply(path, wall["means"] + shift, np.full((count, 3), 99, np.uint8))
     return path
@@ -116,11 +116,13 @@ def test_a_start_travels_with_its_cell_and_a_file_that_changed_is_refused(scene,
 
 def test_what_a_run_cannot_start_from_is_refused_before_anything_is_made(scene, tmp_path):
     far = wall_points(tmp_path / "far.ply", 50, 1e4)
+    other = wall_points(tmp_path / "other.ply", 900, np.array([0, 0, -2.0]))  # in view, in front of the wall
     (tmp_path / "no.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
     )
     for path, message in (
-        (far, r"far\.ply: no train camera of scene sees"),
+        (far, r"far\.ply lies around \(1e\+04, .*\), and at most 0% of its"),
+        (other, r"other\.ply lies around .* at most 0% of its points"),
         (tmp_path / "no.ply", "no x, y and z"),
         (Path(__file__), "no splat file"),
         (tmp_path / "gone.ply", "cannot read"),
@@ -128,3 +130,20 @@ def test_what_a_run_cannot_start_from_is_refused_before_anything_is_made(scene, 
         with pytest.raises(AwError, match=message):
             small(scene, tmp_path / "runs", start=path)
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_start_that_lies_near_few_points_of_the_scene_is_warned_of(scene, tmp_path):
+    given = load_scene(scene)
+    xyz = given.points.xyz / given.place.scale + given.place.centre
+    moved = np.where(np.arange(len(xyz))[:, None] % 40, xyz + [0, 0, -2.0], xyz)
+    write_point_ply(tmp_path / "other.ply", moved, np.zeros(moved.shape, np.uint8))
+    with pytest.warns(UserWarning, match="at most [2-9]% of its points .* is it of another scene"):
+        started(MethodHooks(), start_file(tmp_path / "other.ply"), given)
+
+
+def test_a_start_may_cover_a_part_of_the_scene_alone(scene, tmp_path):
+    wall = wall_model(900)["means"]
+    part = wall[wall[:, 0] < -1.5]
+    write_point_ply(tmp_path / "part.ply", part, np.zeros(part.shape, np.uint8))
+    xyz, _ = started(MethodHooks(), start_file(tmp_path / "part.ply"), load_scene(scene)).given
+    assert 4 < len(xyz) < 300

@@ -71,7 +71,9 @@ def test_a_lock_is_freed_after_an_error(tmp_path):
         assert (tmp_path / ".run.lock").exists()
 
 
-@pytest.mark.parametrize(("number", "advice"), [(28, "free space"), (30, "make it writable")])
+@pytest.mark.parametrize(
+    ("number", "advice"), [(28, "free space"), (27, "raise ulimit -f"), (30, "make it writable")]
+)
 def test_a_lock_that_cannot_be_written_says_what_to_do(tmp_path, monkeypatch, number, advice):
     def refuse(*_, **__):
         raise OSError(number, os.strerror(number))
@@ -227,3 +229,28 @@ def test_of_two_who_make_one_folder_the_second_is_told(tmp_path):
         with atomic_dir(tmp_path / "out", replace=False) as first:
             (first / "a").write_text("first")
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
+
+
+@pytest.mark.parametrize(
+    ("work", "name"),
+    [
+        ("write_bytes(out / 'a.bin', [bytes(9999)])", "a.bin"),
+        ("save(out / 'a.safetensors', {'x': np.zeros(9999)})", "a.safetensors"),
+        ("with atomic_dir(out / 'd') as d: write_bytes(d / 'sub' / 'a.bin', [bytes(9999)])", "d/sub/a.bin"),
+        ("with atomic_dir(out / 'd') as d: shutil.copyfile(sys.executable, d / 'copy')", "d/copy"),
+        ("with atomic_dir(out / 'd') as d, open(d / 'a', 'wb') as f: f.write(bytes(9999)), f.flush()", "d"),
+    ],
+)
+def test_a_file_over_the_limit_of_the_shell_is_named_as_it_was_asked_for(tmp_path, work, name):
+    script = (
+        "import resource, shutil, sys\nfrom pathlib import Path\nimport numpy as np\n"
+        "from ambiguous_wild.core.errors import disk_line\n"
+        "from ambiguous_wild.io.files import atomic_dir, write_bytes\n"
+        "from ambiguous_wild.splat.checkpoint import save\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\nout = Path(sys.argv[1])\n"
+        f"try:\n    {work}\nexcept OSError as error:\n    print(disk_line(error))"
+    )
+    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True)
+    advice = "raise ulimit -f, or choose another folder"
+    assert done.stdout == f"{tmp_path / name}: File too large; {advice}\n", done.stderr
+    assert not list(tmp_path.iterdir())

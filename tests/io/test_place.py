@@ -6,10 +6,8 @@ import gzip
 import json
 import re
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,7 +16,6 @@ from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.datasets.points import random_points
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.ply import read_place, read_point_ply, read_splat_ply, write_splat_ply
-from ambiguous_wild.io.scene_checks import check_scene
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, export, space_of
@@ -137,21 +134,6 @@ def test_the_page_says_what_sizes_cost_that_its_format_does_not_hold(tmp_path: P
         r'"notes": ?\["([^"]*)"\]', page_text(scene, [ViewedModel("m", tmp_path / "large.ply")], title="t")[0]
     )
     assert "dB to the model" in note and "gltf" in note
-
-
-def test_cameras_that_are_probably_wrong_are_said(tmp_path: Path) -> None:
-    usual = load_scene(write_tiny_scene(tmp_path / "scene"))
-    assert check_scene(usual) == []
-    turned = [np.eye(4) for _ in usual.views]
-    for k, pose in enumerate(turned):
-        pose[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.02 * k, 0.0]))[0]
-    views = [replace(v, camera=replace(v.camera, cam_from_world=p)) for v, p in zip(usual.views, turned)]
-    assert any(
-        "cameras stand at one place" in said for said in check_scene(replace(usual, views=tuple(views)))
-    )
-    views = [replace(v, camera=replace(v.camera, cx=-1.0)) for v in usual.views]
-    said = check_scene(replace(usual, views=tuple(views)))
-    assert any("principal points" in warning for warning in said)
 
 
 @pytest.mark.parametrize("side", ["train", "test"])

@@ -89,6 +89,8 @@ def test_junk_is_refused_by_name(tmp_path):
         "cannot use vertex property": whole.replace(b"property float x", b"property list uchar int x"),
         "twice": whole.replace(b"property float y", b"property float x"),
         "f_rest columns": whole.replace(b"f_rest_44", b"g_rest_44"),
+        "its property x is uint32, not float or double": whole.replace(b"float x", b"uint x"),
+        "its property opacity is int32": whole.replace(b"float opacity", b"int opacity"),
         "names no vertices": b"ply\nformat binary_little_endian 1.0\nend_header\n",
     }
     for message, data in cases.items():
@@ -135,3 +137,24 @@ def test_colours_are_read_by_their_range_and_comments_are_no_header(tmp_path, ki
     (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + table.tobytes())
     assert not has_splats(tmp_path / "a.ply")
     assert read_point_ply(tmp_path / "a.ply")[1].tolist() == [[0, 255, 85], [255, 0, 255], [0, 0, 170]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "message"),
+    [
+        ("uint", 7, "x is uint32, not float"),
+        ("float", 3e38, "above 1e\\+18"),
+        ("double", np.nan, "not finite"),
+    ],
+)
+def test_positions_that_float32_cannot_square_or_that_are_no_floats_are_refused(
+    tmp_path, kind, value, message
+):
+    form = {"uint": "<u4", "float": "<f4", "double": "<f8"}[kind]
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 5"]
+    head += [*(f"property {kind} {a}" for a in "xyz"), "end_header\n"]
+    rows = np.ones((5, 3), form)
+    rows[3, 0] = value
+    (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+    with pytest.raises(AwError, match=message):
+        read_point_ply(tmp_path / "a.ply")

@@ -138,6 +138,30 @@ def test_other_versions_of_spz_are_read(tmp_path: Path, version: int, rest: int)
             read_splats(tmp_path / "cut.spz")
 
 
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_what_follows_the_end_of_an_spz_is_refused(version: int) -> None:
+    given = finite(model(20))
+    whole = b"".join(encode_spz(given)) if version == 3 else spz_of_version(version, given)
+    assert len(decode_spz(whole, "m").gaussians["means"]) == 20
+    for data in (whole + b"\0", whole + whole):
+        with pytest.raises(AwError, match="m goes on after the Gaussians that its header announces"):
+            decode_spz(data, "m")
+    if version == 3:
+        raw = bytearray(gzip.decompress(whole) + b"more")
+        with pytest.raises(AwError, match="goes on after"):
+            decode_spz(gzip.compress(raw), "m")
+        raw[14] |= 2  # Niantic's flag for extensions, which follow the Gaussians
+        assert len(decode_spz(gzip.compress(raw), "m").gaussians["means"]) == 20
+
+
+def test_a_gaussian_that_float32_cannot_square_is_refused(tmp_path: Path) -> None:
+    given = model(9)
+    given["means"][4, 1] = -3e38
+    write_splat_ply(tmp_path / "far.ply", given)
+    with pytest.raises(AwError, match=r"far\.ply holds a Gaussian with a coordinate above 1e\+18; remove it"):
+        read_splats(tmp_path / "far.ply")
+
+
 def test_a_compressed_ply_without_bounds_of_colours_is_read(tmp_path: Path) -> None:
     given, path = model(300, 0), tmp_path / "old.ply"
     given["sh0"] = np.clip(given["sh0"], -1.7, 1.7)

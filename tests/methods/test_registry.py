@@ -25,10 +25,11 @@ def test_a_misspelt_method_names_the_nearest():
         get_method("refinsplat")
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "../x", ".hidden", "a\\b"])
-def test_names_that_cannot_be_folders_are_refused(name):
-    with pytest.raises(AwError, match="folder"):
+@pytest.mark.parametrize("name", ["", "a/b", "../x", ".hidden", "a\\b", "-rf", "evil<b>", "a|b", "a\nb"])
+def test_names_that_are_no_names_are_refused_where_methods_are_registered(name):
+    with pytest.raises(AwError, match="method name") as caught:
         register(MethodEntry(name, "", "m:f"))
+    assert "\n" not in str(caught.value) and registry.registered == {}
 
 
 def test_a_plugin_file_adds_a_method(tmp_path):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.metrics.stats import bootstrap_interval, mean, paired_interval, spread
+from ambiguous_wild.metrics.stats import bootstrap_interval, mean, paired_interval, sample_std
 
 NAN, INF = math.nan, math.inf
 
@@ -24,10 +24,10 @@ def test_a_mean_over_a_missing_cell_is_missing() -> None:
 
 
 def test_spread_is_the_sample_deviation() -> None:
-    assert spread([1.0, 3.0]) == pytest.approx(math.sqrt(2.0))
-    assert spread([5.0, 5.0, 5.0]) == 0.0
+    assert sample_std([1.0, 3.0]) == pytest.approx(math.sqrt(2.0))
+    assert sample_std([5.0, 5.0, 5.0]) == 0.0
     for values in ([], [1.0], [1.0, NAN], [1.0, INF]):
-        assert math.isnan(spread(values))
+        assert math.isnan(sample_std(values))
 
 
 def test_interval_against_every_resample_of_three_values() -> None:

@@ -2,9 +2,11 @@
 
 import os
 import stat
+from pathlib import Path
 
 import pytest
 
+from ambiguous_wild.splat import calibration
 from ambiguous_wild.splat.cpu import compile as cache
 
 
@@ -41,3 +43,26 @@ def test_without_a_writable_home_a_private_temporary_folder_is_used(home, monkey
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     folder.chmod(0o777)  # somebody else could plant code there now
     assert cache.kernel_cache().parent != folder
+
+
+def announced(monkeypatch):
+    """Return the line of a command that finds nothing compiled; where kernels lie is decided anew."""
+    lines = []
+    monkeypatch.setattr(cache._config, "CACHE_DIR", str(cache.kernel_cache()))
+    monkeypatch.setattr(calibration, "_cached", lambda: False)
+    calibration.warm_up(lines.append)
+    return " ".join(lines)
+
+
+def test_the_line_says_how_often_kernels_are_compiled_and_what_to_set(home, monkeypatch):
+    assert "once per machine" in announced(monkeypatch)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    monkeypatch.setattr(cache.tempfile, "tempdir", str(home))
+    line = announced(monkeypatch)
+    assert f"again when {home / 'ambiguous_wild-'}" in line and "set NUMBA_CACHE_DIR" in line
+    cache.kernel_cache().parent.chmod(0o777)
+    line = announced(monkeypatch)
+    assert "at every command" in line and "set NUMBA_CACHE_DIR" in line and "once per machine" not in line
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(home / "mine"))
+    assert "once per machine" in announced(monkeypatch)

@@ -13,7 +13,7 @@ from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, sphere_of, spread
+from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, sphere_of, fibonacci_sphere
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
@@ -60,7 +60,7 @@ def test_it_lies_far_behind_cameras_and_points_where_photos_look(data):
 
 
 def test_directions_are_spread_evenly():
-    directions = spread(1000)
+    directions = fibonacci_sphere(1000)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
     cosines = directions @ directions.T - 2 * np.eye(1000)
     nearest = np.degrees(np.arccos(cosines.max(axis=1)))

@@ -16,7 +16,7 @@ from ambiguous_wild.methods.refinesplat.merging import covariances, merge_member
 from ambiguous_wild.methods.refinesplat.recipe import consistency_loss
 from ambiguous_wild.methods.refinesplat.threshold import contrast, entropy, learnt, pool_of, surprise, t_ent
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
-from ambiguous_wild.metrics.stats import bootstrap_interval, mean, paired_interval, spread
+from ambiguous_wild.metrics.stats import bootstrap_interval, mean, paired_interval, sample_std
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
@@ -203,5 +203,5 @@ def test_a_bootstrap_interval_is_ordered_missing_or_named(values, seed):
         assert math.isfinite(found.mean)
         assert len(values) == 1 or found.low <= found.high
     assert math.isnan(mean(values)) or not any(map(math.isnan, numbers))
-    assert not spread(values) < 0
+    assert not sample_std(values) < 0
     assert paired_interval(values, values).count == len(values)

@@ -82,6 +82,22 @@ def test_cache_refuses_pickles_and_other_dtypes(tmp_path):
     assert cached(tmp_path, key, {"x": np.float32}, lambda: good)["x"].dtype == np.float32
 
 
+def test_entries_that_changed_places_are_computed_anew(tmp_path):
+    def fetch(photo: int) -> int:
+        key = cache_key("kind", "backend-1", None, np.full(3, photo))
+        labels = cached(tmp_path, key, {"x": np.int32}, lambda: {"x": np.full(2, photo, np.int32)})["x"]
+        return int(labels[0])
+
+    assert [fetch(photo) for photo in range(3)] == [0, 1, 2]
+    paths = sorted(tmp_path.iterdir())
+    for path, data in zip(paths, [p.read_bytes() for p in (*paths[1:], paths[0])]):
+        path.write_bytes(data)
+    assert [fetch(photo) for photo in range(3)] == [0, 1, 2]
+    with np.load(paths[0]) as entry:  # another array under the hash of the first
+        np.savez(tmp_path / paths[0].name, sha256=entry["sha256"], x=entry["x"] + 7)
+    assert [fetch(photo) for photo in range(3)] == [0, 1, 2]
+
+
 def test_cache_key_depends_on_everything():
     array = np.zeros((2, 3), np.float32)
     keys = {

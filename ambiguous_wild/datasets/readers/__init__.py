@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +20,8 @@ from ambiguous_wild.datasets.readers import (
     transforms,
 )
 from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.scene_folder import OWN_MASKS, find_masks
+from ambiguous_wild.io.scene_checks import check_masks
+from ambiguous_wild.io.scene_folder import OWN_MASKS, SIDES, mask_files, side_masks
 
 READERS: dict[str, Callable[..., ForeignScene]] = {
     "on-the-go": on_the_go.read_on_the_go,
@@ -139,16 +141,25 @@ def read_foreign(root: Path, kind: str | None = None, model: str = "") -> tuple[
     if kind not in COLMAP_KINDS:
         if model:
             raise AwError(f"--model {model} chooses among COLMAP models, which layout {kind} does not use")
-        return _with_masks(READERS[kind](root)), why
-    scene = _with_masks(READERS[kind](root, model))
+        return READERS[kind](root), why
+    scene = READERS[kind](root, model)
     note = colmap.which_model(root, model)
     return (dataclasses.replace(scene, notes=(*scene.notes, note)) if note else scene), why
 
 
-def _with_masks(scene: ForeignScene) -> ForeignScene:
-    """Add the keep masks in masks/ beside the photos, unless the dataset's files name masks."""
+def with_masks(scene: ForeignScene) -> ForeignScene:
+    """Add the keep masks in masks/ beside the photos, unless the dataset's files name masks; note their use.
+
+    Raises:
+        AwError: there are masks, and none is of a photo of the scene.
+    """
     folder = (scene.photos.parent if scene.photos != scene.root else scene.root) / "masks"
-    if scene.masks or scene.kind in ("drone", "dualsplat", "blender") or (folder / OWN_MASKS).is_file():
-        return scene
-    train = [name for name, side in scene.split.items() if side == "train"]
-    return dataclasses.replace(scene, masks=find_masks(folder, train))
+    train, test = ([name for name, of in scene.split.items() if of == side] for side in SIDES)
+    used, files, tests = scene.masks, set(scene.masks.values()), set[Path]()
+    if used:
+        folder = Path(os.path.commonpath({mask.parent for mask in files}))
+    elif scene.kind not in ("drone", "dualsplat", "blender") and not (folder / OWN_MASKS).is_file():
+        used, tests = side_masks(folder, train, "train"), {*side_masks(folder, test, "test").values()}
+        files = mask_files(folder)
+    notes = (*scene.notes, *check_masks(folder, files, used, tests, train))
+    return dataclasses.replace(scene, masks=used, notes=notes)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.datasets.foreign import ForeignScene
-from ambiguous_wild.datasets.readers.posed_photos import find_posed, posed_scene, tool_errors
+from ambiguous_wild.datasets.readers.posed_photos import find_posed, numbers, posed_scene, tool_errors
 from ambiguous_wild.datasets.readers.transforms import frame_camera, read_object
 
 LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -56,10 +56,10 @@ def read_record3d(root: Path) -> ForeignScene:
         raise AwError(f"{root} has no metadata.json of Record3D, with poses and K")
     data = read_object(path)
     with tool_errors("Record3D", path):
-        poses = np.array(data["poses"], np.float64).reshape(-1, 7)  # quaternion (x, y, z, w), position
+        poses = numbers(data["poses"]).reshape(-1, 7)  # quaternion (x, y, z, w), position
         turns = Rotation.from_quat(poses[:, :4]).as_matrix()
-        k = np.array(data["K"], np.float64).reshape(9)[[0, 4, 6, 7]]  # column by column
-        lenses = np.array(data.get("perFrameIntrinsicCoeffs") or [k] * len(poses), np.float64)
+        k = numbers(data["K"]).reshape(9)[[0, 4, 6, 7]]  # column by column
+        lenses = numbers(data.get("perFrameIntrinsicCoeffs") or [k] * len(poses))
         lenses = lenses.reshape(len(poses), 4)  # fx, fy, cx, cy
         sized = [dict(zip(LENS, (*map(float, lens), data["w"], data["h"]))) for lens in lenses]
     photos = next((root / n for n in ("rgb", "rgbd") if (root / n).is_dir()), root)

@@ -82,6 +82,11 @@ def find_posed(folder: Path, names: Sequence[str], where: Path) -> list[str]:
     return photos
 
 
+def numbers(values: object) -> np.ndarray:
+    """Return nested lists of numbers as float64; TypeError for texts, which NumPy would convert."""
+    return np.array(values).astype(np.float64, casting="same_kind")
+
+
 def brown_camera(
     size: tuple[int, int],
     pinhole: Sequence[float],  # fx, fy, cx, cy in px
@@ -131,7 +136,7 @@ def model_of_poses(rows: Iterable[Row]) -> ColmapModel:
         check_camera(Path(name), camera)
         camera_of_photo = cameras.setdefault(key, ModelCamera(len(cameras) + 1, *key))
         try:
-            pose = pose_from_opengl(np.array(matrix, dtype=np.float64))
+            pose = pose_from_opengl(numbers(matrix))
         except (ValueError, TypeError) as error:
             raise AwError(f"{name}: its transform_matrix is not [4, 4] numbers") from error
         except AwError as error:

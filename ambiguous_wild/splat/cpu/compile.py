@@ -26,6 +26,12 @@ from numba.extending import intrinsic as _intrinsic
 
 from ambiguous_wild.io.numba_cache import rebuild_damaged_cache as forgiving
 
+LAYERS = ["omp", "tbb", "workqueue"]  # threading layers; the first that is installed is used
+_config: Any = numba.config
+_lock = threading.RLock()
+_TEMPORARY = "ambiguous_wild-"  # folder for kernels of a user without a writable home
+_ONCE = f"{_TEMPORARY}once-"  # where that folder belongs to somebody else, too: one for each process
+
 
 def kernel_cache() -> Path:
     """Return the folder of compiled kernels: NUMBA_CACHE_DIR, else in the home cache, else temporary."""
@@ -36,32 +42,37 @@ def kernel_cache() -> Path:
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
     name = f"kernels-{digest.hexdigest()[:12]}"
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ambiguous_wild"
     try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ambiguous_wild"
         base.mkdir(parents=True, exist_ok=True)
-        writable = os.access(base, os.W_OK)
-    except OSError:
-        writable = False
-    return base / name if writable else _private_temporary() / name
+        if os.access(base, os.W_OK):
+            return base / name
+    except (OSError, RuntimeError):  # RuntimeError: there is no home
+        pass
+    return _private_temporary() / name
+
+
+def how_often() -> str:
+    """Return how often kernels are compiled, for the line that announces it."""
+    folder = Path(_config.CACHE_DIR).parent
+    if "NUMBA_CACHE_DIR" in os.environ or not folder.name.startswith(_TEMPORARY):
+        return "once per machine"
+    when = "at every command" if folder.name.startswith(_ONCE) else f"again when {folder} is emptied"
+    return f"{when}, as no cache in the home folder can be written: set NUMBA_CACHE_DIR to a folder that can"
 
 
 def _private_temporary() -> Path:
     """Return a temporary folder that only this user can write to, as compiled code is loaded from it."""
     user = os.getuid() if hasattr(os, "getuid") else None  # Windows: its temporary folder is the user's own
-    folder = Path(tempfile.gettempdir()) / f"ambiguous_wild-{'user' if user is None else user}"
+    folder = Path(tempfile.gettempdir()) / f"{_TEMPORARY}{'user' if user is None else user}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
     except OSError:
-        return Path(tempfile.mkdtemp(prefix="ambiguous_wild-"))
+        return Path(tempfile.mkdtemp(prefix=_ONCE))
     mine = user is None or (status.st_uid == user and not status.st_mode & 0o022)
     mine = mine and stat.S_ISDIR(status.st_mode)
-    return folder if mine else Path(tempfile.mkdtemp(prefix="ambiguous_wild-"))
-
-
-LAYERS = ["omp", "tbb", "workqueue"]  # threading layers; the first that is installed is used
-_config: Any = numba.config
-_lock = threading.RLock()
+    return folder if mine else Path(tempfile.mkdtemp(prefix=_ONCE))
 
 
 def _prepare() -> None:

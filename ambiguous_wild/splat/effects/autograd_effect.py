@@ -42,7 +42,7 @@ class Leaf:
 
     values: Tensor  # any shape; [train photos, ...] if `per_photo`
     rate: float  # learning rate of Adam
-    final: float = 1.0  # the rate decays exponentially to this share
+    lr_decay: float = 1.0  # the rate decays exponentially to this share
     per_photo: bool = False  # a row for every photo, and one for a test photo
     fit_rate: float = 0.1  # learning rate while a test photo's row is fitted (WildGaussians)
     made_for: int | None = None  # run length that the rate is for, see `rate_for_run_length`
@@ -206,7 +206,7 @@ class Learnt(Effect):
             leaf = self._leaves[name]
             row = context.view if leaf.per_photo else 0
             assert row is not None
-            rate = decayed(leaf.rate, leaf.rate * leaf.final, context.progress)
+            rate = decayed(leaf.rate, leaf.rate * leaf.lr_decay, context.progress)
             rate = rate if leaf.made_for is None else rate_for_run_length(rate, leaf.made_for, context)
             self._adam[name].step(row, gradient, rate, skip_step)
 

@@ -60,7 +60,7 @@ class Skybox(Effect):
         views = range(0, len(data.photos), -(-len(data.photos) // PHOTOS))
         count, self.count = COUNT, 0
         while count >= LEAST:
-            xyz = middle + radius * spread(count)
+            xyz = middle + radius * fibonacci_sphere(count)
             projections = [_project_into(data, view, xyz) for view in views]
             seen = np.unique(np.concatenate([rows for rows, _, _ in projections]))
             if LEAST_POINTS <= len(seen) <= most:
@@ -86,7 +86,7 @@ def sphere_of(cameras: list[Camera], xyz: np.ndarray) -> tuple[np.ndarray, float
     return middle, RADIUS * max(points, float(np.linalg.norm(centres - middle, axis=1).max()))
 
 
-def spread(count: int) -> np.ndarray:
+def fibonacci_sphere(count: int) -> np.ndarray:
     """Return unit vectors [count, 3], spread evenly (a Fibonacci lattice)."""
     k = np.arange(count) + 0.5
     angle, z = k * np.pi * (3.0 - np.sqrt(5.0)), 1.0 - 2.0 * k / count

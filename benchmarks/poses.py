@@ -39,6 +39,7 @@ WAYS = ("auto", "thorough", "colmap", "colmap-global")
 KINDS = ("cutouts", "patches")
 ROTATION_DEG, POSITION_PERCENT = 1.0, 5.0  # a pose is right if both errors are below
 POSITION_M = 20.0  # the same by GPS, whose own error is several metres in a street
+MOST_TRIPLES = 2000  # of photos, to which the similarity is fitted
 LEAST_COMPOSITE = 6  # photos: `aw composite` refuses fewer
 COLMAP = """
 import os, sys, zlib, pycolmap
@@ -86,8 +87,8 @@ def exact_poses(cameras: Path) -> Poses:
 def compare(estimated: Poses, truth: Poses) -> dict[str, Any]:
     """How many poses are right, and which are not.
 
-    The similarity between the two paths is fitted to the photos whose rotation is right. A photo that the
-    truth lacks is not judged.
+    The similarity between the two paths is fitted to the photos whose rotation is right: of those of every
+    three of them, the one under which most positions are right. A photo that the truth lacks is not judged.
     """
     names = sorted(set(estimated) & set(truth))
     if len(names) < 3:
@@ -98,14 +99,16 @@ def compare(estimated: Poses, truth: Poses) -> dict[str, Any]:
     rotation_deg = {n: float(np.median(np.delete(angles_deg[k], k))) for k, n in enumerate(names)}
     inliers = [n for n in names if rotation_deg[n] <= ROTATION_DEG]
     inliers = inliers if len(inliers) >= 3 else list(names)
-    for _ in range(len(inliers) - 2):  # without those that would drag the others
-        position_percent = _position_errors_percent(names, inliers, estimated, truth)
-        worst = max(inliers, key=lambda n: position_percent[n])
-        if position_percent[worst] <= max(
-            POSITION_PERCENT, 3 * float(np.median([position_percent[n] for n in inliers]))
-        ):
-            break
-        inliers.remove(worst)
+    triples = list(itertools.combinations(inliers, 3))
+    chosen = np.random.default_rng(0).permutation(len(triples))[:MOST_TRIPLES]
+    position_percent, right = {}, -1
+    for fitted in (inliers, *(triples[k] for k in chosen)):
+        for _ in range(2):  # then to those that are right under it
+            errors = _position_errors_percent(names, fitted, estimated, truth)
+            near = [n for n in inliers if errors[n] <= POSITION_PERCENT]
+            if len(near) > right:
+                position_percent, right = errors, len(near)
+            fitted = near if len(near) >= 3 else fitted
     wrong = {
         n: [round(rotation_deg[n], 2), round(position_percent[n], 2)]
         for n in names

@@ -40,6 +40,7 @@ NEAR_DEG = 3.0  # largest angle of poses that may be the same one, found twice
 SAME_SHARE = 0.1  # of the path's radius: largest distance of positions that are the same
 GRID = 12  # cells a side of the grid on which the area of matches is measured
 RELIABLE_MERGE = 4  # pairs across two components; with fewer, the smaller one is provisional
+USUAL_FOCAL = 0.5, 2.0  # over the longer side: another one, of a single photo, may be that of a distractor
 LEAST_POINTS = 6  # points, which two others observe, that fix the scale for a photo with the support of one
 MOST_RESECTIONS = 3  # poses tried for a photo, at most
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of the inliers of a resection
@@ -188,11 +189,8 @@ class Registration:
 
     def cameras(self) -> list[CameraFact]:
         """Return the focal length of every camera; its standard deviation by `mark_provisional`."""
-        numbers: dict[int, list[int]] = {}
-        for photo in self.poses:
-            numbers.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
         facts: list[CameraFact] = []
-        for number, photos in numbers.items():
+        for number, photos in self._photos_of_cameras().items():
             block = None
             if self.covariance is not None:
                 params = self.covariance.model.cameras[number].params
@@ -208,14 +206,30 @@ class Registration:
         return facts
 
     def mark_provisional(self) -> None:
-        """Estimate the covariance; photos whose poses it leaves open are provisional, all if most are."""
+        """Estimate the covariance; photos whose poses it leaves open are provisional, all if most are.
+
+        So is a photo with a camera of its own and an unusual focal length: a distractor that covers much of
+        it bends both.
+        """
         self.covariance = self._joint_covariance()
         self.provisional |= {k for k in self.poses if self._observations(k) < LEAST_POINTS}
+        for photos in self._photos_of_cameras().values():
+            camera = self.matched.cameras[photos[0]]
+            ratio = camera.mean_focal_length() / max(camera.width, camera.height)
+            if len(photos) == 1 and not USUAL_FOCAL[0] <= ratio <= USUAL_FOCAL[1]:
+                self.provisional |= set(photos)
         deviations = self.covariance.deviations if self.covariance else {}
         if deviations:
             sure = {k for k in self.poses if (deviations.get(self.matched.ids[k], np.inf) <= UNSURE).all()}
             most = 2 * len(sure) >= len(deviations)
             self.provisional |= self.poses.keys() - (sure if most else set())
+
+    def _photos_of_cameras(self) -> dict[int, list[int]]:
+        """Return the registered photos of every camera, by its id."""
+        photos: dict[int, list[int]] = {}
+        for photo in self.poses:
+            photos.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
+        return photos
 
     def _observations(self, photo: int) -> int:
         return int(self.model.images[self.matched.ids[photo]].num_points3D)

@@ -157,7 +157,9 @@ def write_contact(scene: Scene, masks: Path, path: Path) -> list[Path]:
     if not views:
         return []
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_jpeg(path, grid([_tinted(scene, view, masks) for view in evenly_spaced(views, MOST_MASKS)], MASK_COLUMNS))
+    write_jpeg(
+        path, grid([_tinted(scene, view, masks) for view in evenly_spaced(views, MOST_MASKS)], MASK_COLUMNS)
+    )
     return [path]
 
 

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.pace import TrainConfig
 
 _NEAR = 0.05  # of a point's distance to the nearest train camera
-# Shares of near points below which a start is refused, and warned of. Models of the scene had 0.59 to 1, with
-# errors of 10 % of the depth 0.97, at half and twice the scale 0.02; 75 of 92 models and point clouds of other
-# scenes had less than 0.1, as had points drawn at random in the scene's box (0.05).
+# Shares of near points below which a start is refused, and warned of. Models of the scene had 0.59 to 1; with
+# errors of 10 % of the depth 0.97, at half and twice the scale 0.02; 75 of 92 models and point clouds of
+# other scenes had less than 0.1, as had points at random in the box of the scene (0.05).
 _LEAST_NEAR, _FEW_NEAR = 0.02, 0.1
 
 

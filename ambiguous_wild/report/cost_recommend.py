@@ -137,7 +137,8 @@ def additive(values: dict[tuple[str, str], float]) -> tuple[dict[str, float], di
     parts = np.linalg.lstsq(rows, np.array(list(values.values())), rcond=None)[0]
     residual = np.array(list(values.values())) - rows @ parts
     spread = {
-        name: stats.sample_std([float(x) for x, key in zip(residual, values) if key[0] == name]) for name in names
+        name: stats.sample_std([float(x) for x, key in zip(residual, values) if key[0] == name])
+        for name in names
     }
     return dict(zip(names, map(float, parts))), spread
 

@@ -176,7 +176,9 @@ ShadeVjp = Callable[[Tensor], ShadeGradients]  # from dL/dcolours [M, 3]
 Shade = Callable[[Tensor, Tensor | slice], tuple[Tensor, ShadeVjp]]
 
 
-def scatter_gradients(gradients: Gradients, shading: ShadeGradients, rows: Tensor | slice, g: Gaussians) -> Gradients:
+def scatter_gradients(
+    gradients: Gradients, shading: ShadeGradients, rows: Tensor | slice, g: Gaussians
+) -> Gradients:
     """Add the gradients of a shading function's rows to those of all rows, in place."""
     if shading.means is not None:
         gradients.means[rows] += shading.means

@@ -1,5 +1,6 @@
 """Components that were registered alone are merged where several pairs agree, and only there."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -260,6 +261,16 @@ def test_the_photo_is_provisional_whose_rotation_the_matches_leave_open(weak, mo
     assert component.provisional == (set() if weak is None else {weak})
     poses = {k: component.model.images[k + 1].cam_from_world().matrix() for k in range(6)}
     assert all(np.allclose(x, pose(k), atol=1e-12) for k, x in poses.items())  # the model stays as it is
+
+
+@pytest.mark.parametrize(("longer_sides", "doubted"), [(1.9, set()), (2.1, {4}), (0.4, {4})])
+def test_a_photo_whose_own_camera_has_an_unusual_focal_length_is_provisional(longer_sides, doubted):
+    component = registered_with_noise(None)
+    camera = copy.deepcopy(component.matched.cameras[4])
+    camera.camera_id, camera.params = 2, [longer_sides * WIDTH, *camera.params[1:]]
+    component.matched.cameras[4] = camera
+    component.mark_provisional()
+    assert component.provisional == doubted
 
 
 def test_an_open_model_and_photos_of_few_points_are_provisional(monkeypatch):

@@ -135,7 +135,7 @@ def test_what_a_run_cannot_start_from_is_refused_before_anything_is_made(scene, 
 def test_a_start_that_lies_near_few_points_of_the_scene_is_warned_of(scene, tmp_path):
     given = load_scene(scene)
     xyz = given.points.xyz / given.place.scale + given.place.centre
-    moved = np.where(np.arange(len(xyz))[:, None] % 40, xyz + [0, 0, -2.0], xyz)
+    moved = np.where(np.arange(len(xyz))[:, None] % 40, xyz - np.array([0, 0, 2.0]), xyz)
     write_point_ply(tmp_path / "other.ply", moved, np.zeros(moved.shape, np.uint8))
     with pytest.warns(UserWarning, match="at most [2-9]% of its points .* is it of another scene"):
         started(MethodHooks(), start_file(tmp_path / "other.ply"), given)

@@ -13,7 +13,7 @@ from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, sphere_of, fibonacci_sphere
+from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, fibonacci_sphere, sphere_of
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig

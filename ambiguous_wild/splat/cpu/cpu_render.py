@@ -149,7 +149,9 @@ class RenderedCpu:
             count=torch.from_numpy(tally[:, 1]) if tally is not None and "count" in needs else None,
             visible=self.visible,
         )
-        return gradients if through is None else scatter_gradients(gradients, through[1], self._shaded_rows, g)
+        return (
+            gradients if through is None else scatter_gradients(gradients, through[1], self._shaded_rows, g)
+        )
 
     @property
     def _shaded_rows(self) -> Tensor:

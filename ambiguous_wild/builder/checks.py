@@ -187,7 +187,7 @@ def focal_length(photos: Sequence[ScreenedPhoto]) -> CaptureCheck:
 
 def blur(photos: Sequence[ScreenedPhoto], compared: PhotoComparison) -> CaptureCheck:
     """Find photos much softer than the median, or softer than others on the same surfaces."""
-    sharp = np.array([photo.blur for photo in photos])
+    sharp = np.array([photo.sharpness for photo in photos])
     soft = sharp < BLUR_RATIO * np.median(sharp)
     soft |= np.nan_to_num(compared.offsets[:, 3], nan=0.0) < SOFT
     names = tuple(photo.source for photo, s in zip(photos, soft) if s)

@@ -47,7 +47,7 @@ class ScreenedPhoto:
     height: int = 0  # px
     exif: ExifRecord = field(default_factory=ExifRecord)
     camera: str | None = None  # make and model
-    blur: float = 0.0  # variance of the Laplacian: the lower, the softer
+    sharpness: float = 0.0  # variance of the Laplacian: the lower, the softer
     mean_luma: float = 0.0  # of 255
     notes: Sequence[str] = ()  # what reading converted
     copies: Sequence[str] = ()  # files of the capture with the same bytes, left out
@@ -240,7 +240,7 @@ class ScenePhoto(TypedDict):
     split: str | None  # None: not in the scene
     width: int
     height: int
-    blur: float
+    sharpness: float
     mean_luma: float
     features: int
     partners: int  # covisible photos that support its pose; 0: not in the scene

@@ -249,7 +249,7 @@ def _photo(
         "split": "train" if photo.name in split.train else "test" if photo.name in split.test else None,
         "width": photo.width,
         "height": photo.height,
-        "blur": photo.blur,
+        "sharpness": photo.sharpness,
         "mean_luma": photo.mean_luma,
         "features": features.get(photo.name, 0),
         "partners": mapping["partners"].get(photo.name, 0),

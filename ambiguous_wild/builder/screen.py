@@ -150,7 +150,7 @@ def photo_record(listed: PhotoSource, photo: Photo, pixels: np.ndarray) -> Scree
         height=photo.height,
         exif=cast(ExifRecord, exif),
         camera=photo.exif.camera,
-        blur=round(sharpness(pixels), 3),
+        sharpness=round(sharpness(pixels), 3),
         mean_luma=round(float(pixels.mean()), 2),
         notes=list(photo.notes),
     )
@@ -202,9 +202,9 @@ def thumbnail(
 def drift_warnings(photos: Sequence[ScreenedPhoto]) -> list[str]:
     """Warn of blurred photos, and of camera settings that changed within the capture."""
     warnings = []
-    blur = np.array([photo.blur for photo in photos])
-    limit = BLUR_RATIO * float(np.median(blur))
-    soft = [photo.source for photo, b in zip(photos, blur) if b < limit]
+    sharp = np.array([photo.sharpness for photo in photos])
+    limit = BLUR_RATIO * float(np.median(sharp))
+    soft = [photo.source for photo, b in zip(photos, sharp) if b < limit]
     if soft:
         warnings.append(
             f"{len(soft)} photos are blurred (Laplacian variance under {limit:.0f}, a fifth of the "

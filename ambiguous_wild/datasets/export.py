@@ -55,14 +55,14 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     scene = load_scene(path, raw=True)
     check_output(output, outside={f"the scene {path}": scene.root}, new=True)
     with atomic_dir(output, replace=False) as folder:
-        place = _copy if copy else link_file
-        left_out = [*WRITERS[form](scene, folder, place)]
+        put = _copy if copy else link_file
+        left_out = [*WRITERS[form](scene, folder, put)]
     if (scene.root / motion_points.FILE).is_file():
         left_out.append("features that move (motion.npz)")
     return ExportedScene(output, len(scene.views), len(scene.train), len(scene.test), tuple(left_out))
 
 
-Place = Callable[[Path, Path], None]
+CopyOrLink = Callable[[Path, Path], None]
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -103,10 +103,10 @@ def _write_lists(scene: Scene, folder: Path) -> None:
         (folder / f"{side}_list.txt").write_text(text, encoding="utf-8")
 
 
-def _colmap(scene: Scene, folder: Path, place: Place, masks: bool = True) -> list[str]:
+def _colmap(scene: Scene, folder: Path, put: CopyOrLink, masks: bool = True) -> list[str]:
     """Write images/, sparse/0, lists that some readers know, and keep masks under COLMAP's names."""
     for view in scene.views:
-        place(view.image_path, folder / "images" / _stored(view))
+        put(view.image_path, folder / "images" / _stored(view))
     write_model(folder / "sparse" / "0", _sized_model(scene))
     _write_lists(scene, folder)
     for view in scene.train if masks else ():
@@ -115,9 +115,9 @@ def _colmap(scene: Scene, folder: Path, place: Place, masks: bool = True) -> lis
     return []
 
 
-def _nerfbaselines(scene: Scene, folder: Path, place: Place) -> list[str]:
+def _nerfbaselines(scene: Scene, folder: Path, put: CopyOrLink) -> list[str]:
     """Write the COLMAP layout with nb-info.json and with keep masks where NerfBaselines looks for them."""
-    _colmap(scene, folder, place, masks=False)
+    _colmap(scene, folder, put, masks=False)
     masked = [view for view in scene.train if view.keep_path is not None]
     for view in masked:
         _write_mask(view, folder / "masks" / f"{without_suffix(view.name)}.png")
@@ -137,13 +137,13 @@ def _half(scene: Scene) -> bool:
     return isinstance(evaluation, dict) and evaluation.get("protocol") == "half"
 
 
-def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
+def _nerfstudio(scene: Scene, folder: Path, put: CopyOrLink) -> list[str]:
     """Write transforms.json with lists, points and masks, for `--data FOLDER nerfstudio-data`."""
     frames = []
     masked = any(view.keep_path for view in scene.train)
     for view in scene.views:
         name = f"images/{_stored(view)}"
-        place(view.image_path, folder / name)
+        put(view.image_path, folder / name)
         frame = {"file_path": name, **_intrinsics(view), "transform_matrix": _camera_to_world(view)}
         if masked:  # nerfstudio needs a mask for every photo, or none
             mask = f"masks/{without_suffix(view.name)}.png"
@@ -163,7 +163,7 @@ def _nerfstudio(scene: Scene, folder: Path, place: Place) -> list[str]:
     return [*_protocol_lost(scene), "tracks of the points"]
 
 
-def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
+def _on_the_go(scene: Scene, folder: Path, put: CopyOrLink) -> list[str]:
     """Write images/, transforms.json, and split.json with positions among the names sorted by base name.
 
     Readers of this layout reduce photos themselves, so they are written at full size if the scene has them.
@@ -178,7 +178,7 @@ def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
     factor = int(scene.info["loaded_factor"])
     if factor > 1 and (scene.root / "images").is_dir():
         for view in scene.views:
-            place(view.image_path, folder / f"images_{factor}" / flat(view))
+            put(view.image_path, folder / f"images_{factor}" / flat(view))
         scene = load_scene(scene.root, factor=1, verify=False, raw=True, check=False)
     if len({flat(v) for v in scene.views}) < len(scene.views):
         raise AwError(f"{scene.root}: two photos have one name, which On-the-go's layout cannot tell apart")
@@ -189,7 +189,7 @@ def _on_the_go(scene: Scene, folder: Path, place: Place) -> list[str]:
     frames = []
     for view in views:
         name = f"images/{flat(view)}"
-        place(view.image_path, folder / name)
+        put(view.image_path, folder / name)
         own = {} if len(lenses) == 1 else _intrinsics(view)
         frames.append({"file_path": name, **own, "transform_matrix": _camera_to_world(view)})
     shared = _intrinsics(views[0]) if len(lenses) == 1 else {}
@@ -224,7 +224,7 @@ def _write_mask(view: View, target: Path) -> None:
     write_png(target, pixels)
 
 
-WRITERS: dict[str, Callable[[Scene, Path, Place], list[str]]] = {
+WRITERS: dict[str, Callable[[Scene, Path, CopyOrLink], list[str]]] = {
     "nerfstudio": _nerfstudio,
     "nerfbaselines": _nerfbaselines,
     "colmap": _colmap,

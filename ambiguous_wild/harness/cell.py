@@ -338,9 +338,9 @@ def _settings(method: MethodEntry, name: str, options: Any) -> list[str]:
     settings = []
     for key, value in changed.items():
         owner, rest = name, key
-        if method.places:  # a graft: its settings are named after the donor of the part
-            place, _, rest = key.partition(".")
-            owner = dict(method.places)[place]
+        if method.slots:  # a graft: its settings are named after the donor of the part
+            slot, _, rest = key.partition(".")
+            owner = dict(method.slots)[slot]
         settings.append(f"{owner}.{rest}={option_text(value)}")
     return list(dict.fromkeys(settings))
 
@@ -348,7 +348,7 @@ def _settings(method: MethodEntry, name: str, options: Any) -> list[str]:
 def _plugins(method: MethodEntry) -> list[Path]:
     """Return the --plugin files that a method, or the members of a graft, came from."""
     methods = all_methods()
-    members = [methods[name] for _, name in method.places if name in methods] or [method]
+    members = [methods[name] for _, name in method.slots if name in methods] or [method]
     # a reference is no plugin: its file need not call register
     files = [file_of(member) for member in members if not member.given_as]
     return [path for path in dict.fromkeys(files) if path is not None]

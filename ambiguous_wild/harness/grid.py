@@ -186,7 +186,7 @@ def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry])
             grouped[entry.name] |= dict.fromkeys(keys, value)
             applied = applied or bool(keys)
         if not applied:
-            names = {entry.name for entry in entries} | {name for e in entries for _, name in e.places}
+            names = {entry.name for entry in entries} | {name for e in entries for _, name in e.slots}
             raise unknown("method in --set", method, names)
     return grouped
 

@@ -196,14 +196,14 @@ def load_metrics(path: Path) -> None:
         register(replace(metric, source=digest))
 
 
-def own() -> dict[str, Metric]:
+def users_metrics() -> dict[str, Metric]:
     """Return the user's metrics that can be computed, by key."""
     return {key: m for key, m in metrics().items() if key not in MEASURES}
 
 
 def try_own(scene: Scene) -> None:
     """Raise AwError if a user's metric fails on a test photo against itself; called before training."""
-    for view in scene.test[:1] if (mine := own()) else ():
+    for view in scene.test[:1] if (mine := users_metrics()) else ():
         photo = read_png_rgb(view.image_path)
         for key, why in measure_images([(view.name, photo, photo)], mine.values(), scene)[1].items():
             raise AwError(f"metric {key}: {why}")
@@ -221,11 +221,11 @@ class MetricRecord(TypedDict):
 
 def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
     """Return the records of the user's metrics among these keys."""
-    fields, mine = MetricRecord.__annotations__, own()
+    fields, mine = MetricRecord.__annotations__, users_metrics()
     return {k: cast(MetricRecord, {f: getattr(mine[k], f) for f in fields}) for k in keys if k in mine}
 
 
-def remember(in_result: Mapping[str, MetricRecord]) -> None:
+def register_columns(in_result: Mapping[str, MetricRecord]) -> None:
     """Register the columns of a result's own metrics from their records, without functions."""
     for key in in_result.keys() - MEASURES:
         own_metrics.setdefault(key, Metric(key, function="", **in_result[key]))

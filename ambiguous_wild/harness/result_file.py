@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, MetricRecord, measure, remember
+from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, MetricRecord, measure, register_columns
 from ambiguous_wild.io.files import sha256_file, unique_keys, write_json
 from ambiguous_wild.metrics import stats
 
@@ -315,7 +315,7 @@ def _checked(data: Any, where: str) -> RunResult:
         msgspec.convert(rows, dict[str, dict[str, float | None]])  # metrics of plugins and later versions too
         if any(kernel <= 0.0 for _, kernel in plain["cost"].get("timing", {}).get("samples", ())):
             raise msgspec.ValidationError("a calibration took no time - at `$.cost.timing.samples`")
-        remember(data.get("metrics", {}))
+        register_columns(data.get("metrics", {}))
         if data["status"] == "failed" and not data["error"]:
             raise msgspec.ValidationError("a failed run must say its error")
     except (msgspec.ValidationError, RecursionError) as error:

@@ -16,7 +16,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.command_lines import length_text
-from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, own
+from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, users_metrics
 from ambiguous_wild.harness.result_file import (
     CONFIG,
     FAILED,
@@ -397,12 +397,12 @@ def could_be_measured(results: Iterable[RunResult]) -> list[str]:
     now = {name for name, reason in lpips.available().items() if reason is None}
     listed = list(results)
     lacking = {name for r in listed for name, why in r["missing"].items() if lpips.TOO_SMALL not in why}
-    return sorted(lacking & now | {name for r in listed for name in own() if lacks(r, name)})
+    return sorted(lacking & now | {name for r in listed for name in users_metrics() if lacks(r, name)})
 
 
 def lacks(result: RunResult, metric: str) -> bool:
     """Return whether the result lacks the metric, or has it from another version of the metric's file."""
-    record, mine = result.get("metrics", {}).get(metric), own().get(metric)
+    record, mine = result.get("metrics", {}).get(metric), users_metrics().get(metric)
     if mine is not None and record is not None and record["source"] != mine.source:
         return True
     return all(metrics_of(row).get(metric) is None for row in result["per_image"])

@@ -57,7 +57,7 @@ class SlowAverage(Effect):
 
     @torch.no_grad()
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
-        gaussians.settle()
+        gaussians.flush()
         for name, tensor in gaussians.items():
             gaussians.attributes[slow(name)].lerp_(tensor, self.share)
 

@@ -47,7 +47,7 @@ class MethodEntry:
     ) = ()  # "module:ABLATIONS" or the groups, see methods/ablation_groups.py
     source_hash: str = ""  # hash of a plugin's file: a changed plugin is another configuration
     # for a graft the method behind each field of its options, see graft.py
-    places: tuple[tuple[str, str], ...] = ()
+    slots: tuple[tuple[str, str], ...] = ()
     # an external program, which runs instead of parts on our trainer, see external.py
     program: Program | None = None
     base: str = ""  # for a method that trains twice its name without "+2passes", by which options are set
@@ -111,7 +111,7 @@ class MethodEntry:
         """Return the keys of this method's options that a setting METHOD.KEY sets; may be empty."""
         if method in (self.name, self.base):
             return [key]
-        return [f"{place}.{key}" for place, name in self.places if name == method]
+        return [f"{slot}.{key}" for slot, name in self.slots if name == method]
 
     def ablation_groups(self) -> tuple[Group, ...]:
         """Return the ablations that the method declares; may be empty."""

@@ -1,7 +1,7 @@
 """Plug and play: masking, density control, regulariser and effects of one method in another.
 
 `3dgs@mask=refinesplat` is 3DGS with RefineSplat's masks, `refinesplat@mask=truth` RefineSplat with exact
-ones. The places, and what a donor fills them with:
+ones. The slots, and what a donor fills them with:
 
 mask         the keep map (`MaskPolicy.keep`, `predict`), and what it learns
 density      the density control and its config
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
     from ambiguous_wild.methods.graft_checks import Member
     from ambiguous_wild.splat.method_hooks import MethodHooks
 
-PLACES = ("mask", "density", "regulariser", "effects")
+SLOTS = ("mask", "density", "regulariser", "effects")
 ALIASES = {"none": "3dgs", "motion": "3dgs+motion", "truth": "3dgs+truth"}  # short names of donors
 
 
 def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
-    """Return a name such as `3dgs@mask=refinesplat,density=refinesplat`; the host's if no place is filled.
+    """Return a name such as `3dgs@mask=refinesplat,density=refinesplat`; the host's if no slot is filled.
 
     Donors replace those in the host's name.
     """
     base, rest = split_graft(host)
     filled = dict(_pairs(host)) if rest else {}
-    filled |= {place: donor for place, donor in donors.items() if donor}
-    text = ",".join(f"{place}={filled[place]}" for place in PLACES if place in filled)
+    filled |= {slot: donor for slot, donor in donors.items() if donor}
+    text = ",".join(f"{slot}={filled[slot]}" for slot in SLOTS if slot in filled)
     return f"{base}@{text}" if text else base
 
 
@@ -62,7 +62,7 @@ def split_graft(name: str) -> tuple[str, str]:
 def refuse_parts_of_program(name: str) -> None:
     """Raise AwError for a name such as `external:opensplat@density=uad`: a program takes no parts."""
     host, _, rest = name.rpartition("@")
-    if not is_program(host) or not all(place in PLACES for place, _ in _written(rest)):
+    if not is_program(host) or not all(slot in SLOTS for slot, _ in _written(rest)):
         return
     path = reference_file(name)
     if path is None or not path.exists():
@@ -83,7 +83,7 @@ def knows_truth(name: str) -> bool:
     """
     name = trained_once(name)
     host, _, rest = name.rpartition("@") if "@" in name else (name, "", "")
-    masks = [ALIASES.get(donor, donor) for place, donor in _written(rest) if place == "mask"] or [host]
+    masks = [ALIASES.get(donor, donor) for slot, donor in _written(rest) if slot == "mask"] or [host]
     return host == "3dgs-clean" or masks[-1] == "3dgs+truth"
 
 
@@ -102,30 +102,30 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
         methods: possible donors by name.
 
     Raises:
-        AwError: a place or donor is unknown, or a place is filled twice.
+        AwError: a slot or donor is unknown, or a slot is filled twice.
     """
     if host.passes > 1:
         raise AwError(f"{name}: the end of the name says that it trains twice: {host.base}@...+2passes")
     pairs = _pairs(name)
     if host.program is not None:
         raise _program_takes_no_parts(host.name, split_graft(name)[1])
-    donors = {place: _donor(place, donor, methods) for place, donor in pairs}
+    donors = {slot: _donor(slot, donor, methods) for slot, donor in pairs}
     entries = {"host": host} | donors
     fields = [
-        (place, entry.options_class(), dataclasses.field(default_factory=entry.options))
-        for place, entry in entries.items()
+        (slot, entry.options_class(), dataclasses.field(default_factory=entry.options))
+        for slot, entry in entries.items()
     ]
     hashes = [entry.source_hash for entry in entries.values()]
-    ordered = graft_name(host.name, dict(pairs))  # in the order of the places, so that one graft has one name
+    ordered = graft_name(host.name, dict(pairs))  # in the order of the slots, so that one graft has one name
     return MethodEntry(
         name=ordered,
-        summary=f"{host.name} with " + ", ".join(f"the {place} of {e.name}" for place, e in donors.items()),
+        summary=f"{host.name} with " + ", ".join(f"the {slot} of {e.name}" for slot, e in donors.items()),
         recipe=Graft(ordered, entries),
         config=dataclasses.make_dataclass("GraftOptions", fields, frozen=True),
         needs="; ".join(dict.fromkeys(e.needs for e in entries.values() if e.needs)),
         source_hash=hashlib.sha256("".join(hashes).encode()).hexdigest() if any(hashes) else "",
-        places=tuple((place, entry.name) for place, entry in entries.items())
-        + tuple((place, donor) for place, donor in pairs if donor in ALIASES),
+        slots=tuple((slot, entry.name) for slot, entry in entries.items())
+        + tuple((slot, donor) for slot, donor in pairs if donor in ALIASES),
         given_as=graft_name(host.given_as, dict(pairs)) if host.given_as else "",
     )
 
@@ -135,29 +135,29 @@ class Graft:
     """The recipe of a graft."""
 
     name: str
-    entries: Mapping[str, MethodEntry]  # "host", and the donor of every place that is filled
+    entries: Mapping[str, MethodEntry]  # "host", and the donor of every slot that is filled
 
     def __call__(self, options: Any) -> MethodHooks:
         return build(self.name, self.entries, options)
 
 
 def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> MethodHooks:
-    """Return the host's hooks with those of the donors in their places.
+    """Return the host's hooks with those of the donors in their slots.
 
-    A method that fills two places with the same options is built once, so its frozen inputs are prepared
+    A method that fills two slots with the same options is built once, so its frozen inputs are prepared
     once, and a method grafted onto itself is unchanged.
 
     Args:
         name: name of the graft, for warnings.
-        entries: "host", and the donor of every place that is filled.
-        options: their options, by place.
+        entries: "host", and the donor of every slot that is filled.
+        options: their options, by slot.
     """
     from ambiguous_wild.methods.graft_checks import check_members
 
     host_member, donors = _members(name, entries, options)
     check_members(host_member, donors)
     host = host_member.hooks
-    mask, regulariser = (donors.get(place, host_member).hooks.mask for place in ("mask", "regulariser"))
+    mask, regulariser = (donors.get(slot, host_member).hooks.mask for slot in ("mask", "regulariser"))
     host = dataclasses.replace(host, mask=compose(mask, regulariser))
     if "density" in donors:
         density = donors["density"].hooks
@@ -179,18 +179,18 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Method
 
 
 def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tuple[Member, dict[str, Member]]:
-    """Build the host and the donors by place; a method with equal options is built once."""
+    """Build the host and the donors by slot; a method with equal options is built once."""
     from ambiguous_wild.methods.graft_checks import Member
 
     typed, members = dict(_pairs(name)), {}
     built: list[tuple[str, Any, MethodHooks]] = []  # method, options, hooks
-    for place, entry in entries.items():
-        own = getattr(options, place)
+    for slot, entry in entries.items():
+        own = getattr(options, slot)
         hooks = next((hooks for method, set_, hooks in built if method == entry.name and set_ == own), None)
         if hooks is None:
             hooks = entry.build(own)
             built.append((entry.name, own, hooks))
-        members[place] = Member(typed.get(place, entry.name), hooks)
+        members[slot] = Member(typed.get(slot, entry.name), hooks)
     return members.pop("host"), members
 
 
@@ -232,36 +232,36 @@ def check_graft(method: MethodEntry, options: Any) -> list[str]:
 
 
 def _pairs(name: str) -> list[tuple[str, str]]:
-    """Return (place, donor) for every place that the name of a graft fills.
+    """Return (slot, donor) for every slot that the name of a graft fills.
 
     Raises:
-        AwError: a place is unknown, has no donor, or is filled twice.
+        AwError: a slot is unknown, has no donor, or is filled twice.
     """
     host, rest = split_graft(name)
     pairs = _written(rest) if rest else []
-    for number, (place, donor) in enumerate(pairs):
+    for number, (slot, donor) in enumerate(pairs):
         if not donor:
-            raise AwError(f"method {name!r}: write {host}@mask=METHOD; places are {', '.join(PLACES)}")
-        if place not in PLACES:
-            raise unknown(f"place in {name!r}", place, PLACES)
-        if place in dict(pairs[:number]):
-            raise AwError(f"method {name!r}: the {place} is given twice")
+            raise AwError(f"method {name!r}: write {host}@mask=METHOD; slots are {', '.join(SLOTS)}")
+        if slot not in SLOTS:
+            raise unknown(f"slot in {name!r}", slot, SLOTS)
+        if slot in dict(pairs[:number]):
+            raise AwError(f"method {name!r}: the {slot} is given twice")
     return pairs
 
 
 def _written(rest: str) -> list[tuple[str, str]]:
-    """Split `mask=refinesplat,density=truth` into (place, donor); the donor is empty without a `=`."""
+    """Split `mask=refinesplat,density=truth` into (slot, donor); the donor is empty without a `=`."""
     parts = [text.partition("=") for text in rest.split(",")]
-    return [(place.strip(), donor.strip()) for place, _, donor in parts]
+    return [(slot.strip(), donor.strip()) for slot, _, donor in parts]
 
 
-def _donor(place: str, name: str, methods: Mapping[str, MethodEntry]) -> MethodEntry:
+def _donor(slot: str, name: str, methods: Mapping[str, MethodEntry]) -> MethodEntry:
     target = ALIASES.get(name, name)
     if is_program(name) or (target in methods and methods[target].program is not None):
         raise AwError(
-            f"{place}={name}: {name} is trained by another program, which has no parts for other methods; "
+            f"{slot}={name}: {name} is trained by another program, which has no parts for other methods; "
             "name a method of 'aw methods'"
         )
     if "@" in target or target not in methods:
-        raise unknown(f"{place} donor", name, [*methods, *ALIASES], "'aw methods' lists them")
+        raise unknown(f"{slot} donor", name, [*methods, *ALIASES], "'aw methods' lists them")
     return methods[target]

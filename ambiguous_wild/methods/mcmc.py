@@ -105,7 +105,7 @@ class McmcDensity(DensityControl):
         dead = (torch.sigmoid(gaussians.opacity_logits) <= self.config.dead_opacity) & mutable
         if 0 < (count := int(dead.sum())) < int(mutable.sum()):
             sources = self._draw(gaussians, optimiser, ~dead & mutable, count)
-            for _, tensor in gaussians.rows():
+            for _, tensor in gaussians.named_tensors():
                 tensor[dead] = tensor[sources]
             gaussians.means[dead] += self._offsets(gaussians.select(sources))
         most = min(len(gaussians) // 20, self.room(step, gaussians))

@@ -215,7 +215,7 @@ class Doubt(EffectMask, CountingMask, WarmUpMask):
     def _seen(self, step: Step) -> Any:
         """Return the rows that may be in the picture, see `Backend.rows`."""
         g = step.gaussians
-        return backend_of(g.device).rows(lambda: in_picture(g.means, step.camera, margin=0.5))
+        return backend_of(g.device).visible_rows(lambda: in_picture(g.means, step.camera, margin=0.5))
 
     def facts(self) -> Facts:
         return super().facts() | {"features": self.distance.name}

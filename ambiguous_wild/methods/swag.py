@@ -225,7 +225,7 @@ class GatedColours(Learnt):
         if context.view is None:
             return {"opacity_logits": torch.where(self._transient(gaussians, leaf, context), CLOSED, logits)}
         means = gaussians.means.detach()
-        seen: Any = backend_of(logits.device).rows(lambda: in_picture(means, context.camera))
+        seen: Any = backend_of(logits.device).visible_rows(lambda: in_picture(means, context.camera))
         colours = gaussians.sh0[seen] * SH_C0 + 0.5
         a = self._net(self.encoded(gaussians.means[seen], leaf), colours, leaf)[:, 3]
         u = hashed_uniform(len(logits), (self.seed, context.iteration, 0x5A), logits.device)[seen]

@@ -144,8 +144,8 @@ def _chosen(method: str) -> list[tuple[str, str, str]]:
     from ambiguous_wild.methods.registry import get_method
 
     try:
-        places = get_method(method).places
-        return sorted((p, member, k) for p, member in places for k in get_method(member).by_machine())
+        slots = get_method(method).slots
+        return sorted((p, member, k) for p, member in slots for k in get_method(member).by_machine())
     except (AwError, ImportError):
         return []
 

@@ -118,7 +118,7 @@ class Backend:
         """Return the number in a 0-d tensor; on a GPU a float64 tensor that `float(...)` reads later."""
         return float(value.detach())
 
-    def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
+    def visible_rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
         """Return rows [M] int64 where `visible()` [N] bool holds; on a GPU all, or the host would wait."""
         return torch.nonzero(visible()).squeeze(1)
 

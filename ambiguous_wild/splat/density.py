@@ -238,7 +238,7 @@ class DensityControl:
 
     def room(self, step: Step, gaussians: Gaussians) -> int:
         """Return how many Gaussians may be added now."""
-        return max(step.ceiling - len(gaussians), 0)
+        return max(step.growth_cap - len(gaussians), 0)
 
     def small(self, gaussians: Gaussians) -> Tensor:
         """Return which Gaussians are small enough to be cloned, [N] bool; growth splits the others."""

@@ -132,7 +132,7 @@ class SceneRenderer:
             seen = replace(
                 step,
                 gaussians=field.gaussians,
-                ceiling=step.ceiling if most is None else most,
+                growth_cap=step.growth_cap if most is None else most,
                 rendered=rendered,
             )
             field.learn(own, progress, skip_step)

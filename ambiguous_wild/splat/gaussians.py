@@ -102,12 +102,12 @@ class Gaussians:
         for name in PARAMETERS:
             yield name, getattr(self, name)
 
-    def rows(self) -> Iterator[tuple[str, Tensor]]:
+    def named_tensors(self) -> Iterator[tuple[str, Tensor]]:
         """Yield name and tensor of everything that a Gaussian has: `items`, then `attributes`."""
         yield from self.items()
         yield from self.attributes.items()
 
-    def settle(self) -> None:
+    def flush(self) -> None:
         """Make the updates that an optimiser has pending, so that `sh_rest` may be read."""
         if self.pending_steps is not None:
             self.pending_steps.make()
@@ -137,8 +137,8 @@ class Gaussians:
         if self.attributes.keys() != other.attributes.keys():
             differing = ", ".join(sorted(self.attributes.keys() ^ other.attributes.keys()))
             raise AwError(f"cannot join Gaussians: only one side has the attributes {differing}")
-        other.settle()
-        theirs = dict(other.rows())
+        other.flush()
+        theirs = dict(other.named_tensors())
         return self._each(lambda name, tensor: torch.cat([tensor, theirs[name]]).contiguous())
 
     def to(self, device: torch.device | str) -> Gaussians:
@@ -154,7 +154,7 @@ class Gaussians:
         return replace(self, attributes={**self.attributes, **attributes})
 
     def _each(self, change: Callable[[str, Tensor], Tensor]) -> Gaussians:
-        self.settle()
+        self.flush()
         changed = [change(name, tensor) for name, tensor in self.items()]
         attributes = {name: change(name, tensor) for name, tensor in self.attributes.items()}
         shared = changed[-1] is self.sh_rest  # it lay on that device already: no copy was made

@@ -36,7 +36,7 @@ class SplatAdam:
     def __init__(
         self,
         gaussians: Gaussians,
-        # rates by name in Gaussians.rows(); an attribute without a rate is not learnt
+        # rates by name in Gaussians.named_tensors(); an attribute without a rate is not learnt
         learning_rates: Mapping[str, float],
         *,
         lazy: bool = True,  # False steps every row of sh_rest at once: the same bits, more memory traffic
@@ -46,7 +46,7 @@ class SplatAdam:
         self._rates: dict[str, float] = {}
         self._moments = {
             name: (torch.zeros_like(tensor), torch.zeros_like(tensor))
-            for name, tensor in gaussians.rows()
+            for name, tensor in gaussians.named_tensors()
             if name in PARAMETERS or name in learning_rates
         }
         self._lazy = lazy and self._backend.kernels
@@ -204,7 +204,7 @@ class SplatAdam:
         self._taken = np.full(self._rows, self.steps if self._lazy else 0, np.int64)
 
     def _learnt(self, gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
-        return ((name, tensor) for name, tensor in gaussians.rows() if name in self._moments)
+        return ((name, tensor) for name, tensor in gaussians.named_tensors() if name in self._moments)
 
     def _set_rates(self, rates: Mapping[str, float]) -> None:
         for name in rates:

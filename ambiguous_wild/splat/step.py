@@ -93,7 +93,7 @@ class Step(ViewContext):
 
     view: int
     photo: Tensor
-    ceiling: int  # growth stops at this many Gaussians now (count schedule)
+    growth_cap: int  # growth stops at this many Gaussians now (count schedule)
     rendered: Rendered
     gaussians: Gaussians
     drawer: Drawer | None = field(default=None, repr=False)

@@ -296,7 +296,7 @@ class Trainer:
         of_context = {f.name: getattr(context, f.name) for f in fields(ViewContext)}
         return Step(
             **of_context,
-            ceiling=self.pace.ceiling(downsampling, progress),
+            growth_cap=self.pace.ceiling(downsampling, progress),
             rendered=rendered,
             gaussians=self.gaussians,
             drawer=self.drawing.again,

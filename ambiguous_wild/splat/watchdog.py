@@ -125,7 +125,7 @@ class Watchdog:
 
     def check_parameters(self, iteration: int, view: int, gaussians: Gaussians) -> None:
         """Raise NonFinite if a parameter is not finite."""
-        named = dict(gaussians.rows())
+        named = dict(gaussians.named_tensors())
         if not _finite(named):
             bad = _bad_rows(named)
             if bad:

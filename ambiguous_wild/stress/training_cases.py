@@ -100,7 +100,7 @@ def _one_round(g: Gaussians, screen: torch.Tensor, ceiling: int, **config: Any) 
     step: Any = SimpleNamespace(
         iteration=600,
         nominal=600.0,
-        ceiling=ceiling,
+        growth_cap=ceiling,
         gaussians=g,
         camera=SimpleNamespace(width=2, height=2),
         rendered=SimpleNamespace(visible=torch.ones(len(g), dtype=torch.bool)),

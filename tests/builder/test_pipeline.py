@@ -112,7 +112,7 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
     ]  # fmt: skip
     assert list(info["cameras"][0]) == ["photos", "focal_px", "focal_sd_px"]
     assert list(info["photos"]["p01.png"]) == [
-        "source", "sha256", "split", "width", "height", "blur", "mean_luma", "features", "partners",
+        "source", "sha256", "split", "width", "height", "sharpness", "mean_luma", "features", "partners",
         "provisional", "notes", "exif",
     ]  # fmt: skip
 

@@ -318,7 +318,7 @@ def test_growth_waits_after_a_reset():
     density.views_seen += 1
     density.last_reset = 1000
     for iteration, count in ((1106, 0), (1107, 10)):
-        growth = density.choose(SimpleNamespace(iteration=iteration, ceiling=100), g)
+        growth = density.choose(SimpleNamespace(iteration=iteration, growth_cap=100), g)
         assert len(growth.clones) + len(growth.splits) == count
 
 

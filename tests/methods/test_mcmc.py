@@ -32,7 +32,7 @@ def one_round(g, config=ROUND, ceiling=1000, iteration=1):
         for moment in moments:
             moment.fill_(1.0)
     density = McmcDensity(config, extent=1.0, seed=0)
-    step = SimpleNamespace(iteration=iteration, nominal=float(iteration), gaussians=g, ceiling=ceiling)
+    step = SimpleNamespace(iteration=iteration, nominal=float(iteration), gaussians=g, growth_cap=ceiling)
     new, events = density.refine(step, g, adam)
     adam.bind(new)
     return new, events, adam
@@ -68,7 +68,7 @@ def test_the_dead_move_and_the_number_grows_by_a_share():
     assert bool((tag >= 5).all())  # nobody is a copy of a dead one
     for row in range(5):
         twin = int(tag[row])
-        for name, tensor in new.rows():
+        for name, tensor in new.named_tensors():
             assert torch.equal(tensor[row], tensor[twin]), name
     moved = tag.unique(return_counts=True)
     sources = moved[0][moved[1] > 1].long()
@@ -144,7 +144,7 @@ def test_noise_has_the_covariance_of_its_gaussian_and_spares_opaque_ones():
     g.opacity_logits[2000:] = 1.0
     density = McmcDensity(McmcConfig(start=1e9, stop=2e9, noise=10.0), 1.0, 0)
     adam = SplatAdam(g, dict.fromkeys(NAMES[:-1], 0.02))
-    density.refine(SimpleNamespace(iteration=1, nominal=1.0, gaussians=g, ceiling=1), g, adam)
+    density.refine(SimpleNamespace(iteration=1, nominal=1.0, gaussians=g, growth_cap=1), g, adam)
     # at 0.005 the gate is 1/2: deviations 0.5 * 10 * 0.02 * scale^2
     assert g.means[:2000].std(dim=0).tolist() == pytest.approx([0.1, 0.4, 0.025], rel=0.06)
     assert float(g.means[2000:].abs().max()) < 1e-12

@@ -65,7 +65,7 @@ def test_matched_growth_takes_as_many_by_the_absolute_gradient():
     density.views_seen += 2
     density.grad_sum[:10] = 4.0  # 2 on average: a tenth of all is above the threshold
     density.abs_sum += 2 * absolute
-    growth = density.choose(SimpleNamespace(ceiling=1000), g)
+    growth = density.choose(SimpleNamespace(growth_cap=1000), g)
     rows = torch.cat([growth.clones, growth.splits]).sort().values.tolist()
     assert rows == [*range(10), *range(90, 100)]
 

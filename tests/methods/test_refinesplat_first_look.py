@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig, first_look
+from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig, initial_mask_prior
 from ambiguous_wild.vision.sparse_surface import static_surfaces
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -48,7 +48,7 @@ def looks(photos, config=None, cloud=None, moving=None):
     cameras = [camera(view) for view in range(VIEWS)]
     surfaces = static_surfaces(cameras, points() if cloud is None else cloud)
     moves = None if moving is None else [np.full(surface.shape, moving, np.float32) for surface in surfaces]
-    return first_look(cameras, photos, surfaces, config or JUDGE_ALL, moves)
+    return initial_mask_prior(cameras, photos, surfaces, config or JUDGE_ALL, moves)
 
 
 def keeps(photos, config=None, cloud=None):
@@ -262,10 +262,10 @@ def test_photos_without_a_surface_and_of_other_sizes_are_no_trouble():
     cameras[2] = cameras[2].resized(WIDTH // 2, HEIGHT // 2)
     photos[2] = photos[2][::2, ::2]
     surfaces[2] = surfaces[2][::2, ::2]
-    found = first_look(cameras, photos, surfaces, JUDGE_ALL)
+    found = initial_mask_prior(cameras, photos, surfaces, JUDGE_ALL)
     assert found[0] is None and found[1] is None
     assert all(np.isfinite(look.passing).all() for look in found[2:])
     assert share_of(found[2].keep((HEIGHT // 2, WIDTH // 2)), masks[2][::2, ::2]) > 0.8
     for few in (1, 2):
         these = slice(3, 3 + few)
-        assert len(first_look(cameras[these], photos[these], surfaces[these], JUDGE_ALL)) == few
+        assert len(initial_mask_prior(cameras[these], photos[these], surfaces[these], JUDGE_ALL)) == few

@@ -103,7 +103,7 @@ def step_of(
         nominal=20.0 * iteration,
         view=view,
         downsampling=downsampling,
-        ceiling=1000,
+        growth_cap=1000,
         photo=data.photos[view],
         camera=data.cameras[view],
         rendered=SimpleNamespace(  # type: ignore[arg-type]

@@ -89,7 +89,7 @@ def refined(control, gaussians, iterations, keep):
         step = SimpleNamespace(
             iteration=iteration,
             nominal=100.0,
-            ceiling=len(gaussians),
+            growth_cap=len(gaussians),
             gaussians=gaussians,
             camera=CAMERA,
             rendered=SimpleNamespace(visible=visible),
@@ -147,7 +147,7 @@ def test_growth_goes_first_and_the_judgement_follows():
         step = SimpleNamespace(
             iteration=iteration,
             nominal=100.0 * iteration,
-            ceiling=100,
+            growth_cap=100,
             gaussians=gaussians,
             camera=CAMERA,
             rendered=SimpleNamespace(visible=torch.ones(len(gaussians), dtype=torch.bool)),

@@ -36,7 +36,7 @@ def step_at(gaussians, iteration, nominal, *, ceiling=1000, visible=None, width=
     return SimpleNamespace(
         iteration=iteration,
         nominal=nominal,
-        ceiling=ceiling,
+        growth_cap=ceiling,
         gaussians=gaussians,
         camera=SimpleNamespace(width=width, height=height),
         rendered=SimpleNamespace(visible=visible),

@@ -116,7 +116,7 @@ def test_a_photo_that_was_not_trained_on(scene, tmp_path):
     rows = effect._adam["tint"].values
     assert torch.equal(effect._leaf(neutral)["tint"], rows[:-1].mean(dim=0))
     shared = {name: adam.values[: effect.photos].clone() for name, adam in effect._adam.items()}
-    before = {name: tensor.clone() for name, tensor in trainer.gaussians.rows()}
+    before = {name: tensor.clone() for name, tensor in trainer.gaussians.named_tensors()}
     photo = (trainer.render(seen).image * torch.tensor([1.3, 1.0, 0.7])).clamp(0, 1).detach()
     left = torch.zeros(photo.shape[:2])
     left[:, :32] = 1.0
@@ -128,7 +128,7 @@ def test_a_photo_that_was_not_trained_on(scene, tmp_path):
     ]
     assert error[0] < 0.7 * error[1]
     assert all(torch.equal(adam.values[: effect.photos], shared[name]) for name, adam in effect._adam.items())
-    assert all(torch.equal(tensor, before[name]) for name, tensor in trainer.gaussians.rows())
+    assert all(torch.equal(tensor, before[name]) for name, tensor in trainer.gaussians.named_tensors())
 
 
 def test_names_are_told_apart(scene, tmp_path):

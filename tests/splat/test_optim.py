@@ -145,7 +145,7 @@ def test_copies_are_up_to_date_and_belong_to_no_optimiser(copied):
     copy = copied(lazy)
     assert equal(copy, dense) and copy.pending_steps is None
     a.step(*gradients_at(lazy, 12))
-    copy.settle()
+    copy.flush()
     assert equal(copy, dense)
 
 
@@ -160,10 +160,10 @@ def test_gaussians_that_were_left_behind_ask_for_no_more_updates():
     for step in (12, 13):
         a.step(*gradients_at(fewer, step))
     put_off = fewer.sh_rest.clone()
-    shared.settle()
+    shared.flush()
     render_cpu(shared, camera())
     assert equal(shared, dense) and torch.equal(fewer.sh_rest, put_off)
-    fewer.settle()
+    fewer.flush()
     assert not torch.equal(fewer.sh_rest, put_off)  # otherwise nothing was put off
 
 

@@ -68,11 +68,11 @@ class Support:
             keep: [H, W] float32 at the camera's size, 1 = static; None = 1 everywhere.
         """
         backend = backend_of(gaussians.device)
-        rows = backend.rows(lambda: visible)
+        rows = backend.visible_rows(lambda: visible)
         means = gaussians.means[rows]
         inside, supported = _on_kept(means, camera, keep)
         if keep is not None:
-            hidden = backend.rows(lambda: inside & ~supported)
+            hidden = backend.visible_rows(lambda: inside & ~supported)
             # a large Gaussian may be supported at its flanks
             parts = means[hidden], gaussians.quats[rows][hidden], gaussians.log_scales[rows][hidden]
             supported[hidden] |= _flank_on_kept(*parts, camera, keep)

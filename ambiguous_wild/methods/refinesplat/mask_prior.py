@@ -105,7 +105,7 @@ class InitialMaskPrior:
         return np.power(np.float32(self.weight), 2.0 * _resized(self.passing, shape) - 1.0)
 
 
-def first_look(
+def initial_mask_prior(
     cameras: Sequence[Camera],
     photos: Iterable[np.ndarray],
     surfaces: Sequence[np.ndarray | None],

@@ -252,7 +252,7 @@ class OtherViews:
             offset: offset of colours from the first answers; from these pixels alone, a car could look like
                 exposure.
         """
-        rows = backend_of(few.device).rows(lambda: few & depth.isfinite())
+        rows = backend_of(few.device).visible_rows(lambda: few & depth.isfinite())
         other, difference = self._look_up(points, rows, depth[rows], sparse=True)
         if difference is not None and offset is not None:
             other = replace(other, agree=agree(difference, other.same, self.config.agree, offset))

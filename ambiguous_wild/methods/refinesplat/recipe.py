@@ -25,7 +25,7 @@ from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensi
 from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, silence
 from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
-from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior, first_look, masked_share
+from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior, initial_mask_prior, masked_share
 from ambiguous_wild.methods.refinesplat.masks import MaskStore
 from ambiguous_wild.methods.refinesplat.threshold import Variant
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
@@ -137,7 +137,7 @@ class RefineSplatMask(PausingMask):
         if config.first_look.on:
             moving = self._moving(surfaces) if config.first_look.motion > 0 else None
             photos = (photo.cpu().numpy() for photo in data.photos)  # one at a time: all may not fit
-            looks = first_look(data.cameras, photos, surfaces, config.first_look, moving)
+            looks = initial_mask_prior(data.cameras, photos, surfaces, config.first_look, moving)
             self.looks = {view: look for view, look in enumerate(looks) if look is not None}
         labels, static = self.inputs.labels, self.inputs.static
         self.masks = MaskStore(config, data, surfaces, self.looks, labels, static, self.compare)

@@ -128,7 +128,7 @@ class Learnt(Effect):
 
     def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
         leaf = self._leaf(context)
-        given = {name: tensor.detach().clone() for name, tensor in gaussians.rows()}
+        given = {name: tensor.detach().clone() for name, tensor in gaussians.named_tensors()}
         graph = _Graph(leaf, given)
         with torch.enable_grad():
             attributes = {name: given[name] for name in gaussians.attributes}

@@ -99,7 +99,7 @@ def left_gradient(gaussians: Gaussians, camera: Camera, gradients: Gradients) ->
         camera: camera that was rendered.
         gradients: gradients of that render; Gaussians without a gradient add nothing.
     """
-    rows = backend_of(gaussians.device).rows(
+    rows = backend_of(gaussians.device).visible_rows(
         lambda: (gradients.means.abs().sum(dim=1) + gradients.quats.abs().sum(dim=1)) > 0
     )
     means, d_means = gaussians.means[rows].double(), gradients.means[rows].double()

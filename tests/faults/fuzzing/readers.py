@@ -25,6 +25,7 @@ from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io import archive, images, scene_folder
 from ambiguous_wild.io.photos import read_photo
 from ambiguous_wild.io.splat_files import FORMATS, read_splats
+from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.report import board, board_pictures
 from ambiguous_wild.report.audit_numbers import read_tables
 from ambiguous_wild.simulate import capture_writer, spec_file
@@ -86,7 +87,8 @@ def _config(path: Path) -> None:
     (run / "checkpoint").mkdir(exist_ok=True)
     shutil.copyfile(path, run / "config.yaml")
     read_runs(run.parent)
-    refuse_other_config(run, SimpleNamespace(identity="h", config={"method": "3dgs", "train": {}}))  # type: ignore[arg-type]
+    cell = SimpleNamespace(identity="h", config={"method": "3dgs", "train": {}}, method=get_method("3dgs"))
+    refuse_other_config(run, cell)  # type: ignore[arg-type]
 
 
 def _scene_json(path: Path) -> None:

@@ -39,8 +39,8 @@ WAYS = ("auto", "thorough", "colmap", "colmap-global")
 KINDS = ("cutouts", "patches")
 ROTATION_DEG, POSITION_PERCENT = 1.0, 5.0  # a pose is right if both errors are below
 POSITION_M = 20.0  # the same by GPS, whose own error is several metres in a street
-MOST_TRIPLES = 2000  # of photos, to which the similarity is fitted
-LEAST_COMPOSITE = 6  # photos: `aw composite` refuses fewer
+MAX_TRIPLES = 2000  # of photos, to which the similarity is fitted
+MIN_COMPOSITE = 6  # photos: `aw composite` refuses fewer
 COLMAP = """
 import os, sys, zlib, pycolmap
 photos, out, mapper, seed = sys.argv[1:]
@@ -100,7 +100,7 @@ def compare(estimated: Poses, truth: Poses) -> dict[str, Any]:
     inliers = [n for n in names if rotation_deg[n] <= ROTATION_DEG]
     inliers = inliers if len(inliers) >= 3 else list(names)
     triples = list(itertools.combinations(inliers, 3))
-    chosen = np.random.default_rng(0).permutation(len(triples))[:MOST_TRIPLES]
+    chosen = np.random.default_rng(0).permutation(len(triples))[:MAX_TRIPLES]
     position_percent, right = {}, -1
     for fitted in (inliers, *(triples[k] for k in chosen)):
         for _ in range(2):  # then to those that are right under it
@@ -218,7 +218,7 @@ def capture_of(
     photos = args.out / "photos" / f"{name}{thin}"
     if not photos.is_dir():
         _copy_every(source, photos, every)
-    if kind != "clean" and len(_photos(photos)) < LEAST_COMPOSITE:
+    if kind != "clean" and len(_photos(photos)) < MIN_COMPOSITE:
         return None
     if kind == "clean":
         raw = raw if raw.is_dir() else Path(shutil.copytree(photos, raw))

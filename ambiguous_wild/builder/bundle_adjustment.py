@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.builder.retrieval import FEW
+from ambiguous_wild.builder.retrieval import FEW_PHOTOS
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 DISTORTIONS = -0.5, 0.3  # k of SIMPLE_RADIAL, from an action camera to more than any pincushion
 # Triangulation angle that a tenth of the points must have: 1.8 where a camera only turned, 12 where not.
-LEAST_ANGLE_DEG = 2.0
-MOST_ANGLES = 1000  # points of which it is computed
+MIN_ANGLE_DEG = 2.0
+MAX_ANGLES = 1000  # points of which it is computed
 
 
 def pipeline_options(seed: int) -> Any:
@@ -35,12 +35,12 @@ def shows_depth(model: Any) -> bool:
     centres = {k: model.images[k].projection_center() for k in model.reg_image_ids()}
     points = list(model.points3D.values())
     angles = []
-    for point in points[:: len(points) // MOST_ANGLES + 1]:
+    for point in points[:: len(points) // MAX_ANGLES + 1]:
         seen_from = np.array([centres[e.image_id] for e in point.track.elements if e.image_id in centres])
         rays = seen_from - point.xyz
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
-    return bool(angles) and float(np.percentile(angles, 90)) >= LEAST_ANGLE_DEG
+    return bool(angles) and float(np.percentile(angles, 90)) >= MIN_ANGLE_DEG
 
 
 def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
@@ -53,7 +53,7 @@ def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
     options.ceres.solver_options.max_num_iterations = 50 if final else 10
     options.ceres.solver_options.function_tolerance = 1e-6 if final else 1e-4
     options.ceres.min_num_residuals_for_cpu_multi_threading = 10**9
-    if photos > FEW:
+    if photos > FEW_PHOTOS:
         options.ceres.auto_select_solver_type = False
         solver: Any = options.ceres.solver_options  # its enumerations take names
         solver.linear_solver_type, solver.preconditioner_type = "ITERATIVE_SCHUR", "SCHUR_JACOBI"

@@ -27,7 +27,7 @@ from ambiguous_wild.builder.records import MappingResult
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.colmap_records import ColmapModel
 
-MOST_POINTS = 5000  # of the backdrop
+MAX_POINTS = 5000  # of the backdrop
 STRONGEST = 4  # links drawn of each photo, besides the weak ones
 LONGEST_NAME = 14  # characters
 DOWN = 0.8  # share of the mean viewing direction along the normal of a plane from which on cameras face it
@@ -136,8 +136,8 @@ def map_of_model(
         result.listed.append(f"another part, {len(members)} photos: {named}")
         result.advice.insert(0, f"take a photo that shows both {pair[0]} and {pair[1]}, to join the parts")
     result = _with_left_out(result, left_out, mapping, shown, at, plane, size)
-    points = model.points.xyz[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
-    colours = model.points.rgb[:: max(1, -(-len(model.points.xyz) // MOST_POINTS))]
+    points = model.points.xyz[:: max(1, -(-len(model.points.xyz) // MAX_POINTS))]
+    colours = model.points.rgb[:: max(1, -(-len(model.points.xyz) // MAX_POINTS))]
     return replace(
         result, points=points @ plane.T, colours=colours, labels=short_labels(list(shown.values()))
     )

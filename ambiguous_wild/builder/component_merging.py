@@ -14,15 +14,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambiguous_wild.builder.matched import Matched, PointLookup
-from ambiguous_wild.builder.registration import ALIKE_DEG, INLIER_RATIO, LEAST_PHOTOS, Registration, centre_of
+from ambiguous_wild.builder.registration import (
+    ALIKE_DEG,
+    INLIER_RATIO,
+    MIN_MODEL_PHOTOS,
+    Registration,
+    centre_of,
+)
 from ambiguous_wild.builder.relative_poses import Pair, trace_of
 
-LEAST_MERGE_PAIRS = 2  # pairs across two components that must support the merge; they involve one more photo
+MIN_MERGE_PAIRS = 2  # pairs across two components that must support the merge; they involve one more photo
 # Smallest singular value of the equations for scale and shift, relative to the largest: along a straight path
 # every scale fits.
-LEAST_CONDITION = 0.02
-MOST_PAIRS = 200  # pairs across two components that are used, those with most matches
-LEAST_DEPTHS = 8  # features of a photo with a depth in both components, for the scale
+MIN_CONDITION = 0.02
+MAX_PAIRS = 200  # pairs across two components that are used, those with most matches
+MIN_DEPTHS = 8  # features of a photo with a depth in both components, for the scale
 ROUGHLY = 4.0  # inliers lie within this many times the usual distance: the merge is not adjusted yet
 # Pairs that agree on another rotation, relative to those that support the merge, from which on it is refused.
 COMPETING_PAIRS = 0.5
@@ -45,7 +51,7 @@ class Similarity:
 def merge(first: Registration, second: Registration) -> bool:
     """Add the photos of the second component if enough pairs support it; the first must then run again."""
     added = {photo: pose for photo, pose in second.poses.items() if photo not in first.poses}
-    if not added or min(len(first.poses), len(second.poses)) < LEAST_PHOTOS:
+    if not added or min(len(first.poses), len(second.poses)) < MIN_MODEL_PHOTOS:
         return False
     rotations = _rotations(first, second)
     alike = _alike(rotations)
@@ -56,7 +62,7 @@ def merge(first: Registration, second: Registration) -> bool:
         moved = {photo: similarity.moved(pose) for photo, pose in added.items()}
         support = _supporting_pairs(first, moved)
         photos = {photo for pair in support for photo in pair}
-        if len(support) < LEAST_MERGE_PAIRS or len(photos) <= LEAST_MERGE_PAIRS:
+        if len(support) < MIN_MERGE_PAIRS or len(photos) <= MIN_MERGE_PAIRS:
             continue
         if best is not None and len(support) <= best[0]:
             continue
@@ -96,7 +102,7 @@ def _rotations(first: Registration, second: Registration) -> list[Across]:
     of_pairs = first.matched.relative_poses.items()
     strongest = sorted(of_pairs, key=lambda item: -sum(len(relative.matches) for relative in item[1]))
     for pair, relative_poses in strongest:
-        if len({row.pair for row in rows}) >= MOST_PAIRS:
+        if len({row.pair for row in rows}) >= MAX_PAIRS:
             break
         for here, there in (pair, pair[::-1]):
             if here not in first.poses or there not in second.poses or {here, there} <= first.poses.keys():
@@ -140,7 +146,7 @@ def _by_pairs(
     for which in same:
         alike = [row for row, use in zip(across, which) if use]
         ends = frozenset((row.here, row.there) for row in alike)
-        if len(ends) < LEAST_MERGE_PAIRS or ends in known:
+        if len(ends) < MIN_MERGE_PAIRS or ends in known:
             continue
         known.add(ends)
         left, _, right = np.linalg.svd(sum(row.rotation for row in alike))
@@ -154,7 +160,7 @@ def _by_pairs(
         system = np.concatenate(rows) * [1 / second.radius, 1.0, 1.0, 1.0]
         scale, *shift = np.linalg.lstsq(system, np.concatenate(values), rcond=None)[0]
         singular_values = np.linalg.svd(system, compute_uv=False)
-        if scale > 0 and singular_values[-1] > LEAST_CONDITION * singular_values[0]:
+        if scale > 0 and singular_values[-1] > MIN_CONDITION * singular_values[0]:
             yield Similarity(float(scale) / second.radius, rotation, np.array(shift))
 
 
@@ -168,7 +174,7 @@ def _by_photos(first: Registration, second: Registration) -> Iterator[Similarity
         for pose, near in zip(mine, depths[0]):
             for other, far in zip(theirs, depths[1]):
                 both = sorted(near.keys() & far.keys())
-                if len(both) < LEAST_DEPTHS:
+                if len(both) < MIN_DEPTHS:
                     continue
                 scale = float(np.median([near[k] / far[k] for k in both]))
                 rotation = pose[:, :3].T @ other[:, :3]

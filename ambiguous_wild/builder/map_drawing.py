@@ -31,7 +31,7 @@ from ambiguous_wild.io.scene_folder import MAP
 SOFTWARE = "ambiguous_wild"  # text chunk `Software` of the file, followed by the version
 SIZE_PX, PANEL_PX, TITLE_PX = (1300, 860), 380, 40  # of the picture, its side panel and its title
 DPI = 100
-MOST_ADVICE, MOST_LISTED = 7, 8  # sentences at the side
+MAX_ADVICE, MAX_LISTED = 7, 8  # sentences at the side
 CORE = (10, 90)  # percentiles of the backdrop's positions that are shown if they fit
 MARGIN = 0.08  # of the map's size
 FONT_PX, NAME_PX = 12.0, 11.0
@@ -274,7 +274,7 @@ def _draw_names(
 ) -> None:
     from matplotlib.patheffects import withStroke
 
-    photos, advice = drawn.photos, drawn.advice[:MOST_ADVICE]
+    photos, advice = drawn.photos, drawn.advice[:MAX_ADVICE]
     named = {name for text in advice for name in _names_in(drawn, text)}
 
     def urgency(k: int) -> tuple[bool, bool, bool, int]:
@@ -303,8 +303,8 @@ def _draw_panel(axes: Any, drawn: CaptureMap) -> None:
         axes.text(46, top, text, fontsize=_points(FONT_PX), va="top")
         top -= 1.25 * line
     for heading, sentences, most in (
-        ("Take more photos (star)" if drawn.stars else "Take more photos", drawn.advice, MOST_ADVICE),
-        ("Not placed", drawn.listed, MOST_LISTED),
+        ("Take more photos (star)" if drawn.stars else "Take more photos", drawn.advice, MAX_ADVICE),
+        ("Not placed", drawn.listed, MAX_LISTED),
     ):
         if not sentences:
             continue

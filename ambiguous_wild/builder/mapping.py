@@ -15,9 +15,9 @@ from ambiguous_wild.builder.bundle_adjustment import pipeline_options, plausible
 from ambiguous_wild.builder.component_merging import merge
 from ambiguous_wild.builder.matched import Matched, connected_photos
 from ambiguous_wild.builder.records import TURNED, ModelSummary, no_model
-from ambiguous_wild.builder.registration import LEAST_PHOTOS, Registration
-from ambiguous_wild.builder.retrieval import FEW, RELATIVE_POSES
-from ambiguous_wild.builder.settings import ENOUGH
+from ambiguous_wild.builder.registration import MIN_MODEL_PHOTOS, Registration
+from ambiguous_wild.builder.retrieval import FEW_PHOTOS, RELATIVE_POSES
+from ambiguous_wild.builder.settings import MIN_REGISTERED
 from ambiguous_wild.builder.sfm import MappingJob
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -66,9 +66,9 @@ def run_mapping(job: MappingJob) -> None:
         component.mark_provisional()
     reliable = len(components[0].poses.keys() - components[0].provisional) if components else 0
     why = "no pair of photos to start from"
-    if chosen is not None and len(chosen.poses) >= LEAST_PHOTOS and not shows_depth(chosen.model):
+    if chosen is not None and len(chosen.poses) >= MIN_MODEL_PHOTOS and not shows_depth(chosen.model):
         chosen, components, reliable, why = None, [], 0, TURNED
-    if chosen is None or len(chosen.poses) < LEAST_PHOTOS:
+    if chosen is None or len(chosen.poses) < MIN_MODEL_PHOTOS:
         left_out = dict.fromkeys(matched.names, why)
         left_out |= _left_out(components[0], components) if components else {}
         names = [_names(component, component.poses) for component in components if component.poses]
@@ -135,7 +135,7 @@ def _left_out(registration: Registration, components: Sequence[Registration]) ->
 
 def _explained(registration: Registration) -> int:
     """Count the observations of a model; 0 where it lost its photos, because its points are then outdated."""
-    enough = len(registration.poses) >= LEAST_PHOTOS
+    enough = len(registration.poses) >= MIN_MODEL_PHOTOS
     return int(registration.model.compute_num_observations()) if enough else 0
 
 
@@ -143,7 +143,7 @@ def _models(job: MappingJob, output: Path, matched: Matched, *, constant_focal: 
     """Return the models of COLMAP's mapper, and of the global one if it leaves photos out; largest first."""
     models: list[Any] = []
     connected = connected_photos(Path(job["database"]))
-    enough = connected if len(matched.ids) <= FEW else ENOUGH * connected
+    enough = connected if len(matched.ids) <= FEW_PHOTOS else MIN_REGISTERED * connected
     for mapper in dict.fromkeys((job["mapper"], "global")):
         run = _map_globally if mapper == "global" else _map_incrementally
         models += sorted(
@@ -157,7 +157,7 @@ def _models(job: MappingJob, output: Path, matched: Matched, *, constant_focal: 
             break
     # The global mapper may return negative focal lengths.
     models = [m for m in models if all(c.mean_focal_length() > 0 for c in m.cameras.values())]
-    return [model for model in models if model.num_reg_images() >= LEAST_PHOTOS]
+    return [model for model in models if model.num_reg_images() >= MIN_MODEL_PHOTOS]
 
 
 def _size(model: Any) -> tuple[int, int]:
@@ -205,7 +205,7 @@ def _register(job: MappingJob, database: Path, matched: Matched, models: Sequenc
             best.run()
     kept, registered = [best], set(best.poses)
     for other in others:
-        if len(other.poses.keys() - registered) >= LEAST_PHOTOS:
+        if len(other.poses.keys() - registered) >= MIN_MODEL_PHOTOS:
             kept.append(other)
             registered |= other.poses.keys()
     return kept
@@ -216,7 +216,7 @@ def _map_incrementally(
 ) -> dict[int, Any]:
     options = pipeline_options(job["seed"])
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not constant_focal
-    options.min_model_size = LEAST_PHOTOS
+    options.min_model_size = MIN_MODEL_PHOTOS
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
     options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
     options.ba_global_max_refinements = job["refinements"]
@@ -258,5 +258,5 @@ def _map_globally(job: MappingJob, output: Path, distorted: bool, constant_focal
     options.mapper.bundle_adjustment.refine_extra_params = distorted
     options.mapper.bundle_adjustment.refine_focal_length = not constant_focal
     adjustment.min_num_residuals_for_cpu_multi_threading = 10**9
-    options.min_model_size = LEAST_PHOTOS
+    options.min_model_size = MIN_MODEL_PHOTOS
     return pycolmap.global_mapping(job["database"], job["photos"], str(output), options=options)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ambiguous_wild.builder.overlap_graph import component_labels
 from ambiguous_wild.builder.relative_poses import (
-    LEAST,
+    MIN_INLIERS,
     Pair,
     RelativePose,
     consistent_relative_poses,
@@ -43,7 +43,7 @@ class Matched:
     names: list[str]
     cameras: list[Any]  # pycolmap.Camera of every photo
     features: list[np.ndarray]  # a photo each: [N, 2] px
-    matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with at least `LEAST`
+    matches: dict[Pair, np.ndarray]  # [K, 2] features of the pair's photos; pairs with at least `MIN_INLIERS`
     relative_poses: dict[Pair, list[RelativePose]] = field(default_factory=dict)
     distorted: bool = True  # whether the lens's distortion is estimated; else there is none
 
@@ -57,7 +57,7 @@ class Matched:
             at = {image.image_id: k for k, image in enumerate(images)}
             matches = {}
             for number, rows in zip(*db.read_all_matches()):
-                if len(rows) >= LEAST:
+                if len(rows) >= MIN_INLIERS:
                     first, second = pycolmap.pair_id_to_image_pair(number)
                     matches[at[first], at[second]] = np.asarray(rows)
             return cls(
@@ -131,7 +131,7 @@ class Matched:
         for a, b in self.matches:
             if a in poses and b in poses:
                 rows = np.flatnonzero(self.inliers((a, b), poses[a], poses[b], normalised))
-                if len(rows) >= LEAST:
+                if len(rows) >= MIN_INLIERS:
                     verified[a, b] = pose_between(poses[a], poses[b]), rows
         return verified
 

@@ -19,20 +19,20 @@ from scipy.spatial import cKDTree
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.builder.registration import INLIER_RATIO
-from ambiguous_wild.builder.relative_poses import LEAST
+from ambiguous_wild.builder.relative_poses import MIN_INLIERS
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 CLEARLY = 2.0  # a match moves if its epipolar error is this many times the largest of an inlier
-LEAST_CONSISTENT = 0.25  # share of the covisible photos that must be consistent with the pose of a photo
+MIN_CONSISTENT = 0.25  # share of the covisible photos that must be consistent with the pose of a photo
 # A point is seen through by comparing it with at most this many points around it, no farther away than this
 # share of the photo's longer side, which must be deeper by this factor.
 AROUND, THROUGH, BEHIND = 12, 0.02, 1.2
-LEAST_THROUGH = 2  # photos that must see through a point
+MIN_THROUGH = 2  # photos that must see through a point
 NEIGHBOURS = 0.05  # share of the longer side: points seen through that lie as near belong to one thing
-LEAST_OF_THING = 3  # points of one thing
+MIN_OF_THING = 3  # points of one thing
 
 
 @dataclass
@@ -74,7 +74,7 @@ def count_votes(
                 votes[b].static[inliers[:, 1]] += 1
             # A relative pose of static scene and distractor together also has outliers.
             moving = rows[found.matches[errors[found.matches] > CLEARLY]]
-            if len(moving) >= LEAST:
+            if len(moving) >= MIN_INLIERS:
                 for photo, features in ((a, moving[:, 0]), (b, moving[:, 1])):
                     votes[photo].moving[features] += 1
                     votes[photo].motions.append(features)
@@ -150,7 +150,7 @@ def motion_points(
         fx, fy, cx, cy = camera.pinhole()
         xy = (normalised[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
         # Only features that got votes and that undistortion leaves inside the photo are kept.
-        vote_counts = (votes.static + votes.moving) * (votes.consistent >= LEAST_CONSISTENT * votes.covisible)
+        vote_counts = (votes.static + votes.moving) * (votes.consistent >= MIN_CONSISTENT * votes.covisible)
         some = np.flatnonzero((vote_counts > 0) & ((xy >= 0) & (xy <= 1)).all(axis=1))
         # Features at one position that differ in orientation become one point: the one with most votes.
         some = some[np.argsort(-vote_counts[some], kind="stable")]
@@ -171,13 +171,13 @@ def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> 
         through: [N] photos that see through each, by `seen_through`; empty if the photo was not checked.
         reach: largest distance in px between neighbours of one thing.
     """
-    gone = np.flatnonzero(through >= LEAST_THROUGH)
+    gone = np.flatnonzero(through >= MIN_THROUGH)
     if not len(gone):
         return []
     links = cKDTree(features[gone]).query_pairs(reach, output_type="ndarray").T
     graph = coo_matrix((np.ones(links.shape[1]), links), (len(gone), len(gone)))
     group = connected_components(graph, directed=False)[1]
-    return [gone[group == k] for k in np.flatnonzero(np.bincount(group) >= LEAST_OF_THING)]
+    return [gone[group == k] for k in np.flatnonzero(np.bincount(group) >= MIN_OF_THING)]
 
 
 def write_motion(

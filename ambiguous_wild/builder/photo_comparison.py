@@ -23,10 +23,10 @@ from ambiguous_wild.core.srgb import srgb_to_linear
 SIDE = 800  # px, longer side at which photos are compared
 FEATURES = 2000  # with 1000, sparse captures look as if they fell apart: half of every third of monstree
 RATIO = 0.8  # Lowe's ratio test
-MIN_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
+MIN_OVERLAP_INLIERS = 16  # matches of one epipolar geometry for two photos to overlap
 # Fewer matches are enough if a third photo confirms some of them, by a feature that matches both. With 16
 # alone, a walk of 29 photos that COLMAP places whole seems to fall into 24 and 5.
-LEAST_MATCHES, CONFIRMED = 12, 2
+MIN_MATCHES, CONFIRMED = 12, 2
 # Candidates of each photo: the next photos, and those of the most similar coarse colours.
 NEXT_PHOTOS, SIMILAR_PHOTOS = 4, 8
 EXTRA_CANDIDATES = 60  # further candidates of a photo that overlaps with none or one of these
@@ -141,13 +141,13 @@ def compare_photos(
         if inliers is None:
             return
         matches[i, j] = inliers
-        if len(inliers[0]) < MIN_INLIERS:
+        if len(inliers[0]) < MIN_OVERLAP_INLIERS:
             return  # too few for the direction of motion and the settings
         graph[i, j] = graph[j, i] = True
         forward.append(is_forward(features[i].xy[inliers[0]], features[j].xy[inliers[1]], features[i].size))
         difference = features[i].values[inliers[0]] - features[j].values[inliers[1]]
         good = np.isfinite(difference).all(axis=1)
-        if good.sum() >= MIN_INLIERS // 2:
+        if good.sum() >= MIN_OVERLAP_INLIERS // 2:
             rows.append((i, j, np.median(difference[good], axis=0), float(np.sqrt(good.sum()))))
 
     def enter_all(pairs: Sequence[tuple[int, int]], raw: Mapping[tuple[int, int], np.ndarray]) -> None:
@@ -168,7 +168,7 @@ def compare_photos(
 
 
 def confirmed(matches: Matches) -> Matches:
-    """Leave out pairs with fewer than `MIN_INLIERS` matches of which no third photo confirms `CONFIRMED`."""
+    """Leave out pairs of fewer than `MIN_OVERLAP_INLIERS` matches that no third photo confirms."""
     matched_features: dict[
         int, dict[int, dict[int, int]]
     ] = {}  # photo -> other photo -> feature -> its feature
@@ -184,7 +184,7 @@ def confirmed(matches: Matches) -> Matches:
     sure: Matches = {}
     for (a, b), ends in matches.items():
         third = matched_features[a].keys() & matched_features[b].keys()
-        if len(ends[0]) >= MIN_INLIERS or any(confirms(c, a, b) for c in third):
+        if len(ends[0]) >= MIN_OVERLAP_INLIERS or any(confirms(c, a, b) for c in third):
             sure[a, b] = ends
     return sure
 
@@ -242,9 +242,9 @@ def _without(features: Sequence[PhotoFeatures], fixed: Sequence[FixedArea]) -> l
 def _raw_matches(
     features: Sequence[PhotoFeatures], pair: tuple[int, int]
 ) -> np.ndarray:  # [K, 2] features of the pair's photos
-    """Match two photos, without a check of the geometry; both need `LEAST_MATCHES` features."""
+    """Match two photos, without a check of the geometry; both need `MIN_MATCHES` features."""
     a, b = (features[k] for k in pair)
-    if min(len(a.xy), len(b.xy)) < LEAST_MATCHES:
+    if min(len(a.xy), len(b.xy)) < MIN_MATCHES:
         return np.zeros((0, 2), int)
     return np.column_stack(_ratio_matches(a.descriptors, b.descriptors))
 
@@ -275,11 +275,11 @@ def _match(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the indices of matching features in each photo; None where they are too few."""
     (a, b), (one, two) = (features[k] for k in pair), matches.T
-    if len(one) < LEAST_MATCHES:
+    if len(one) < MIN_MATCHES:
         return None
     cv2.setRNGSeed(0)
     _, inlier = cv2.findFundamentalMat(a.xy[one], b.xy[two], cv2.FM_RANSAC, 2.0, 0.99, 500)
-    if inlier is None or int(inlier.sum()) < LEAST_MATCHES:
+    if inlier is None or int(inlier.sum()) < MIN_MATCHES:
         return None
     keep = inlier.ravel() > 0
     return one[keep], two[keep]

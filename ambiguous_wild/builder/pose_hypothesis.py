@@ -9,14 +9,14 @@ import numpy as np
 
 from ambiguous_wild.builder.relative_poses import Pair
 
-LEAST_SUPPORT = 2  # covisible photos that must support a photo's pose
-LEAST_SUPPORT_NEW = 3  # the same for a photo that is not registered yet, if inliers cover under `AREA_NEW`
+MIN_SUPPORT = 2  # covisible photos that must support a photo's pose
+MIN_SUPPORT_NEW = 3  # the same for a photo that is not registered yet, if inliers cover under `AREA_NEW`
 COMPETING_WEIGHT = 0.7  # relative weight of a competing hypothesis from which on neither is accepted
-LEAST_AREA = 0.2  # share of a photo that inliers must cover: what is smaller may be a distractor
+MIN_AREA = 0.2  # share of a photo that inliers must cover: what is smaller may be a distractor
 # The same if all registered photos that share a relative pose with it support the hypothesis, and the least
 # coverage of the inliers, relative to as many features drawn at random: those of a distractor are clustered.
 LITTLE_AREA, LITTLE_COVERAGE = 0.05, 0.2
-LEAST_COVERAGE = 0.28  # coverage of the inliers below which they must cover `AREA_NEW` of a photo
+MIN_COVERAGE = 0.28  # coverage of the inliers below which they must cover `AREA_NEW` of a photo
 AREA_NEW = 0.3  # share of a photo that is not registered yet, from which on the support of two is enough
 
 
@@ -50,9 +50,9 @@ def reason_against(best: PoseHypothesis, competing: PoseHypothesis, needed: int)
         return "only one placed photo agrees with it on a pose"
     if len(best.support) < needed:
         return f"only {len(best.support)} placed photos agree with it on a pose"
-    if best.area < LEAST_AREA or (best.area < AREA_NEW and best.coverage < LEAST_COVERAGE):
+    if best.area < MIN_AREA or (best.area < AREA_NEW and best.coverage < MIN_COVERAGE):
         part = f"{best.area:.0%}, coverage {best.coverage:.2f}"
         return f"only a small part of it agrees with {len(best.support)} placed photos ({part})"
-    if len(competing.support) >= LEAST_SUPPORT and competing.weight > COMPETING_WEIGHT * best.weight:
+    if len(competing.support) >= MIN_SUPPORT and competing.weight > COMPETING_WEIGHT * best.weight:
         return f"two poses: {len(best.support)} photos agree on one, {len(competing.support)} on another"
     return None

@@ -20,29 +20,29 @@ from ambiguous_wild.builder.overlap_graph import bridges, connected_components, 
 from ambiguous_wild.builder.pose_covariance import UNSURE, JointCovariance, joint_covariance
 from ambiguous_wild.builder.pose_hypothesis import (
     AREA_NEW,
-    LEAST_SUPPORT,
-    LEAST_SUPPORT_NEW,
+    MIN_SUPPORT,
+    MIN_SUPPORT_NEW,
     PoseHypothesis,
     reason_against,
 )
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.builder.relative_poses import Pair, trace_of
-from ambiguous_wild.builder.retrieval import FEW
+from ambiguous_wild.builder.retrieval import FEW_PHOTOS
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 if TYPE_CHECKING:
     import networkx as nx
 
 INLIER_RATIO = 0.5  # least share of inliers of a relative pose for a covisible photo to support a hypothesis
-LEAST_PHOTOS = 3  # smallest number of photos of a model
+MIN_MODEL_PHOTOS = 3  # smallest number of photos of a model
 ALIKE_DEG, SAME_DEG = 5.0, 1.0  # largest angle of rotations that agree, and of poses that are the same
 NEAR_DEG = 3.0  # largest angle of poses that may be the same one, found twice
 SAME_SHARE = 0.1  # of the path's radius: largest distance of positions that are the same
 GRID = 12  # cells a side of the grid on which the area of matches is measured
 RELIABLE_MERGE = 4  # pairs across two components; with fewer, the smaller one is provisional
 USUAL_FOCAL = 0.5, 2.0  # over the longer side: another one, of a single photo, may be that of a distractor
-LEAST_POINTS = 6  # points, which two others observe, that fix the scale for a photo with the support of one
-MOST_RESECTIONS = 3  # poses tried for a photo, at most
+MIN_POINTS = 6  # points, which two others observe, that fix the scale for a photo with the support of one
+MAX_RESECTIONS = 3  # poses tried for a photo, at most
 RESECTION_PX, RESECTION_LEAST = 6.0, 15  # largest error and smallest number of the inliers of a resection
 ROUNDS = 8  # rounds of registering all photos anew, besides those that only add photos
 SPLITS = 5  # times at most that photos without a link to the others are taken out
@@ -79,22 +79,22 @@ class Registration:
         """Register all photos anew, one after another, until none moves, or hardly any of many."""
         times_out = [0] * len(self.matched.ids)
         for _ in range(SPLITS):
-            if len(self.poses) < LEAST_PHOTOS:  # COLMAP does not adjust fewer photos
+            if len(self.poses) < MIN_MODEL_PHOTOS:  # COLMAP does not adjust fewer photos
                 break
             self._register_until_stable(times_out)
             components = self._keep_largest()
-            if not components and len(self.poses) >= LEAST_PHOTOS:
+            if not components and len(self.poses) >= MIN_MODEL_PHOTOS:
                 self._triangulate_and_adjust(final=True)
                 components = self._keep_largest()
             if not components:
                 break
-            self.split_off += [poses for poses in components if len(poses) >= LEAST_PHOTOS]
+            self.split_off += [poses for poses in components if len(poses) >= MIN_MODEL_PHOTOS]
         else:
-            if len(self.poses) >= LEAST_PHOTOS:
+            if len(self.poses) >= MIN_MODEL_PHOTOS:
                 self._triangulate_and_adjust(final=True)
         self.links = self.find_links()
         reliable = self.components(self.links, self.provisional)[:1]
-        reliable = [component for component in reliable if len(component) >= LEAST_PHOTOS]
+        reliable = [component for component in reliable if len(component) >= MIN_MODEL_PHOTOS]
         self.provisional = set(self.poses).difference(*reliable)
         for component in self.merged:
             if sum((a in component) != (b in component) for a, b in self.links) < RELIABLE_MERGE:
@@ -107,7 +107,7 @@ class Registration:
     def _register_until_stable(self, times_out: list[int]) -> None:
         """Register all photos anew until none moves; `times_out` counts how often each was taken out."""
         rounds, moved, pairs = 0, True, False
-        while moved and rounds <= ROUNDS and len(self.poses) >= LEAST_PHOTOS:
+        while moved and rounds <= ROUNDS and len(self.poses) >= MIN_MODEL_PHOTOS:
             before = set(self.poses)
             self._triangulate_and_adjust(final=False, pairs=pairs)
             moved = self._register_all(times_out, only_out=rounds == ROUNDS)
@@ -162,7 +162,7 @@ class Registration:
         components = [set(group) for group in connected_components(graph)]
         for _, a, b in sorted((-n, a, b) for a, b, n in links if (a, b) in weak):
             first, second = (next(group for group in components if k in group) for k in (a, b))
-            if min(len(first), len(second)) < LEAST_PHOTOS:
+            if min(len(first), len(second)) < MIN_MODEL_PHOTOS:
                 components.remove(second)
                 first |= second
         named = [{photos[k] for k in group} for group in components]
@@ -184,7 +184,7 @@ class Registration:
                 sides.append((self.hypothesis(photo, self.poses[photo], of_side), side))
             sides.sort(key=lambda item: -item[0].weight)
             for hypothesis, side in sides[1:]:
-                if len(side) >= LEAST_PHOTOS and hypothesis.area < AREA_NEW:
+                if len(side) >= MIN_MODEL_PHOTOS and hypothesis.area < AREA_NEW:
                     graph.remove_edges_from([(k, j) for j in linked & side])
 
     def cameras(self) -> list[CameraFact]:
@@ -212,7 +212,7 @@ class Registration:
         it bends both.
         """
         self.covariance = self._joint_covariance()
-        self.provisional |= {k for k in self.poses if self._observations(k) < LEAST_POINTS}
+        self.provisional |= {k for k in self.poses if self._observations(k) < MIN_POINTS}
         for photos in self._photos_of_cameras().values():
             camera = self.matched.cameras[photos[0]]
             ratio = camera.mean_focal_length() / max(camera.width, camera.height)
@@ -235,10 +235,10 @@ class Registration:
         return int(self.model.images[self.matched.ids[photo]].num_points3D)
 
     def _joint_covariance(self) -> JointCovariance | None:
-        if not LEAST_PHOTOS <= len(self.poses) <= COVARIANCE_LIMIT:
+        if not MIN_MODEL_PHOTOS <= len(self.poses) <= COVARIANCE_LIMIT:
             return None
         # A photo with fewer points leaves all of them open.
-        photos = [k for k in self.poses if self._observations(k) >= LEAST_POINTS]
+        photos = [k for k in self.poses if self._observations(k) >= MIN_POINTS]
         ids = [self.matched.ids[k] for k in sorted(photos, key=self._observations, reverse=True)]
         options = adjustment_options(self.matched.distorted, len(self.poses), final=True)
         return joint_covariance(self.model, ids, options)
@@ -254,8 +254,8 @@ class Registration:
             if best.pose is not None and best.support:
                 self.hypotheses[photo] = best.pose
             few = pose_now is None and best.area < AREA_NEW
-            reason = reason_against(best, competing, LEAST_SUPPORT_NEW if few else LEAST_SUPPORT)
-            if reason is None and len(best.support) < LEAST_SUPPORT_NEW:
+            reason = reason_against(best, competing, MIN_SUPPORT_NEW if few else MIN_SUPPORT)
+            if reason is None and len(best.support) < MIN_SUPPORT_NEW:
                 self.provisional.add(photo)
             if reason is not None and self._unopposed(photo, best, competing, points):
                 self.provisional.add(photo)
@@ -301,7 +301,7 @@ class Registration:
                 # It may be the same pose, less precise: evidence for both counts for the best only.
                 evidence = {k: rows for k, rows in evidence.items() if k not in best.evidence}
             elsewhere.append(self.hypothesis(photo, hypothesis.pose, evidence))
-        elsewhere = [hypothesis for hypothesis in elsewhere if len(hypothesis.support) >= LEAST_SUPPORT]
+        elsewhere = [hypothesis for hypothesis in elsewhere if len(hypothesis.support) >= MIN_SUPPORT]
         elsewhere.append(self._competing_rotation(photo, best.support))
         return best, max(
             elsewhere,
@@ -315,7 +315,7 @@ class Registration:
         """Tell whether little evidence for a pose is enough, because nothing speaks against it."""
         if competing.support or best.clustered:
             return False
-        if len(best.support) >= LEAST_SUPPORT:
+        if len(best.support) >= MIN_SUPPORT:
             return True
         if not best.support or best.pose is None or best.area < AREA_NEW:
             return False
@@ -324,7 +324,7 @@ class Registration:
         front = local[:, 2] > 0
         pixels = np.asarray(self.matched.cameras[photo].img_from_cam(local[front])).reshape(-1, 2)
         off = np.linalg.norm(pixels - self.matched.features[photo][features[front]], axis=1)
-        return bool(np.count_nonzero(off < RESECTION_PX) >= LEAST_POINTS)
+        return bool(np.count_nonzero(off < RESECTION_PX) >= MIN_POINTS)
 
     def _score(self, photo: int, pose: np.ndarray, normalised: Sequence[np.ndarray]) -> PoseHypothesis:
         """Score a pose hypothesis: a photo supports it if most matches of a relative pose are inliers."""
@@ -401,7 +401,7 @@ class Registration:
         options.ransac.random_seed = self.seed
         poses: list[np.ndarray] = []
         left = np.arange(len(features))
-        while len(poses) < MOST_RESECTIONS and len(left) >= RESECTION_LEAST:
+        while len(poses) < MAX_RESECTIONS and len(left) >= RESECTION_LEAST:
             answer = pycolmap.estimate_and_refine_absolute_pose(
                 pixels[left], xyz[left], self.matched.cameras[photo], options
             )
@@ -444,7 +444,7 @@ class Registration:
         mapper.complete_and_merge_tracks(options.triangulation)
         for error in (LOOSE_PX, TIGHT_PX) if final else (LOOSE_PX,):
             options.mapper.filter_max_reproj_error = error
-            careful = final and (error == TIGHT_PX or len(self.poses) <= FEW)
+            careful = final and (error == TIGHT_PX or len(self.poses) <= FEW_PHOTOS)
             mapper.iterative_global_refinement(
                 ADJUSTMENTS if careful else 1,
                 STILL,

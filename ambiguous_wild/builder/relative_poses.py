@@ -20,8 +20,8 @@ import numpy as np
 
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
-LEAST = 15  # smallest number of inliers of a relative pose
-MOST_RELATIVE_POSES = 3  # of a pair
+MIN_INLIERS = 15  # smallest number of inliers of a relative pose
+MAX_RELATIVE_POSES = 3  # of a pair
 DECOMPOSITIONS = 3  # of a relative pose, at most: a plane allows two more
 ERROR_PX = 2.0  # largest epipolar error of an inlier
 CYCLE_DEG = 4.0  # largest rotation left over around a closed triplet
@@ -87,7 +87,7 @@ def estimate_relative_poses(first: np.ndarray, second: np.ndarray, error: float)
     """
     left = np.arange(len(first))
     models: list[RelativePose] = []
-    while len(models) < MOST_RELATIVE_POSES and len(left) >= LEAST:
+    while len(models) < MAX_RELATIVE_POSES and len(left) >= MIN_INLIERS:
         a, b = first[left], second[left]
         try:
             essential, mask = cv2.findEssentialMat(
@@ -95,7 +95,7 @@ def estimate_relative_poses(first: np.ndarray, second: np.ndarray, error: float)
             )
         except cv2.error:  # OpenCV gives up on some degenerate samples
             break
-        if essential is None or mask is None or np.count_nonzero(mask) < LEAST:
+        if essential is None or mask is None or np.count_nonzero(mask) < MIN_INLIERS:
             break
         inside = mask.ravel() > 0
         _, rotation, translation, _ = cv2.recoverPose(essential[:3], a[inside], b[inside], np.eye(3))
@@ -203,14 +203,14 @@ def _fundamentals(
         (a, b), rows = pair, matches[pair]
         first, second = features[a][rows[:, 0]], features[b][rows[:, 1]]
         fitted: list[tuple[Pair, np.ndarray, int]] = []
-        while len(fitted) < MOST_RELATIVE_POSES - 1 and len(first) >= LEAST:
+        while len(fitted) < MAX_RELATIVE_POSES - 1 and len(first) >= MIN_INLIERS:
             try:
                 matrix, mask = cv2.findFundamentalMat(
                     first, second, cv2.USAC_MAGSAC, FUNDAMENTAL_PX, CONFIDENCE, TRIALS
                 )
             except cv2.error:  # OpenCV gives up on some degenerate samples
                 break
-            if matrix is None or matrix.shape != (3, 3) or np.count_nonzero(mask) < LEAST:
+            if matrix is None or matrix.shape != (3, 3) or np.count_nonzero(mask) < MIN_INLIERS:
                 break
             scaled = np.diag([sides_px[b]] * 2 + [1]) @ matrix @ np.diag([sides_px[a]] * 2 + [1])
             fitted.append((pair, scaled, int(np.count_nonzero(mask))))
@@ -248,8 +248,8 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[RelativePose]]) -> dict[Pair, np.n
     """
     connected = sorted(pair for pair, found in pairs.items() if found)
     at = {pair: k for k, pair in enumerate(connected)}
-    rotations = np.full((len(connected), MOST_RELATIVE_POSES * DECOMPOSITIONS, 3, 3), np.nan)
-    prior = np.zeros((len(connected), MOST_RELATIVE_POSES * DECOMPOSITIONS))
+    rotations = np.full((len(connected), MAX_RELATIVE_POSES * DECOMPOSITIONS, 3, 3), np.nan)
+    prior = np.zeros((len(connected), MAX_RELATIVE_POSES * DECOMPOSITIONS))
     for pair, k in at.items():
         total = sum(len(relative.matches) for relative in pairs[pair])
         for m, relative in enumerate(pairs[pair]):
@@ -263,7 +263,7 @@ def cycle_votes(pairs: Mapping[Pair, Sequence[RelativePose]]) -> dict[Pair, np.n
     votes = exists.astype(float)
     for _ in range(ROUNDS):
         votes = _vote(votes, prior, edges, rows)
-    return {pair: votes[k].reshape(MOST_RELATIVE_POSES, DECOMPOSITIONS) for pair, k in at.items()}
+    return {pair: votes[k].reshape(MAX_RELATIVE_POSES, DECOMPOSITIONS) for pair, k in at.items()}
 
 
 def _triplets(pairs: Sequence[Pair], at: Mapping[Pair, int]) -> np.ndarray:

@@ -32,8 +32,8 @@ from ambiguous_wild.io.photos import MIN_SIDE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 TRUTH_PARTS = ("distractor", "clean")
-MOST_LOST = 0.9  # share of the photo that is kept, below which a message says so
-LEAST_SHARE, MOST_SHARE = 0.1, 1.1  # plausible shares of the photo that undistortion keeps
+MAX_LOST = 0.9  # share of the photo that is kept, below which a message says so
+MIN_SHARE, MAX_SHARE = 0.1, 1.1  # plausible shares of the photo that undistortion keeps
 NEGLIGIBLE_PX = 0.1  # distortion below this everywhere is ignored
 FACTORS = (1, 2, 4, 8)
 TARGET_SIDE = 480  # px; literature trains at about 504 x 378
@@ -106,7 +106,7 @@ def make_lens(camera: ModelCamera) -> Lens:
     index = (source - 0.5).astype(np.float32)  # OpenCV counts from pixel centres
     x, y = np.concatenate([source[0], source[:, -1], source[-1, ::-1], source[::-1, 0]]).T
     share = float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2 / (camera.width * camera.height))
-    if not LEAST_SHARE < share < MOST_SHARE:
+    if not MIN_SHARE < share < MAX_SHARE:
         raise AwError(
             f"camera {camera.camera_id} ({camera.model}, parameters {list(camera.params)}): undistorted, it "
             f"sees {100 * share:.3g} % of its photo: check the parameters, or split the photos"
@@ -217,7 +217,7 @@ def resample(
     with ThreadPoolExecutor(jobs) as pool:
         done = list(pool.map(one, model.images.values()))
     bar.finish()
-    if lenses and (least := min(lens.share for lens in lenses.values())) < MOST_LOST:
+    if lenses and (least := min(lens.share for lens in lenses.values())) < MAX_LOST:
         bar.say(f"undistortion leaves {least:.0%} of the photos, the middle of what the lens sees")
     cameras, images = {c.camera_id: c for _, c, _ in done}, {image.image_id: image for image, _, _ in done}
     write_model(folder / "sparse" / "0", ColmapModel(cameras, images, model.points))

@@ -28,12 +28,12 @@ KEPT = 4  # number of these best pairs
 FAR, FAR_LEAST = 0.5, 20  # share of a photo's pairs that are far, and their smallest number of matches
 WORDS = 64  # visual words
 SAMPLE = 20_000  # descriptors that the words are learnt from
-MOST = 1500  # descriptors of a photo that are used: the largest features come first in COLMAP
+MAX_DESCRIPTORS = 1500  # descriptors of a photo that are used: the largest features come first in COLMAP
 SIMILAR = 16  # photos that each is matched with, unless a plan says otherwise
 NEIGHBOURS = 5  # next photos in the order of capture that each is matched with, likewise
 # Up to this number of photos every pair is compared (4950 pairs take about 10 s of a core), and adjustments
 # are solved directly; above, iteratively: for 200 photos in half of the time.
-FEW = 100
+FEW_PHOTOS = 100
 SHORTLIST = 3
 _ROWS = 256  # photos compared at a time
 _ROUNDS = 12  # of k-means
@@ -49,7 +49,7 @@ def embed(
     share = max(1, SAMPLE // max(len(names), 1))
     sample = []
     for name in names:
-        rows = read(name)[:MOST]
+        rows = read(name)[:MAX_DESCRIPTORS]
         if len(rows):
             sample.append(unit(rows[generator.permutation(len(rows))[:share]]))
     vectors = np.zeros((len(names), WORDS * 128), np.float32)
@@ -57,7 +57,7 @@ def embed(
         return vectors
     words = _words(np.concatenate(sample), generator)
     for index, name in enumerate(names):
-        vectors[index] = _vlad(read(name)[:MOST], words)
+        vectors[index] = _vlad(read(name)[:MAX_DESCRIPTORS], words)
     return vectors
 
 
@@ -127,7 +127,7 @@ def retrieval_pairs(
 ) -> list[tuple[str, str]]:
     """Pair each photo with those that share most features and with the next ones in the order of capture.
 
-    Photos of a separate test set get no next ones. Up to `FEW` photos every pair is compared; above,
+    Photos of a separate test set get no next ones. Up to `FEW_PHOTOS` photos every pair is compared; above,
     each photo is compared with `SHORTLIST` times `similar` photos, most of them those with the most similar
     vectors, and some of its pairs are far.
 
@@ -154,7 +154,7 @@ def retrieval_pairs(
         if i + s < len(walk) and (only is None or {names[walk[i]], names[walk[i + s]]} & set(only))
     }
     far_share = 0.0
-    if len(names) <= FEW:
+    if len(names) <= FEW_PHOTOS:
         listed = [(a, b) for a in asking for b in everyone if a != b]
     else:
         far_share, near = FAR, (SHORTLIST - 1) * similar

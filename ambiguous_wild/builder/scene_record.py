@@ -42,7 +42,7 @@ from ambiguous_wild.io.scene_folder import MAP
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
 ENOUGH_PHOTOS = 20  # with fewer, most of a place is seen in one or two of them
-LEAST_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
+MIN_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
 SFM_STAGES = ("features", "matches", "mapping")
 
 
@@ -310,7 +310,7 @@ def map_warnings(result: MapResult) -> list[str]:
 
 def _parallax_warnings(model: ColmapModel) -> list[str]:
     angle = parallax_deg(model)
-    if not angle < LEAST_PARALLAX_DEG:
+    if not angle < MIN_PARALLAX_DEG:
         return []
     return [
         f"the camera hardly moved: half of the points have less than {angle:.2f} deg of parallax, so their "

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from ambiguous_wild.builder.records import ScreenedPhoto
-from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, FEW, NEIGHBOURS
+from ambiguous_wild.builder.retrieval import EXHAUSTIVE_LIMIT, FAST_EXHAUSTIVE_LIMIT, FEW_PHOTOS, NEIGHBOURS
 from ambiguous_wild.core.errors import AwError
 
 CameraMode = Literal["auto", "single", "per-device", "per-folder", "per-image"]
@@ -20,11 +20,11 @@ Effort = Literal["auto", "fast", "thorough"]
 
 
 WIDER = 40  # pairs in the second attempt of a photo that was left out
-ENOUGH = 0.9  # registered share that ends the attempts: more pairs seldom register the rest
-HALF = 0.5  # the same of more than `FEW` photos, before all pairs are matched
+MIN_REGISTERED = 0.9  # registered share that ends the attempts: more pairs seldom register the rest
+HALF = 0.5  # the same of more than `FEW_PHOTOS` photos, before all pairs are matched
 MANY_FEATURES = 8000  # of a photo in the last attempt at a small capture, whose photos may overlap little
 RATIO, LOOSE_RATIO = 0.8, 0.9  # of the distances of matches; the second where photos may overlap little
-MOST_FEATURES = 100_000  # largest --max-features; SIFT finds fewer in any photo
+MAX_FEATURES = 100_000  # largest --max-features; SIFT finds fewer in any photo
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class BuildSettings:
     def __post_init__(self) -> None:
         if self.factor is not None and not 1 <= self.factor <= 64:
             raise AwError(f"--factor must be between 1 and 64, got {self.factor}")
-        if not 100 <= self.max_features <= MOST_FEATURES:
+        if not 100 <= self.max_features <= MAX_FEATURES:
             raise AwError(
-                f"--max-features must be between 100, to match anything, and {MOST_FEATURES}, "
+                f"--max-features must be between 100, to match anything, and {MAX_FEATURES}, "
                 f"got {self.max_features}"
             )
         if self.part < 1:
@@ -84,8 +84,8 @@ def plans(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> list[SfmP
     """Return the attempts in order; each next one runs if the one before leaves photos out."""
     thorough = _thorough(len(photos), settings)
     # Other features find other pairs: a capture that one kind leaves in parts may be whole by the other.
-    covariant = replace(thorough, name="covariant", sift="covariant", ratio=LOOSE_RATIO, below=ENOUGH)
-    careful = [thorough, covariant] if len(photos) <= FEW else [thorough]
+    covariant = replace(thorough, name="covariant", sift="covariant", ratio=LOOSE_RATIO, below=MIN_REGISTERED)
+    careful = [thorough, covariant] if len(photos) <= FEW_PHOTOS else [thorough]
     if settings.sfm == "thorough":
         return careful
     fast = _fast(photos, settings)
@@ -94,8 +94,10 @@ def plans(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> list[SfmP
     fast = replace(fast, worth=HALF)
     if fast.matcher != "retrieval":
         return [fast, *careful]
-    wider = replace(fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True, below=ENOUGH)
-    below = ENOUGH if len(photos) <= FEW else HALF
+    wider = replace(
+        fast, name="wider", similar=WIDER, neighbours=NEIGHBOURS, continues=True, below=MIN_REGISTERED
+    )
+    below = MIN_REGISTERED if len(photos) <= FEW_PHOTOS else HALF
     return [fast, wider, replace(thorough, below=below), *careful[1:]]
 
 
@@ -113,7 +115,7 @@ def _fast(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> SfmPlan:
         growth=2.0,
         refinements=1,
         # All photos are registered anew afterwards, and of many the last digits cost most of the time.
-        tolerance=1e-4 if len(photos) > FEW else 0.0,
+        tolerance=1e-4 if len(photos) > FEW_PHOTOS else 0.0,
         local_refinements=1,
         local_cameras=4,
     )
@@ -123,7 +125,7 @@ def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
     return SfmPlan(
         "thorough",
         sift="colmap",
-        max_features=max(settings.max_features, MANY_FEATURES * (count <= FEW)),
+        max_features=max(settings.max_features, MANY_FEATURES * (count <= FEW_PHOTOS)),
         ratio=RATIO,
         matcher=_matcher(count, settings, EXHAUSTIVE_LIMIT),
         similar=16,

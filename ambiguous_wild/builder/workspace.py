@@ -26,7 +26,7 @@ from ambiguous_wild.io.files import atomic_dir, own_json, write_json
 BUILDER = 22  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 _RESULT = "stage.json"
-_LEAST_FREE = 2**20  # bytes; with less, a stage that fails is taken to fail for lack of space
+_MIN_FREE = 2**20  # bytes; with less, a stage that fails is taken to fail for lack of space
 Facts = TypeVar("Facts", bound=Mapping[str, object])  # a record of `records.py`
 
 
@@ -85,7 +85,7 @@ class Workspace:
                 try:
                     facts = work(temporary)
                 except AwError as error:  # COLMAP does not say why it ended, and its log is on the same disk
-                    if shutil.disk_usage(temporary).free >= _LEAST_FREE:
+                    if shutil.disk_usage(temporary).free >= _MIN_FREE:
                         raise
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)) from error
                 spent = round(time.perf_counter() - started, 3)

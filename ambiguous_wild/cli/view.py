@@ -29,7 +29,7 @@ from ambiguous_wild.io.splat_files import FORMATS
 if TYPE_CHECKING:
     from ambiguous_wild.viewing.model import ExportedModel
 
-MOST_GAUSSIANS = 150_000
+MAX_GAUSSIANS = 150_000
 THIS_MACHINE = "127.0.0.1"
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 
@@ -60,7 +60,7 @@ class HostPort(click.ParamType):
 @click.option(
     "--max-gaussians", type=click.IntRange(4),
     help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note. With "
-    f"--live: in the training.  [default: {MOST_GAUSSIANS}; with --live, the method's]",
+    f"--live: in the training.  [default: {MAX_GAUSSIANS}; with --live, the method's]",
 )  # fmt: skip
 @plugin_option
 @click.option("--title", help="Title of the page.  [default: the scene's name]")
@@ -130,7 +130,7 @@ def view_command(
         runs,
         output,
         scene_folder=scene_folder,
-        most_gaussians=max_gaussians or MOST_GAUSSIANS,
+        most_gaussians=max_gaussians or MAX_GAUSSIANS,
         title=title,
         say=say,
     )

@@ -34,7 +34,7 @@ TRIES = 5
 WAIT_S = 2.0  # before the second try; doubles
 STALL_S = 60.0  # without a byte, a connection counts as broken
 _CHUNK = 1 << 20
-MOST_BYTES = 200_000_000_000
+MAX_BYTES = 200_000_000_000
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ def _copy(
         if not chunk:
             break
         done += len(chunk)
-        if done > MOST_BYTES or (total is not None and done > total):
+        if done > MAX_BYTES or (total is not None and done > total):
             raise AwError("the server sends more than it announced; do not trust it")
         target.write(chunk)
         tick(done, total)

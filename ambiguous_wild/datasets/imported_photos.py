@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.builder.resample import (
-    MOST_LOST,
+    MAX_LOST,
     Lens,
     downsample_mask,
     downsample_photo,
@@ -258,7 +258,7 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
         target = resized(pinhole, scene.max_width, height)
         notes.append(f"reduced to {scene.max_width} px")
     if lens.map_xy is not None:
-        lost = f" without {100 * (1 - lens.share):.0f} % of the photo" if lens.share < MOST_LOST else ""
+        lost = f" without {100 * (1 - lens.share):.0f} % of the photo" if lens.share < MAX_LOST else ""
         notes.insert(0, f"undistorted{lost}")
     if plan.turn > 1:
         notes.insert(0, f"turned upright (EXIF orientation {plan.turn})")

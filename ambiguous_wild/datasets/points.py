@@ -38,7 +38,7 @@ from ambiguous_wild.io.colmap_records import (
 RANDOM_POINTS = 100_000  # as in 3DGS for Blender scenes and in gsplat's random start
 BLENDER_SIDE = 1.3  # half the side of 3DGS's cube for Blender scenes
 CAMERA_SIDE = 3.0  # half the side of gsplat's cube over the largest distance of a camera from their mean
-LEAST_POINTS = 100  # smallest number of triangulated points to start from
+MIN_POINTS = 100  # smallest number of triangulated points to start from
 
 
 def drop_test_only(model: ColmapModel, split: Mapping[str, Split]) -> tuple[ColmapModel, int]:
@@ -105,7 +105,7 @@ def triangulate(
         bar: progress.
 
         Returns:
-            The same cameras and poses, with points; without any if fewer than `LEAST_POINTS` were found.
+            The same cameras and poses, with points; without any if fewer than `MIN_POINTS` were found.
     """
     used = {i.name: i for i in model.images.values() if i.name in split}
     database = _match_posed(folder, model, photos, split, "thorough", seed, jobs, bar)
@@ -122,7 +122,7 @@ def triangulate(
     run_job(job, folder, lambda: None)
     bar.finish()
     triangulated = read_model(folder / "points")
-    if len(triangulated.points.ids) < LEAST_POINTS:
+    if len(triangulated.points.ids) < MIN_POINTS:
         return model
     # The given poses are kept, not the rounded ones of COLMAP's files.
     by_name: dict[str, ModelImage] = {i.name: i for i in triangulated.images.values()}

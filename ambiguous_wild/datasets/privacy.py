@@ -31,7 +31,7 @@ HOW_WEAK = (
     "cut off or far, and both find people in trees and windows. Number plates are not looked for. A photo "
     "that is not listed may show people: look at every photo before release."
 )
-_LEAST_WEIGHT = 0.5  # smallest weight of the SVM; below, most detections are wrong
+_MIN_WEIGHT = 0.5  # smallest weight of the SVM; below, most detections are wrong
 
 
 def strip_metadata(data: bytes, name: str) -> tuple[bytes, list[str]]:
@@ -181,7 +181,7 @@ def may_show_person(path: Path) -> str:
     detected = []
     if gray.shape[0] >= 128 and gray.shape[1] >= 64:
         _, weights = hog.detectMultiScale(gray, winStride=(8, 8), scale=1.1)
-        if np.size(weights) and float(np.max(weights)) >= _LEAST_WEIGHT:
+        if np.size(weights) and float(np.max(weights)) >= _MIN_WEIGHT:
             detected.append("person")
     if min(gray.shape) >= 24:
         with warnings.catch_warnings():

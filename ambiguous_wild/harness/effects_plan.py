@@ -19,13 +19,13 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, track_colours
 
-LEAST = 50  # observations; fewer give no evidence
-LEAST_VIEWS = 6  # photos of a point, to fit four numbers to its colour
+MIN_OBSERVATIONS = 50  # observations; fewer give no evidence
+MIN_VIEWS = 6  # photos of a point, to fit four numbers to its colour
 OUTLYING = 4.5  # median deviations from a point's median colour: three standard deviations of noise
 RELIT = 0.5  # share of a photo's points far from their median colours above which it counts as relit
-LEAST_APART = 1e-3  # spread of cameras over the depth they look at; below, they are all at one place
-LEAST_SPREAD = 0.01  # of the colour range, or of the logarithm: smallest median deviation that is used
-MOST = 20_000  # number of points whose view dependence is fitted; more do not change a median
+MIN_APART = 1e-3  # spread of cameras over the depth they look at; below, they are all at one place
+MIN_SPREAD = 0.01  # of the colour range, or of the logarithm: smallest median deviation that is used
+MAX_FITTED_POINTS = 20_000  # number of points whose view dependence is fitted; more do not change a median
 SCHEMA = 1
 # Thresholds, set on tracks with and without the injected effect (tests/harness/test_planning.py), on
 # presets and on real captures.
@@ -39,7 +39,7 @@ SAMPLING = 1.5
 # for the last a dense start of 30 photos was better
 OUTWARD = 2.0
 # captures of 9 to 20 photos gained SSIM by a dense start, those of 30 did not
-LEAST_PHOTOS, FEW_PHOTOS = 3, 24
+MIN_PHOTOS, FEW_PHOTOS = 3, 24
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def measure(scene: Scene, photos: Iterable[np.ndarray]) -> Evidence:
     """
     colours = track_colours(scene, photos)
     gains = log_gains(colours, len(scene.train))
-    enough = len(colours.point) >= LEAST
+    enough = len(colours.point) >= MIN_OBSERVATIONS
     grey = colours.rgb.mean(axis=1) / np.exp(gains[colours.view].mean(axis=1))
     # variances in the colour range and in logarithms, explained by direction and left
     (in_codes, _), (_, in_logs) = (_fit_points(scene, colours, v) for v in (grey, np.log(grey)))
@@ -81,7 +81,7 @@ def measure(scene: Scene, photos: Iterable[np.ndarray]) -> Evidence:
 
 def has_tracks(scene: Scene) -> bool:
     """Return whether enough observations of points are known; without them no photo need be read."""
-    return bool((scene.points.track_views >= 0).sum() >= LEAST)
+    return bool((scene.points.track_views >= 0).sum() >= MIN_OBSERVATIONS)
 
 
 def exposure_spread(colours: TrackColours, gains: np.ndarray) -> float:
@@ -127,7 +127,7 @@ def outward(scene: Scene) -> float:
     # the root of the summed variances does not depend on the axes of the world
     apart, between = (float(np.sqrt(a.var(axis=0).sum())) for a in (cameras, places))
     depth = float(np.median([depth for _, depth in looking]))
-    return between / apart if apart > LEAST_APART * depth else float("nan")
+    return between / apart if apart > MIN_APART * depth else float("nan")
 
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
@@ -157,14 +157,14 @@ def _fit_points(scene: Scene, colours: TrackColours, values: np.ndarray) -> np.n
     point, view, values = colours.point[order], colours.view[order], values[order]
     starts = np.flatnonzero(np.r_[True, point[1:] != point[:-1]])
     sizes = np.diff(np.r_[starts, len(point)])
-    chosen = np.flatnonzero(sizes >= LEAST_VIEWS)
-    if len(chosen) > MOST:
-        chosen = np.random.default_rng(0).choice(chosen, MOST, replace=False)
+    chosen = np.flatnonzero(sizes >= MIN_VIEWS)
+    if len(chosen) > MAX_FITTED_POINTS:
+        chosen = np.random.default_rng(0).choice(chosen, MAX_FITTED_POINTS, replace=False)
     centres = np.array([v.camera.center for v in scene.train])
     groups = [starts[k] + np.arange(sizes[k]) for k in chosen]
     fits = []
     for rows in _without_outliers(groups, values, view):
-        if len(rows) < LEAST_VIEWS:
+        if len(rows) < MIN_VIEWS:
             continue
         direction = centres[view[rows]] - scene.points.xyz[point[rows[0]]]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -183,7 +183,7 @@ def _without_outliers(groups: Sequence[np.ndarray], values: np.ndarray, view: np
     far = []
     for rows in groups:
         apart = np.abs(values[rows] - np.median(values[rows]))
-        far.append(apart > OUTLYING * max(float(np.median(apart)), LEAST_SPREAD))
+        far.append(apart > OUTLYING * max(float(np.median(apart)), MIN_SPREAD))
     of_photo = view[np.concatenate(groups)]
     count = np.maximum(np.bincount(of_photo), 1)
     relit = np.bincount(of_photo, np.concatenate(far)) > RELIT * count
@@ -325,7 +325,7 @@ def _dense_start(evidence: Evidence) -> Decision:
     """
     photos = evidence.photos
     few, middle = photos <= FEW_PHOTOS, evidence.outward > OUTWARD
-    measured = photos >= LEAST_PHOTOS and not math.isnan(evidence.exposure)
+    measured = photos >= MIN_PHOTOS and not math.isnan(evidence.exposure)
     decision: Answer = "unknown" if not measured else "on" if few or middle else "off"
     if middle and not few:
         return Decision(

@@ -33,7 +33,7 @@ from ambiguous_wild.harness.chosen_effects import (
 )
 from ambiguous_wild.harness.effects_plan import EffectsPlan, plan_effects
 from ambiguous_wild.harness.start import start_file, start_line, started
-from ambiguous_wild.harness.timing import LEAST, MOST, expected_s, slowness
+from ambiguous_wild.harness.timing import MAX_RATIO, MIN_RATIO, expected_s, slowness
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
@@ -285,8 +285,8 @@ def expected_line(cells: Sequence[Cell]) -> str:
     runs = "1 run" if len(cells) == 1 else f"{len(cells)} runs"
     return (
         f"no --iterations and no --budget: {runs} of {cells[0].train.iterations} iterations take "
-        f"{_duration(LEAST * total)} to {_duration(MOST * total)} with 3dgs on this machine, up to 3 times "
-        "as long with other methods; --budget 10m ends each after ten minutes"
+        f"{_duration(MIN_RATIO * total)} to {_duration(MAX_RATIO * total)} with 3dgs on this machine, up to "
+        "3 times as long with other methods; --budget 10m ends each after ten minutes"
     )
 
 

@@ -52,11 +52,11 @@ LARGE = 0.05  # of a photo: a larger patch is more than one instance
 
 # Limits, as shares of the photos' pixels, set on the presets.
 OCCLUSION, LOCAL, GLOBAL, ENTROPY = 0.003, 0.003, 0.05, 0.01
-MOST_PHOTOS = 60  # evenly spaced photos of a pair: 300 iterations visit each five times
+MAX_PHOTOS = 60  # evenly spaced photos of a pair: 300 iterations visit each five times
 SEED = 0  # of the blocks and of the pair
-LEAST_PHOTOS = 4  # fewer give no useful standard error
+MIN_PHOTOS = 4  # fewer give no useful standard error
 # Without growth masks gain little: static captures -0.02 to +0.01 dB, captures with distractors from 0.05 dB
-LEAST_DB = 0.02
+MIN_DB = 0.02
 # Share of unexplained pixels: static captures have 0.0 to 0.9 %, captures with distractors 0.6 % or more.
 CERTAIN = 0.03
 MASK_LINES = ("masks", "masks, local", "masks, global", "entropy density")
@@ -259,11 +259,11 @@ def held_back(data: TrainData, seed: int) -> list[Tensor]:
 
 
 def sampled(scene: Scene) -> tuple[Scene, list[int]]:
-    """Return the scene with at most `MOST_PHOTOS` train photos, and their indices in `scene.train`."""
+    """Return the scene with at most `MAX_PHOTOS` train photos, and their indices in `scene.train`."""
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
-    if len(train) <= MOST_PHOTOS:
+    if len(train) <= MAX_PHOTOS:
         return scene, list(range(len(train)))
-    places = np.linspace(0, len(train) - 1, MOST_PHOTOS).round().astype(int).tolist()
+    places = np.linspace(0, len(train) - 1, MAX_PHOTOS).round().astype(int).tolist()
     chosen = {train[place] for place in places}
     views = tuple(
         dataclasses.replace(view, split="train" if index in chosen else "test")
@@ -342,7 +342,7 @@ class Gain:
 def compare(with_it: Mapping[str, float], without: Mapping[str, float]) -> Gain | None:
     """Return the gain photo by photo; None if the two share too few photos."""
     difference = np.array([with_it[name] - without[name] for name in without if name in with_it])
-    if len(difference) < LEAST_PHOTOS:
+    if len(difference) < MIN_PHOTOS:
         return None
     return Gain(float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference))))
 
@@ -392,7 +392,7 @@ def with_gain(plan: EffectsPlan, gain: Gain | None) -> EffectsPlan:
     masks = next(d for d in plan.decisions if d.effect == "masks")
     if gain is None or masks.decision != "on":
         return plan
-    static = masks.value < CERTAIN and not (gain.db >= LEAST_DB and gain.db > gain.error_db)
+    static = masks.value < CERTAIN and not (gain.db >= MIN_DB and gain.db > gain.error_db)
 
     def line(decision: Decision) -> Decision:
         if static and decision.effect in MASK_LINES:

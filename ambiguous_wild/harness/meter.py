@@ -31,13 +31,13 @@ _STAT = Path("/proc/stat")
 _IDLE = (3, 4)  # fields of a line of /proc/stat: idle, waiting for a disk
 _GUEST = (8, 9)  # counted in user and nice already
 # The error of one calibration is a tenth, on a busy machine a fifth, so a run needs about 20 of them.
-# Time between two calibrations: SHARE of the training so far, but from LEAST_S to EVERY_S.
-LEAST_S = 1.0
+# Time between two calibrations: SHARE of the training so far, but from MIN_S to EVERY_S.
+MIN_S = 1.0
 SHARE = 1 / 20
 EVERY_S = 15.0
 OTHERS = 0.1  # a run is contended if others use more than this share of the processors that it needs
 VARIED = 1.3  # or if the machine is this many times slower in one part of the training than in another
-LEAST_GAIN = 0.15  # extra processors that several threads must get, to be distinguished from one thread
+MIN_GAIN = 0.15  # extra processors that several threads must get, to be distinguished from one thread
 PARTS = 5  # parts of the training that are compared
 PART_SAMPLES = 4  # fewest calibrations of a part
 COVERED = 0.9  # share of the training that must lie between the first and the last calibration
@@ -193,7 +193,7 @@ class Meter:
         ago = trained_s - self.samples[-1][0]
         if progress >= 1.0:
             return ago > 0.0
-        return ago >= min(max(LEAST_S, SHARE * trained_s), EVERY_S)
+        return ago >= min(max(MIN_S, SHARE * trained_s), EVERY_S)
 
     def look(self, trained_s: float) -> None:
         """Calibrate, and add the work of others since the last calibration."""
@@ -261,7 +261,7 @@ class Meter:
         if not self.samples or self.wall_s <= 0.0:
             return math.nan
         _, _, many, serial_s, one = np.mean(np.array(self.samples), axis=0)
-        if math.isnan(serial_s) or many - one < LEAST_GAIN:
+        if math.isnan(serial_s) or many - one < MIN_GAIN:
             return math.nan
         return float(np.clip((self.own_s / self.wall_s - one) / (many - one), 0.0, 1.0))
 

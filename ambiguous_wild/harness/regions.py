@@ -33,7 +33,7 @@ from ambiguous_wild.vision.sparse_surface import (
 
 COVERED_FROM = 0.5  # share of the train views that look at a pixel's surface
 SUPPORTED_FROM = 3  # number of train views that show it
-MOST_VIEWS = 64  # number of train views compared with a test view where there are no exact masks
+MAX_VIEWS = 64  # number of train views compared with a test view where there are no exact masks
 
 Visibility = tuple[np.ndarray, np.ndarray]
 VALID, COVERED, UNCOVERED = "psnr_valid", "psnr_covered", "psnr_uncovered"
@@ -89,7 +89,7 @@ def why_nothing_covered(masks: Iterable[np.ndarray | None]) -> str:
 def _nearest(camera: Camera, others: Sequence[Camera]) -> list[int]:
     """Return the indices of the nearest cameras; of hundreds, these see the same surfaces."""
     distance = [float(np.linalg.norm(other.center - camera.center)) for other in others]
-    return sorted(range(len(others)), key=lambda k: (distance[k], k))[:MOST_VIEWS]
+    return sorted(range(len(others)), key=lambda k: (distance[k], k))[:MAX_VIEWS]
 
 
 def _seen(

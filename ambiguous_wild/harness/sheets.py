@@ -29,7 +29,7 @@ FONT, SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 NAME = "sheet.jpg"
 WIDTH = 320  # px of a photo on the sheets of a capture and of masks
 CAPTURE_COLUMNS, MASK_COLUMNS = 4, 5  # photos in a row
-MOST_MASKS = 20  # photos on a sheet of masks
+MAX_MASKS = 20  # photos on a sheet of masks
 VIEWS = 3  # test photos, and train photos, on the sheet of runs
 
 
@@ -148,7 +148,7 @@ def write_contact(scene: Scene, masks: Path, path: Path) -> list[Path]:
     Args:
         scene: the scene with the train photos.
         masks: RUN/masks, keep maps by the photo's name, white = keep.
-        path: JPEG to write; it shows up to `MOST_MASKS` photos, evenly spaced among those with a mask.
+        path: JPEG to write; it shows up to `MAX_MASKS` photos, evenly spaced among those with a mask.
 
     Returns:
         The path written; empty if no photo has a mask.
@@ -158,7 +158,7 @@ def write_contact(scene: Scene, masks: Path, path: Path) -> list[Path]:
         return []
     path.parent.mkdir(parents=True, exist_ok=True)
     write_jpeg(
-        path, grid([_tinted(scene, view, masks) for view in evenly_spaced(views, MOST_MASKS)], MASK_COLUMNS)
+        path, grid([_tinted(scene, view, masks) for view in evenly_spaced(views, MAX_MASKS)], MASK_COLUMNS)
     )
     return [path]
 

@@ -23,7 +23,7 @@ _NEAR = 0.05  # of a point's distance to the nearest train camera
 # Shares of near points below which a start is refused, and warned of. Models of the scene had 0.59 to 1; with
 # errors of 10 % of the depth 0.97, at half and twice the scale 0.02; 75 of 92 models and point clouds of
 # other scenes had less than 0.1, as had points at random in the box of the scene (0.05).
-_LEAST_NEAR, _FEW_NEAR = 0.02, 0.1
+_MIN_NEAR, _FEW_NEAR = 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,6 @@ def _refuse_elsewhere(path: Path, xyz: np.ndarray, scene: Scene) -> None:
             f"{path} lies around ({coordinates}), and at most {max(shares):.0%} of its points and those of "
             f"{scene.name} lie near each other"
         )
-        if max(shares) < _LEAST_NEAR:
+        if max(shares) < _MIN_NEAR:
             raise AwError(f"{found}: give a file of this scene, in its coordinates")
         warnings.warn(f"{found}: is it of another scene?", stacklevel=2)

@@ -27,9 +27,9 @@ VERDICTS: tuple[Verdict, ...] = ("alone", "contended", "unknown")
 UNTIMED = "its time was not calibrated (an earlier version, several GPUs, or an external program)"
 # ms of a step of 3dgs on the reference machine (splat/calibration.py): a constant, a part for every 1000 px
 # and one for every 1000 Gaussians. Fitted to captures of 240x134 to 480x268 px with 32 000 to 102 000
-# Gaussians, whose times were LEAST to MOST times what the formula gives.
+# Gaussians, whose times were MIN_RATIO to MAX_RATIO times what the formula gives.
 STEP_MS, PIXELS_MS, GAUSSIANS_MS = 2.2, 0.09, 0.22
-LEAST, MOST = 0.67, 1.5
+MIN_RATIO, MAX_RATIO = 0.67, 1.5
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def in_reference_seconds(
 
 
 def expected_s(iterations: int, pixels: int, gaussians: int) -> float:
-    """Return the expected seconds of 3dgs on the reference machine; the true ones are LEAST to MOST times it.
+    """Return the expected seconds of 3dgs on the reference machine, right within `MIN_RATIO` to `MAX_RATIO`.
 
     `pixels` are those of a photo, `gaussians` the number at the end.
     """

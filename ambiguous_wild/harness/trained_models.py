@@ -21,7 +21,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import RenderSettings, ViewedModel, file_model
-from ambiguous_wild.viewing.page_file import MOST_GAUSSIANS, PAGE, Page, check_page_folder, page_text
+from ambiguous_wild.viewing.page_file import MAX_GAUSSIANS, PAGE, Page, check_page_folder, page_text
 from ambiguous_wild.viewing.video import scene_around
 
 MASKS = "masks"
@@ -241,7 +241,7 @@ def view_runs(
     *,
     scene: str | None = None,
     scene_folder: Path | None = None,
-    most_gaussians: int = MOST_GAUSSIANS,
+    most_gaussians: int = MAX_GAUSSIANS,
     title: str | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Page:

@@ -16,7 +16,7 @@ from ambiguous_wild.io.files import atomic_path
 
 FILE = "motion.npz"  # in the scene's folder
 _COLUMNS = {"xy": ("f4", (2,)), "static": ("u1", ()), "moving": ("u1", ()), "motion": ("i2", ())}
-_MOST_BYTES = 1 << 28  # largest unpacked size; a thousand photos have about 2e7
+_MAX_BYTES = 1 << 28  # largest unpacked size; a thousand photos have about 2e7
 # Exceptions that numpy and zipfile raise for a damaged file, besides their own.
 _DAMAGE = (ValueError, LookupError, OSError, EOFError, TypeError, AttributeError, RuntimeError, MemoryError,
            OverflowError)  # fmt: skip
@@ -61,7 +61,7 @@ def read_motion_points(scene: Path) -> dict[str, MotionPoints]:
         return {}
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(member.file_size for member in archive.infolist()) > _MOST_BYTES:
+            if sum(member.file_size for member in archive.infolist()) > _MAX_BYTES:
                 raise ValueError("it is too large")
         with np.load(path, allow_pickle=False) as file:
             return _read(file)

@@ -14,11 +14,11 @@ from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import load_image_float, read_alpha
 
-LEAST_TRAIN = 2  # photos: one shows no depth
+MIN_TRAIN = 2  # photos: one shows no depth
 ASPECT = 2.0  # largest ratio of focal lengths; pixels of anamorphic lenses are 2:1
 SAME_POSE = 1e-6  # largest difference of two equal poses, relative to the scene's size
 SAME_PHOTO = 0.01  # mean difference of equal pictures that were compressed again, of 1
-MOST_POINTS = 5000  # points that are projected to find out whether photos show any
+MAX_POINTS = 5000  # points that are projected to find out whether photos show any
 SHARED = (
     "test photos are training photos ({names}), so their scores say nothing: use each for training or for "
     "testing alone"
@@ -45,7 +45,7 @@ def _faults(scene: Scene, checks: Checks) -> Iterator[str]:
 
 
 def _few_train_photos(scene: Scene) -> list[str]:
-    return [view.name for view in scene.train if len(scene.train) < LEAST_TRAIN]
+    return [view.name for view in scene.train if len(scene.train) < MIN_TRAIN]
 
 
 def _shared_photos(scene: Scene) -> list[str]:
@@ -92,7 +92,7 @@ def _pose(view: View, extent: float) -> np.ndarray:
 
 def _one_pose(scene: Scene) -> list[str]:
     poses = np.array([_pose(view, scene.extent) for view in scene.train])
-    one = len(poses) >= LEAST_TRAIN and np.ptp(poses, axis=0).max() < SAME_POSE
+    one = len(poses) >= MIN_TRAIN and np.ptp(poses, axis=0).max() < SAME_POSE
     return [view.name for view in scene.train if one]
 
 
@@ -116,7 +116,7 @@ def _far_cameras(scene: Scene) -> list[str]:
 
 def _one_position(scene: Scene) -> list[str]:
     centres = np.array([view.camera.center for view in scene.train])
-    one = len(centres) >= LEAST_TRAIN and not np.ptp(centres, axis=0).any()
+    one = len(centres) >= MIN_TRAIN and not np.ptp(centres, axis=0).any()
     return [view.name for view in scene.train if one]
 
 
@@ -136,7 +136,7 @@ def _one_point(scene: Scene) -> list[str]:
 
 def _no_point_in_view(scene: Scene) -> list[str]:
     xyz = scene.points.xyz
-    xyz = xyz[:: max(1, len(xyz) // MOST_POINTS)]
+    xyz = xyz[:: max(1, len(xyz) // MAX_POINTS)]
     for view in scene.train if len(xyz) else ():
         camera = view.camera
         local = camera.to_camera(xyz)

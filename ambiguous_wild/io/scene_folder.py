@@ -22,7 +22,7 @@ from ambiguous_wild.io.images import image_size
 from ambiguous_wild.io.scene_checks import check_masks, check_scene
 
 SCENE_SCHEMA = 1  # version of scene.json, raised when an older reader would misread it
-MOST_FACTOR = 1000  # largest downsampling factor; the builder allows 64
+MAX_FACTOR = 1000  # largest downsampling factor; the builder allows 64
 SIDES: tuple[Split, Split] = ("train", "test")
 MAP = "map.png"  # in the scene's folder: the cameras from above
 TEST_EVERY = 8  # in scenes without lists every 8th photo is a test photo, as in 3DGS and gsplat
@@ -136,8 +136,8 @@ def _check_fields(path: Path, info: dict[str, object]) -> None:
     """Raise AwError where a key that readers need has the wrong type."""
     factor, name, files = info.get("factor"), info.get("name", ""), info.get("files")
     wrong = []
-    if not _is_count(factor) or not 1 <= factor <= MOST_FACTOR:
-        wrong.append(f"factor must be a whole number from 1 to {MOST_FACTOR}, not {quoted(factor)}")
+    if not _is_count(factor) or not 1 <= factor <= MAX_FACTOR:
+        wrong.append(f"factor must be a whole number from 1 to {MAX_FACTOR}, not {quoted(factor)}")
     if not isinstance(name, str):
         wrong.append(f"name must be a text, not {quoted(name)}")
     if not isinstance(files, dict):
@@ -301,7 +301,7 @@ def _default_factor(root: Path, info: SceneInfo | None) -> int:
 def shipped_factors(root: Path) -> list[int]:
     """Return the factors N of the downsampled folders images_N, ascending."""
     tails = (p.name.removeprefix("images_") for p in root.glob("images_*") if p.is_dir())
-    return sorted(int(t) for t in tails if t.isdigit() and 1 < int(t) <= MOST_FACTOR)
+    return sorted(int(t) for t in tails if t.isdigit() and 1 < int(t) <= MAX_FACTOR)
 
 
 def _image_folder(root: Path, factor: int) -> Path:

@@ -31,12 +31,12 @@ from ambiguous_wild.io.splat_arrays import (
 )
 
 _CODES = 256  # entries of a codebook
-_MOST_PALETTE = 65536
+_MAX_PALETTE = 65536
 _ROUNDS = 20  # rounds of Lloyd's algorithm
 _BINS = 1 << 14
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # fixed time of files in the archive: the same model gives the same bytes
 _ROW = 64  # palette entries in a row of their texture
-_MOST_TEXTURE = 1 << 28
+_MAX_TEXTURE = 1 << 28
 _LOSSLESS = 101  # WebP quality above 100
 
 
@@ -189,7 +189,7 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The set is halved at the median of its widest dimension until there are K parts; the reference sets K.
     """
     n = len(rows)
-    halvings = int(np.log2(min(_MOST_PALETTE, n)))
+    halvings = int(np.log2(min(_MAX_PALETTE, n)))
     order, starts = np.arange(n), np.zeros(1, np.int64)
     for _ in range(halvings):
         ordered = rows[order].astype(np.float64)
@@ -229,6 +229,6 @@ def _read_webp(data: bytes) -> np.ndarray:
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
-    if archive.getinfo(name).file_size > _MOST_TEXTURE:
+    if archive.getinfo(name).file_size > _MAX_TEXTURE:
         raise ValueError(f"{name} is larger than a texture can be")
     return archive.read(name)

@@ -13,7 +13,7 @@ from ambiguous_wild.core import UNMOVED, SceneTransform
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
-_MOST_LOGIT = 15.0  # its sigmoid is 3e-7 below 1; formats that store alpha cannot hold an infinite logit
+_MAX_LOGIT = 15.0  # its sigmoid is 3e-7 below 1; formats that store alpha cannot hold an infinite logit
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
     Rows with a value that is not finite are left out; an opacity of exactly 0 or 1 (infinite logits) stays.
     """
     # exact 0 and 1 as converters of 8-bit alpha write them
-    logits = np.nan_to_num(gaussians["opacity_logits"], nan=np.nan, posinf=_MOST_LOGIT, neginf=-_MOST_LOGIT)
+    logits = np.nan_to_num(gaussians["opacity_logits"], nan=np.nan, posinf=_MAX_LOGIT, neginf=-_MAX_LOGIT)
     gaussians = {**gaussians, "opacity_logits": logits}
     sound = np.ones(len(gaussians["means"]), bool)
     for name in _NAMES:
@@ -52,7 +52,7 @@ def logit(alpha: np.ndarray) -> np.ndarray:
     """Return the inverse of the sigmoid, clamped to finite values."""
     with np.errstate(divide="ignore"):
         logits = np.log(alpha) - np.log1p(-alpha.astype(np.float64))
-    return np.clip(logits, -_MOST_LOGIT, _MOST_LOGIT).astype(np.float32)
+    return np.clip(logits, -_MAX_LOGIT, _MAX_LOGIT).astype(np.float32)
 
 
 def rounded(

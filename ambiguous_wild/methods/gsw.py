@@ -47,7 +47,7 @@ CHANNELS, FREE = 16, 2  # channels of a map; number of maps that are sampled at 
 DYNAMIC = (FREE + 1) * CHANNELS
 INTRINSIC, OCTAVES = 48, 10  # intrinsic features of a Gaussian; octaves of the code of positions
 LENGTH = 70_000  # iterations of the release's commands
-MOST = 64  # number of train photos whose maps are averaged for a camera without a photo
+MAX_AVERAGED = 64  # number of train photos whose maps are averaged for a camera without a photo
 
 
 def unet_leaves(width: int, rng: np.random.Generator, rate: float) -> dict[str, Leaf]:
@@ -144,7 +144,7 @@ class GswAppearance(Learnt):
         self.seed, self.points, self.all_photos = data.seed, data.sfm_points, data.photos
         self.unit = SceneNormaliser(data.scene.points.xyz, data.device)
         self.cameras, count = data.cameras, len(data.photos)
-        self.chosen = sorted({k * count // min(count, MOST) for k in range(min(count, MOST))})
+        self.chosen = sorted({k * count // min(count, MAX_AVERAGED) for k in range(min(count, MAX_AVERAGED))})
         self._cached: tuple[float, list[Tensor]] | None = None  # nominal iteration, and maps of those photos
         super().setup(data)
 
@@ -209,7 +209,7 @@ class GswAppearance(Learnt):
 
     @torch.no_grad()
     def _maps(self, context: ViewContext, leaf: Mapping[str, Tensor]) -> list[Tensor]:
-        """Return maps of at most `MOST` train photos, evenly chosen; computed once an iteration."""
+        """Return maps of at most `MAX_AVERAGED` train photos, evenly chosen; computed once an iteration."""
         if self._cached is None or self._cached[0] != context.nominal:
             maps = [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen]
             self._cached = context.nominal, maps

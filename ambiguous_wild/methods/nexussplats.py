@@ -44,7 +44,7 @@ from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewC
 from ambiguous_wild.vision.backends import check_features
 
 CODE, SHIFT = 32, 4.0  # length of codes; offset of the drawn uncertainty, because the renderer clamps at 0
-LEAST = 0.1  # smallest sigma
+MIN_SIGMA = 0.1  # smallest sigma
 GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
 COLOURING = ("nexussplats", "exposure", "appearance")  # effects that are not applied to the uncertainty
 
@@ -184,7 +184,7 @@ class Doubt(EffectMask, CountingMask, WarmUpMask):
             raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).detach().requires_grad_(learn)
             # with an upper limit of w instead, the distance has no gradient where w reaches it, and sigma
             # falls without end
-            sigma = LEAST + F.softplus(raw)
+            sigma = MIN_SIGMA + F.softplus(raw)
             weight = 0.5 / sigma.square()
         judged = weight.detach()
         if self.config.boundary:

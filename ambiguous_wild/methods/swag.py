@@ -34,7 +34,7 @@ PARTS = 8  # parallel parts of the positions
 PRIMES = (1, 2_654_435_761, 805_459_861)  # as in Instant-NGP
 _SECOND, _THIRD = np.uint64(PRIMES[1]), np.uint64(PRIMES[2])
 PHOTO = 24
-CLOSED, LEAST = -20.0, 1e-7  # logit of Gaussians that are left out; least opacity under a gate
+CLOSED, MIN_OPACITY = -20.0, 1e-7  # logit of Gaussians that are left out; least opacity under a gate
 
 
 @kernel
@@ -230,7 +230,7 @@ class GatedColours(Learnt):
         a = self._net(self.encoded(gaussians.means[seen], leaf), colours, leaf)[:, 3]
         u = hashed_uniform(len(logits), (self.seed, context.iteration, 0x5A), logits.device)[seen]
         z = torch.sigmoid((a + torch.logit(u)) / self.config.temperature)
-        opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(LEAST, 1.0 - 1e-6)
+        opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(MIN_OPACITY, 1.0 - 1e-6)
         opened = logits.clone()
         opened[seen] = torch.logit(opacity)
         gate = mean_of_seen(z, means[seen], context.camera)

@@ -22,7 +22,7 @@ from ambiguous_wild.report.cost_runs import CostRun, Length, why_unranked
 from ambiguous_wild.report.grouping import grouped
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
-MOST = 0.9  # of the best PSNR
+NEAR_BEST = 0.9  # of the best PSNR
 LAST_DB = 1.0
 
 
@@ -382,7 +382,7 @@ def _answer(scene: str, curves: Sequence[Curve]) -> TargetRow | None:
     best = best_curve.end(scene)
     # seeds end above or below their mean, so the mean is reached at the end of the training
     end_s = summary(best_curve, (scene,), lambda run: run.train_s + run.added_s).mean
-    most = _first(finished, MOST * best)
+    most = _first(finished, NEAR_BEST * best)
     before = _first([best_curve], best - LAST_DB)
     return TargetRow(
         scene,

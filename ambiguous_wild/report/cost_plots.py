@@ -22,7 +22,7 @@ DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))  # when colour
 GREY = "0.45"
 PANEL = (4.6, 3.4)  # inches
 DPI = 130
-MOST_COLUMNS = 3
+MAX_COLUMNS = 3
 AXES = (
     ("minutes", "training time", True),
     ("model_mb", "model size (MB)", True),
@@ -36,7 +36,7 @@ def new_figure(
     """Make a figure without a screen; return it with the axes of its panels. `reading` is a line below it."""
     from matplotlib.figure import Figure
 
-    columns = 2 if panels == 4 else min(MOST_COLUMNS, panels)
+    columns = 2 if panels == 4 else min(MAX_COLUMNS, panels)
     rows = -(-panels // columns)
     figure = Figure(figsize=(panel[0] * columns, panel[1] * rows), layout="constrained", dpi=DPI)
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)

@@ -21,7 +21,7 @@ LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
 MEMORY = ("model_mb",)
 LEVEL = 0.95
 RESAMPLES = 2000
-LEAST = 6  # images; five differences have the same sign by chance once in 16 times
+MIN_IMAGES = 6  # images; five differences have the same sign by chance once in 16 times
 FAMILIES = ("psnr", "ssim", "lpips")
 NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
@@ -246,7 +246,7 @@ class Ties:
             finite = ~(np.isinf(a) | np.isinf(b))  # means leave out infinite values, so differences do too
             differences.append(a[finite] - b[finite])
         low, high = difference_interval(differences)
-        few = sum(map(len, differences)) < LEAST and not math.isnan(low)
+        few = sum(map(len, differences)) < MIN_IMAGES and not math.isnan(low)
         return few or low <= 0.0 <= high
 
 

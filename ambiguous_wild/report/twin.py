@@ -21,7 +21,7 @@ from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.harness.effects_plan import (
     APPEARANCE,
     EXPOSURE,
-    LEAST_SPREAD,
+    MIN_SPREAD,
     OF_SHINE,
     OUTWARD,
     SAMPLING,
@@ -46,7 +46,7 @@ from ambiguous_wild.simulate.spec import (
 from ambiguous_wild.simulate.spec_file import check_spec
 from ambiguous_wild.splat.effects.tracks import BRIGHT, DARK
 
-MOST_PHOTOS = 64  # photos whose noise and blur are measured
+MAX_PHOTOS = 64  # photos whose noise and blur are measured
 LONGEST = 960  # px, longer side of a simulated photo, as in the presets
 MOVES = 0.003  # share of features that move: static captures have up to 0.0013, others from 0.0037
 # Distractors cover more than the share of features that move: one to eight times it in ten captures.
@@ -100,7 +100,7 @@ def measure_likeness(scene: Scene) -> Likeness:
             "its photos with 'aw build-scene'"
         )
     photos = [load_image_float(view.image_path) for view in scene.train]
-    step = max(-(-len(scene.train) // MOST_PHOTOS), 1)
+    step = max(-(-len(scene.train) // MAX_PHOTOS), 1)
     noises, smaller, sharp = [], [], []
     for view in scene.train[::step]:
         photo = load_image_float(_full_size(scene, view))
@@ -184,7 +184,7 @@ def _effects(of: Likeness, factor: int, seed: int, views: int) -> Effects:
     drawn = [PhotoRandom(seed, k, k / (count - 1)) for k in range(count)]
     spread = SPREAD_OF_STOP * np.std([draw_exposure_drift(ExposureDrift(1.0), r) for r in drawn], ddof=1)
     stops = (
-        float(_clear(seen.exposure, EXPOSURE) / spread) if seen.exposure >= LEAST_SPREAD and not day else 0.0
+        float(_clear(seen.exposure, EXPOSURE) / spread) if seen.exposure >= MIN_SPREAD and not day else 0.0
     )
     iso = _iso(of.noise * factor) if of.noise else 0.0
     return Effects(

@@ -50,9 +50,9 @@ from ambiguous_wild.simulate.placement import (
 from ambiguous_wild.simulate.truth_records import summary
 
 _TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos
-_MOST_PIECES = 3  # largest number of pieces in a photo
+_MAX_PIECES = 3  # largest number of pieces in a photo
 _SPREAD = (0.5, 1.5)  # range of a photo's coverage, relative to the mean
-_MOST_COVER = 0.6  # largest mean coverage of photos with distractors
+_MAX_COVER = 0.6  # largest mean coverage of photos with distractors
 _MIDDLE = (0.15, 0.85)  # range of a piece's middle, relative to the photo's sides
 
 
@@ -85,10 +85,10 @@ def composite_photos(
     root, target = Path(source), Path(output)
     check_request(root, target, config, cutouts)
     mean = config.coverage / config.presence  # mean coverage of photos with distractors
-    if mean > _MOST_COVER:
+    if mean > _MAX_COVER:
         raise AwError(
             f"--coverage {config.coverage:g} with --presence {config.presence:g} covers {mean:.2f} of a "
-            f"photo, more than {_MOST_COVER:g}; lower --coverage or raise --presence"
+            f"photo, more than {_MAX_COVER:g}; lower --coverage or raise --presence"
         )
     shapes = [] if cutouts is None else read_cutouts(cutouts)
     paths, base = _list_photos(root), _base(root)
@@ -231,7 +231,7 @@ def _draw(
     shapes: list[Cutout], others: list[Path], area: float, patches: bool, rng: np.random.Generator
 ) -> list[tuple[Cutout, str, bool]]:
     """Draw one to three pieces that fill `area` px: cut-out, photo that it was cut from, mirrored or not."""
-    count = int(rng.integers(1, _MOST_PIECES + 1))
+    count = int(rng.integers(1, _MAX_PIECES + 1))
     shown = [shapes[int(rng.integers(len(shapes)))] for _ in range(count)] if shapes else blobs(rng)[:count]
     drawn = []
     for cutout in shown:

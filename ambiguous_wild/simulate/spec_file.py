@@ -29,7 +29,7 @@ from ambiguous_wild.simulate.spec import (
 from ambiguous_wild.simulate.world import POSTERS, SHEETS
 
 PICTURES = tuple(f"poster_{name}" for name in POSTERS)
-MOST = 255  # largest number of distractors, as the ray caster stores a pixel's distractor in a byte
+MAX_DISTRACTORS = 255  # the ray caster stores a pixel's distractor in a byte
 KINDS: dict[str, type] = {
     name: next(kind for kind in typing.get_args(hint) if kind is not type(None))
     for name, hint in typing.get_type_hints(Effects).items()
@@ -182,8 +182,8 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
     _within("", spec, {**_SPEC, **_WALKS[spec.walk], "eye_m": (0.2, plan.highest_m)})
     if not 1 <= spec.samples <= 64 or math.isqrt(spec.samples) ** 2 != spec.samples:
         raise AwError(f"samples: a square number from 1 to 64, got {spec.samples}")
-    if len(spec.distractors) > MOST:
-        raise AwError(f"distractors: at most {MOST}, got {len(spec.distractors)}")
+    if len(spec.distractors) > MAX_DISTRACTORS:
+        raise AwError(f"distractors: at most {MAX_DISTRACTORS}, got {len(spec.distractors)}")
     for k, distractor in enumerate(spec.distractors):
         if not distractor.name.strip():
             raise AwError(f"distractors[{k}].name: empty; capture.json lists the placed distractors by name")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 
-LEAST_POINTS = 4  # points to start from: the size of a Gaussian is the distance of three neighbours
+MIN_POINTS = 4  # points to start from: the size of a Gaussian is the distance of three neighbours
 # what the renderer reads, in the order of the fields of `Gaussians` and `Gradients`
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 SH_C0 = 0.28209479177387814  # zeroth real spherical harmonic, 1 / (2 sqrt(pi))
@@ -184,9 +184,9 @@ class Gaussians:
         Raises:
             AwError: fewer than 4 points.
         """
-        if len(xyz) < LEAST_POINTS:
+        if len(xyz) < MIN_POINTS:
             raise AwError(
-                f"cannot start from {len(xyz)} points: at least {LEAST_POINTS} are needed; "
+                f"cannot start from {len(xyz)} points: at least {MIN_POINTS} are needed; "
                 "check the sparse model"
             )
         from scipy.spatial import cKDTree

@@ -21,7 +21,7 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.fields import Fields
-from ambiguous_wild.splat.gaussians import LEAST_POINTS, Gaussians
+from ambiguous_wild.splat.gaussians import MIN_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, Rendered
 from ambiguous_wild.splat.step import Step, TrainData
@@ -248,7 +248,7 @@ class MethodHooks:
         xyz, rgb = self.given or (data.scene.points.xyz, data.scene.points.rgb)
         kept = thinned(len(xyz), most)
         xyz, rgb = xyz[kept], rgb[kept]
-        for points in self.more_points if len(xyz) >= LEAST_POINTS else ():  # fewer are refused below
+        for points in self.more_points if len(xyz) >= MIN_POINTS else ():  # fewer are refused below
             room = int(START_SHARE * most) - len(xyz)
             if room > 0:
                 more = points(data, room)
@@ -309,5 +309,5 @@ def thinned(count: int, most: int) -> np.ndarray:
     if not most or count <= most:
         return np.arange(count)
     # chosen at random: points of a scan have no tracks that would show which of them matter
-    chosen = np.random.default_rng(0).choice(count, max(int(START_SHARE * most), LEAST_POINTS), replace=False)
+    chosen = np.random.default_rng(0).choice(count, max(int(START_SHARE * most), MIN_POINTS), replace=False)
     return np.sort(chosen)

@@ -22,7 +22,7 @@ from ambiguous_wild.io.files import write_text
 # growth comes every hundredth step, merging every thousandth; a divisor of these would time them too often.
 SAMPLED = 17
 ROWS = 100  # rows of a timeline
-MOST = 20_000  # positions kept of each kind: enough for a picture, small in every checkpoint
+MAX_POSITIONS = 20_000  # positions kept of each kind: enough for a picture, small in every checkpoint
 
 
 class Clock:
@@ -193,7 +193,7 @@ class Timeline:
 
 @dataclass
 class SampledPositions:
-    """Positions [n, 3] in the world, thinned evenly to at most `MOST` without random numbers."""
+    """Positions [n, 3] in the world, thinned evenly to at most `MAX_POSITIONS` without random numbers."""
 
     xyz: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
     stride: int = 1  # one in `stride` positions is kept
@@ -204,7 +204,7 @@ class SampledPositions:
         first = -self.passed % self.stride
         self.passed += len(xyz)
         self.xyz = torch.cat([self.xyz, xyz.detach()[first :: self.stride].cpu()])
-        while len(self.xyz) > MOST:
+        while len(self.xyz) > MAX_POSITIONS:
             self.xyz = self.xyz[::2].clone()
             self.stride *= 2
 

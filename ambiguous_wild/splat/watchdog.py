@@ -41,7 +41,7 @@ Kind = Literal["loss", "gradient", "parameter"]
 FOLDER = "nonfinite"
 REPORT, GOOD, STEP = "report.json", "good.safetensors", "step.safetensors"
 EVERY = 50  # iterations between checks of the parameters
-MOST_ROLLBACKS = 5  # a run that needs more is stopped
+MAX_ROLLBACKS = 5  # a run that needs more is stopped
 _CHECKED = ("means", "quats", "log_scales", "opacity_logits", "sh0")  # gradients that are checked
 
 
@@ -150,7 +150,7 @@ class Watchdog:
     @property
     def rolls_back(self) -> bool:
         """Whether the run rolls back after a finding."""
-        return self.action == "rollback" and len(self.rollbacks) < MOST_ROLLBACKS
+        return self.action == "rollback" and len(self.rollbacks) < MAX_ROLLBACKS
 
     def note_rollback(self, error: NonFinite, earlier: list[Facts], *, epoch: int, iteration: int) -> None:
         """Note that the run was rolled back: the photo is left out for the rest of its epoch.

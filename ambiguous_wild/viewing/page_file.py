@@ -24,11 +24,11 @@ from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="aw view">'
-MOST_GAUSSIANS = 150_000  # default size of a model: about 6 MB, which a phone still turns smoothly
-MOST_PHOTO_BYTES = 1_000_000  # text of all photos and of the map
-MOST_MAP_BYTES = 200_000
-MOST_POINTS = 20_000  # moving and static features of all photos
-MOST_MASK_BYTES = 300_000  # text of the masks of all models
+MAX_GAUSSIANS = 150_000  # default size of a model: about 6 MB, which a phone still turns smoothly
+MAX_PHOTO_BYTES = 1_000_000  # text of all photos and of the map
+MAX_MAP_BYTES = 200_000
+MAX_POINTS = 20_000  # moving and static features of all photos
+MAX_MASK_BYTES = 300_000  # text of the masks of all models
 _SPZ = FORMATS["spz"]  # the format that the page's renderer reads
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
@@ -69,7 +69,7 @@ def page_text(
     models: Sequence[ViewedModel],
     *,
     title: str,
-    most_gaussians: int = MOST_GAUSSIANS,
+    most_gaussians: int = MAX_GAUSSIANS,
     notes: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> tuple[str, int]:
@@ -111,7 +111,7 @@ def page_text(
         elements.append(
             f'<script id="{element}" type="text/plain">{base64.b64encode(packed).decode("ascii")}</script>'
         )
-        facts.append(_model_facts(model, element, views, scene.train, MOST_MASK_BYTES // len(models)))
+        facts.append(_model_facts(model, element, views, scene.train, MAX_MASK_BYTES // len(models)))
     for line in page_notes:
         say(line)
     space = space_of(scene)
@@ -120,7 +120,7 @@ def page_text(
         drawn = Renderer(models[0].read(), models[0].render_settings)
         uris = [data_uri("jpeg", jpeg_bytes(narrowed(drawn(v.camera), WIDTHS[1]), _QUALITY)) for v in views]
     else:
-        uris = photo_uris(views, MOST_PHOTO_BYTES - len(capture_map))
+        uris = photo_uris(views, MAX_PHOTO_BYTES - len(capture_map))
     data = {
         "up": space.up.tolist(),
         "middle": space.middle.tolist(),
@@ -174,7 +174,7 @@ def _points(scene: Scene, views: Sequence[View]) -> list[list[int]]:
 
     Each photo has the same largest number of features; moving ones come first.
     """
-    motion_points, most = read_motion_points(scene.root), MOST_POINTS // max(len(views), 1)
+    motion_points, most = read_motion_points(scene.root), MAX_POINTS // max(len(views), 1)
     rows: list[list[int]] = []
     for view in views:
         points = motion_points.get(view.name)
@@ -228,7 +228,7 @@ def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
 
 def map_uri(path: Path) -> str:
     """Return a data: address of the scene's map as JPEG, "" without one."""
-    return _as_wide_as_fits(_photo, [path], MAP_WIDTHS, MOST_MAP_BYTES)[0] if path.is_file() else ""
+    return _as_wide_as_fits(_photo, [path], MAP_WIDTHS, MAX_MAP_BYTES)[0] if path.is_file() else ""
 
 
 def mask_uris(folder: Path, views: Sequence[View], most_bytes: int) -> dict[str, str]:

@@ -22,9 +22,9 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and
 _TILT_DEG = 15.0  # angle of an orbit's cameras above the middle
 _WIDTH, _HEIGHT, _VIEWS = 960, 540, 8  # px and number of cameras without a scene
 _AWAY = 3.0  # distance of these cameras, relative to the Gaussians' median distance from their middle
-_MOST_POINTS = 20_000
+_MAX_POINTS = 20_000
 _GAP = 4  # px between pictures
-_MOST_SIDE = 8192  # px; largest side of a frame
+_MAX_SIDE = 8192  # px; largest side of a frame
 _GIF_COLOURS = 128
 
 
@@ -75,7 +75,7 @@ def scene_around(model: ViewedModel) -> Scene:
     """
     place = model.place
     xyz = model.read()["means"].astype(np.float64)
-    xyz = xyz[:: -(-len(xyz) // _MOST_POINTS)] @ place.rotation / place.scale + place.centre
+    xyz = xyz[:: -(-len(xyz) // _MAX_POINTS)] @ place.rotation / place.scale + place.centre
     middle = np.median(xyz, axis=0)
     size = float(np.median(np.linalg.norm(xyz - middle, axis=1))) or 1.0
     axes = np.concatenate([place.rotation, -place.rotation])
@@ -232,10 +232,8 @@ def draw_frames(
     down = -(-count // across)
     width, height = cameras[0].width, cameras[0].height
     size = (down * (height + _GAP) - _GAP, across * (width + _GAP) - _GAP)
-    if max(size) > _MOST_SIDE:
-        raise AwError(
-            f"a frame would be {size[1]}x{size[0]} px, at most {_MOST_SIDE}; give a smaller --width"
-        )
+    if max(size) > _MAX_SIDE:
+        raise AwError(f"a frame would be {size[1]}x{size[0]} px, at most {_MAX_SIDE}; give a smaller --width")
     renderers = [Renderer(model.read(), model.render_settings) for model in models]
     for number, camera in enumerate(cameras):
         frame = np.zeros(

@@ -28,7 +28,7 @@ POINTS = "features: green stay, red move"  # caption of `draw_points`
 MOVING_PX, STATIC_PX = 3.0, 2.0
 VOTES = 3  # votes of a feature at most: one for each photo that it is matched in
 SEGMENT_VOTES = 1.0  # votes of a segment at most
-LEAST_PROMPT = 3  # a motion of fewer features is no prompt
+MIN_PROMPT = 3  # a motion of fewer features is no prompt
 UNSURE = 1.0  # votes that are added, half to each side: they pull the map towards 0.5
 
 
@@ -76,7 +76,7 @@ def moving_labels(
         points: the photo's features.
         folder: the cache.
     """
-    motions = np.flatnonzero(np.bincount(points.motion)[1:] >= LEAST_PROMPT) + 1
+    motions = np.flatnonzero(np.bincount(points.motion)[1:] >= MIN_PROMPT) + 1
     if not isinstance(instances, SamInstances) or not len(motions):
         return labels
     xy = points.xy * labels.shape[::-1]

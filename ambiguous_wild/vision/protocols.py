@@ -17,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import State
 from ambiguous_wild.io.progress_bar import Progress
 
-_LEAST_PX = 8
+_MIN_PX = 8
 _BLUR_PX, _NOISE = 1.5, 0.02  # blur and noise of the copies that set units and weights of features
 
 
@@ -151,7 +151,7 @@ def check_sizes(name: str, size: int, cell: int, fit_photos: int) -> None:
 
 def check_image(image: Tensor) -> None:
     """Raise AwError if the image is not [H, W, 3] or smaller than 8 px."""
-    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < _LEAST_PX:
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < _MIN_PX:
         raise AwError(f"features need an image of [H, W, 3], at least 8x8 px, got {list(image.shape)}")
 
 

@@ -19,16 +19,16 @@ from ambiguous_wild.core import Camera
 BEHIND = 1.15  # a point deeper than this times the nearest static depth is behind the surface
 PIXELS = 20_000  # most pixels of a map; results are enlarged to the photo's size
 _CELLS = 32  # cells along a side; within a cell, points far behind the nearest one are occluded
-_LEAST_POINTS = 8
+_MIN_POINTS = 8
 _FRAME_PIXELS = 1000  # pixels of a map that says how many cameras have a place in their frame
-_MOST_POINTS = 4000  # a random subset; more points are slower and not better (see docs/metrics.md)
+_MAX_POINTS = 4000  # a random subset; more points are slower and not better (see docs/metrics.md)
 
 
 def some_points(xyz: np.ndarray) -> np.ndarray:
     """Return a fixed random subset of the points [M, 3], large enough for surfaces."""
-    if len(xyz) <= _MOST_POINTS:
+    if len(xyz) <= _MAX_POINTS:
         return xyz
-    return xyz[np.random.default_rng(0).permutation(len(xyz))[:_MOST_POINTS]]
+    return xyz[np.random.default_rng(0).permutation(len(xyz))[:_MAX_POINTS]]
 
 
 def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
@@ -42,7 +42,7 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
     near = _around(x, y, (h, w))
     x, y, z = x[near], y[near], xyz[near, 2]
     front = _in_front(x / w, y / h, z)
-    if front.sum() < _LEAST_POINTS:
+    if front.sum() < _MIN_POINTS:
         return None
     try:
         surface = LinearNDInterpolator(np.column_stack([x, y])[front], 1.0 / z[front])

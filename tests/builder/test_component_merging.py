@@ -278,7 +278,7 @@ def test_an_open_model_and_photos_of_few_points_are_provisional(monkeypatch):
     component = registered_with_noise(None)
     component.mark_provisional()
     assert component.provisional == set(range(6))
-    monkeypatch.setattr(registration, "LEAST_POINTS", 10)
+    monkeypatch.setattr(registration, "MIN_POINTS", 10)
     monkeypatch.setattr(registration, "UNSURE", np.array([np.radians(0.25), np.inf]))
     component = registered_with_noise(4)
     component.mark_provisional()

@@ -23,7 +23,7 @@ from ambiguous_wild.builder.relative_poses import (
     estimate_relative_poses,
     focal_votes,
 )
-from ambiguous_wild.builder.retrieval import FEW
+from ambiguous_wild.builder.retrieval import FEW_PHOTOS
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.colmap_model import read_model
@@ -197,7 +197,8 @@ def test_a_photo_without_a_clear_pose_is_named_with_the_reason():
 
 
 def test_only_many_photos_are_adjusted_iteratively():
-    few, many = (adjustment_options(True, photos, final=True).ceres for photos in (FEW, FEW + 1))
+    sizes = FEW_PHOTOS, FEW_PHOTOS + 1
+    few, many = (adjustment_options(True, photos, final=True).ceres for photos in sizes)
     assert few.auto_select_solver_type and not many.auto_select_solver_type
     assert many.solver_options.linear_solver_type.name == "ITERATIVE_SCHUR"
 
@@ -307,7 +308,7 @@ def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypat
     write_capture(tmp_path / "raw", 6)
     set_in_worker(
         monkeypatch,
-        "registration.LEAST_SUPPORT = registration.LEAST_SUPPORT_NEW = pose_hypothesis.LITTLE_AREA = 99",
+        "registration.MIN_SUPPORT = registration.MIN_SUPPORT_NEW = pose_hypothesis.LITTLE_AREA = 99",
     )
     with pytest.raises(AwError, match="placed 0 of 6 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500, sfm="fast"))

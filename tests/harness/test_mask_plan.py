@@ -12,9 +12,9 @@ from ambiguous_wild.harness.effects_plan import Evidence, decide
 from ambiguous_wild.harness.mask_plan import (
     CERTAIN,
     HELD_BACK,
-    LEAST_DB,
-    LEAST_PHOTOS,
     MASK_LINES,
+    MIN_DB,
+    MIN_PHOTOS,
     Gain,
     Occlusion,
     Pair,
@@ -40,7 +40,7 @@ def test_a_gain_is_the_mean_over_photos_and_its_standard_error():
     gain = compare(psnr(21.0, 22.0, 23.0, 24.0), psnr(20.0, 22.0, 22.0, 22.0))  # differences 1, 0, 1, 2
     assert gain.db == pytest.approx(1.0)
     assert gain.error_db == pytest.approx(math.sqrt(2 / 3) / 2)
-    assert compare(psnr(*[20.0] * (LEAST_PHOTOS - 1)), psnr(*[20.0] * 9)) is None
+    assert compare(psnr(*[20.0] * (MIN_PHOTOS - 1)), psnr(*[20.0] * 9)) is None
 
 
 def test_masks_are_off_where_leaving_the_patches_out_does_not_pay():
@@ -125,4 +125,4 @@ def test_leaving_distractors_out_helps_and_leaving_the_scene_out_harms(scene, tm
         return compare(*arms)
 
     static, spoilt = gain(scene), gain(load_scene(root))
-    assert static.db < LEAST_DB and static.db < 0 < spoilt.db
+    assert static.db < MIN_DB and static.db < 0 < spoilt.db

@@ -16,13 +16,13 @@ def numbered(start: int, count: int) -> torch.Tensor:
 
 @given(st.lists(st.integers(0, 70), max_size=12))
 def test_what_is_kept_is_every_so_many_th_of_all(sizes):
-    most, training_records.MOST = training_records.MOST, 16
+    most, training_records.MAX_POSITIONS = training_records.MAX_POSITIONS, 16
     try:
         places = SampledPositions()
         for size in sizes:
             places.add(numbered(places.passed, size))
     finally:
-        training_records.MOST = most
+        training_records.MAX_POSITIONS = most
     total = sum(sizes)
     assert places.passed == total
     assert len(places.xyz) <= 16

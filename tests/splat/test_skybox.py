@@ -13,7 +13,7 @@ from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.effects.skybox import COUNT, LEAST, Skybox, fibonacci_sphere, sphere_of
+from ambiguous_wild.splat.effects.skybox import COUNT, MIN_SPHERE_POINTS, Skybox, fibonacci_sphere, sphere_of
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
@@ -100,7 +100,7 @@ def test_with_little_room_it_is_coarser_and_still_all_around(data):
     assert len(Skybox().first_points(data, 0)[0]) == 0
     tiny = Skybox()
     count = len(tiny.first_points(data, 3)[0])
-    assert count <= 3 and LEAST > 0
+    assert count <= 3 and MIN_SPHERE_POINTS > 0
 
 
 def trainer_for(data, folder, parts, iterations=140, **config):

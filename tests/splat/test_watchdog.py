@@ -12,7 +12,7 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.training_loop import train
-from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MOST_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
+from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MAX_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.splat.test_trainer import parts_of
 
@@ -103,7 +103,7 @@ def test_a_rollback_goes_on_as_if_the_photo_had_been_left_out(scene, tmp_path):
 
 def test_a_photo_that_never_works_ends_the_run(scene, tmp_path):
     trainer = poisoned(scene, tmp_path, Poison(view=3), on_nonfinite="rollback")
-    with pytest.raises(NonFinite, match=f"after {MOST_ROLLBACKS} rollbacks"):
+    with pytest.raises(NonFinite, match=f"after {MAX_ROLLBACKS} rollbacks"):
         train(trainer)
 
 

@@ -23,7 +23,7 @@ NERF_W: Evaluation = {
     "effects": ["appearance"],
     "source": "NeRF-W: colour is fitted on the left half of a test photo, the right half is measured",
 }
-LEAST_SHARE = 0.5  # of the table's photos in the model; below, the table belongs to another scene
+MIN_SHARE = 0.5  # of the table's photos in the model; below, the table belongs to another scene
 
 
 def find_table(root: Path) -> Path | None:
@@ -82,7 +82,7 @@ def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
     total = sum(len(v) for v in listed.values())
     bases = {PurePosixPath(n).name for n in names}
     in_model = sum(PurePosixPath(n).name in bases for v in listed.values() for n in v)
-    if total and in_model < LEAST_SHARE * total and table is not None:
+    if total and in_model < MIN_SHARE * total and table is not None:
         raise AwError(
             f"{table} names {total} photos, {in_model} of them are in the model of {len(names)}: it is the "
             "table of another scene"

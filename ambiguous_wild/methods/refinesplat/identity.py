@@ -22,7 +22,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.threshold import Variant
 
-MOST_IDENTITIES = 255
+MAX_IDENTITIES = 255
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def associate(
     min_shared: int = 3,
     min_share: float = 0.25,
     min_similarity: float = 0.8,
-    most: int = MOST_IDENTITIES,
+    most: int = MAX_IDENTITIES,
 ) -> Identities:
     """Merge instances of different photos into identities.
 

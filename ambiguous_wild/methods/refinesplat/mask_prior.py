@@ -35,7 +35,7 @@ from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_p
 _SETTLED = 0.005  # a round in which a smaller share of pixels changes is the last
 _SAME = 0.06  # difference of colour in [0, 1] up to which two photos show the same
 _EDGE = 0.003  # variance of colours in [0, 1] that is an edge for the filter
-_FEW = 0.1  # if surfaces are known for a smaller share of a photo, its answer does not limit masks
+_MIN_KNOWN = 0.1  # if surfaces are known for a smaller share of a photo, its answer does not limit masks
 _WINDOW = np.ones((3, 3), np.uint8)  # px of the map in which the colour may lie
 
 
@@ -179,7 +179,7 @@ def initial_mask_prior(
 
 def _most(answer: np.ndarray, inverse: np.ndarray | None, config: FirstLookConfig) -> float:
     """Return the share of the photo that later masks may cover."""
-    if config.most <= 0 or inverse is None or np.isfinite(inverse).mean() < _FEW:
+    if config.most <= 0 or inverse is None or np.isfinite(inverse).mean() < _MIN_KNOWN:
         return 1.0
     return min(max(config.most * masked_share([answer]), config.most_least), 1.0)
 

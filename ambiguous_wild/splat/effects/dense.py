@@ -47,8 +47,8 @@ class DenseStart(Effect):
         return {"points": self.count}
 
 
-_LEAST_POINTS = 10  # sparse points in a photo that give the range of its depths
-_MOST_POINTS = 5000  # points that choose neighbours if the model has no tracks
+_MIN_POINTS = 10  # sparse points in a photo that give the range of its depths
+_MAX_POINTS = 5000  # points that choose neighbours if the model has no tracks
 SIDE = 160  # px, the longer side at which photos are compared
 PHOTOS = 64  # largest number of photos used, evenly chosen
 PLANES = 64  # evenly spaced in inverse depth
@@ -59,7 +59,7 @@ ALONE = 0.02  # least lead of the best correlation over those of all other depth
 TOLERANCE = 0.02  # relative difference of depths that agree
 AGREEING = 2  # photos whose depth must agree, out of 2 `VIEWS`
 # degrees between two photos' rays: the best angle, spreads below and above it, and the least median angle
-_ANGLE, _BELOW, _ABOVE, _LEAST_ANGLE = 8.0, 4.0, 12.0, 1.0
+_ANGLE, _BELOW, _ABOVE, _MIN_ANGLE = 8.0, 4.0, 12.0, 1.0
 _NOISE = 1e-5  # variance of grey in [0, 1] that noise has
 _PEAK = 3  # planes around the best one that belong to its peak
 
@@ -122,8 +122,8 @@ def _small(
         static = cv2.resize(np.ascontiguousarray(keep, np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
     shrunk = camera.resized(*size)
     seen = np.asarray(track, np.int64)
-    if len(seen) < _LEAST_POINTS:  # a model without tracks: all points in the frame
-        some = np.arange(0, len(xyz), max(-(-len(xyz) // _MOST_POINTS), 1))
+    if len(seen) < _MIN_POINTS:  # a model without tracks: all points in the frame
+        some = np.arange(0, len(xyz), max(-(-len(xyz) // _MAX_POINTS), 1))
         pixels, z = _projected(shrunk, xyz[some])
         seen = some[_inside(pixels, z, rgb.shape[:2])]
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -139,7 +139,7 @@ def _neighbours(small: Sequence[_ReducedPhoto], at: int, xyz: np.ndarray, most: 
             a, b = xyz[both] - own.camera.center, xyz[both] - other.camera.center
             cosine = (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
             angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-            if not np.median(angle) >= _LEAST_ANGLE:  # from one place every depth looks the same
+            if not np.median(angle) >= _MIN_ANGLE:  # from one place every depth looks the same
                 continue
             spread = np.where(angle < _ANGLE, _BELOW, _ABOVE)
             scores.append((-float(np.exp(-0.5 * ((angle - _ANGLE) / spread) ** 2).sum()), k))
@@ -151,7 +151,7 @@ def _depth(photo: _ReducedPhoto, others: Sequence[_ReducedPhoto], xyz: np.ndarra
     shape = photo.grey.shape
     z = _projected(photo.camera, xyz[photo.seen])[1]
     z = z[z > 0]
-    if len(z) < _LEAST_POINTS or len(others) < 2:
+    if len(z) < _MIN_POINTS or len(others) < 2:
         return np.zeros(shape, np.float32)
     # a few wrong points must not spread the planes
     near, middle, far = np.quantile(z, [0.02, 0.5, 0.98])

@@ -22,12 +22,12 @@ from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.geometry import inside, projected
 from ambiguous_wild.splat.effects.tracks import tracks_of
-from ambiguous_wild.splat.gaussians import LEAST_POINTS, Gaussians
+from ambiguous_wild.splat.gaussians import MIN_POINTS, Gaussians
 from ambiguous_wild.splat.step import Step, TrainData
 
 RADIUS = 8.0  # times the distance of the farthest camera, or of 99 % of the SfM points, from their middle
 COUNT = 4000  # points on the whole sphere, some 3 degrees apart; those in a photo are used
-LEAST = 100  # a sphere with fewer points is not used
+MIN_SPHERE_POINTS = 100  # a sphere with fewer points is not used
 BLUR = 0.05  # size of the window that a colour is averaged over, as a share of a photo's longer side
 PHOTOS = 200  # largest number of photos that colours are read from
 SHARE = 0.6  # share of the depth of the nearest points below which nothing belongs
@@ -59,11 +59,11 @@ class Skybox(Effect):
         middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
         views = range(0, len(data.photos), -(-len(data.photos) // PHOTOS))
         count, self.count = COUNT, 0
-        while count >= LEAST:
+        while count >= MIN_SPHERE_POINTS:
             xyz = middle + radius * fibonacci_sphere(count)
             projections = [_project_into(data, view, xyz) for view in views]
             seen = np.unique(np.concatenate([rows for rows, _, _ in projections]))
-            if LEAST_POINTS <= len(seen) <= most:
+            if MIN_POINTS <= len(seen) <= most:
                 self.count = len(seen)
                 return xyz[seen], _colours(data, views, projections, len(xyz))[seen]
             count //= 2  # a coarser sphere, instead of a part of one

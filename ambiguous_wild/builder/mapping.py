@@ -218,11 +218,11 @@ def _map_incrementally(
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not constant_focal
     options.min_model_size = MIN_MODEL_PHOTOS
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = job["growth"]
-    options.ba_global_max_refinements = job["refinements"]
-    options.ba_global_function_tolerance = job["tolerance"]
-    options.ba_local_max_refinements = job["local_refinements"]
-    options.mapper.ba_local_num_images = job["local_cameras"]
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = job["ba_global_ratio"]
+    options.ba_global_max_refinements = job["ba_global_max_refinements"]
+    options.ba_global_function_tolerance = job["ba_global_tolerance"]
+    options.ba_local_max_refinements = job["ba_local_max_refinements"]
+    options.mapper.ba_local_num_images = job["ba_local_num_images"]
     counter = Path(job["progress"])
     state = {"best": 0, "now": 0}
 

@@ -70,11 +70,11 @@ class SfmPlan:
     matcher: str  # "exhaustive", "retrieval" or "sequential"
     similar: int  # photos that each is matched with, for "retrieval"
     neighbours: int  # next photos in the order of capture, for "retrieval"
-    growth: float  # all cameras are adjusted whenever the model has grown by this factor
-    refinements: int  # rounds of such an adjustment, at most
-    tolerance: float  # relative change of the error that ends a round; 0: when the gradient is small
-    local_refinements: int  # rounds of the adjustment after a photo was registered, at most
-    local_cameras: int  # cameras in that adjustment: the new one and those that share most points with it
+    ba_global_ratio: float  # all cameras are adjusted whenever the model has grown by this factor
+    ba_global_max_refinements: int  # rounds of such an adjustment, at most
+    ba_global_tolerance: float  # relative change of the error that ends a round; 0: when the gradient is small
+    ba_local_max_refinements: int  # rounds of the adjustment after a photo was registered, at most
+    ba_local_num_images: int  # cameras in that adjustment: the new one and those that share most points with it
     continues: bool = False  # only photos left out so far look for pairs, besides those matched so far
     worth: float = 0.0  # share of the photos that pairs must connect, else nothing is mapped
     below: float = 1.0  # the plan runs only if a smaller share of the photos is registered so far
@@ -112,12 +112,12 @@ def _fast(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> SfmPlan:
         matcher=matcher,
         similar=16 if many else 14,
         neighbours=5 if many else 2,
-        growth=2.0,
-        refinements=1,
+        ba_global_ratio=2.0,
+        ba_global_max_refinements=1,
         # All photos are registered anew afterwards, and of many the last digits cost most of the time.
-        tolerance=1e-4 if len(photos) > FEW_PHOTOS else 0.0,
-        local_refinements=1,
-        local_cameras=4,
+        ba_global_tolerance=1e-4 if len(photos) > FEW_PHOTOS else 0.0,
+        ba_local_max_refinements=1,
+        ba_local_num_images=4,
     )
 
 
@@ -130,11 +130,11 @@ def _thorough(count: int, settings: BuildSettings) -> SfmPlan:
         matcher=_matcher(count, settings, EXHAUSTIVE_LIMIT),
         similar=16,
         neighbours=5,
-        growth=1.1,
-        refinements=5,
-        tolerance=0.0,
-        local_refinements=2,
-        local_cameras=6,
+        ba_global_ratio=1.1,
+        ba_global_max_refinements=5,
+        ba_global_tolerance=0.0,
+        ba_local_max_refinements=2,
+        ba_local_num_images=6,
     )
 
 

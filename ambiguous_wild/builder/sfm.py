@@ -89,11 +89,11 @@ class MappingJob(TypedDict):
     progress: str  # file that holds the number of registered photos
     mapper: str
     part: int  # component, from 1, the largest
-    growth: float  # of `SfmPlan`, as the four below
-    refinements: int
-    tolerance: float
-    local_refinements: int
-    local_cameras: int
+    ba_global_ratio: float  # of `SfmPlan`, as the four below
+    ba_global_max_refinements: int
+    ba_global_tolerance: float
+    ba_local_max_refinements: int
+    ba_local_num_images: int
     seed: int
     jobs: int
     parent: NotRequired[int]
@@ -312,11 +312,11 @@ class StructureFromMotion:
             "progress": str(progress),
             "mapper": settings.mapper,
             "part": settings.part,
-            "growth": plan.growth,
-            "refinements": plan.refinements,
-            "tolerance": plan.tolerance,
-            "local_refinements": plan.local_refinements,
-            "local_cameras": plan.local_cameras,
+            "ba_global_ratio": plan.ba_global_ratio,
+            "ba_global_max_refinements": plan.ba_global_max_refinements,
+            "ba_global_tolerance": plan.ba_global_tolerance,
+            "ba_local_max_refinements": plan.ba_local_max_refinements,
+            "ba_local_num_images": plan.ba_local_num_images,
             "seed": settings.seed,
             "jobs": self.jobs,
         }

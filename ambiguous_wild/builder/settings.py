@@ -72,9 +72,9 @@ class SfmPlan:
     neighbours: int  # next photos in the order of capture, for "retrieval"
     ba_global_ratio: float  # all cameras are adjusted whenever the model has grown by this factor
     ba_global_max_refinements: int  # rounds of such an adjustment, at most
-    ba_global_tolerance: float  # relative change of the error that ends a round; 0: when the gradient is small
+    ba_global_tolerance: float  # relative change of the error that ends a round; 0: the gradient ends it
     ba_local_max_refinements: int  # rounds of the adjustment after a photo was registered, at most
-    ba_local_num_images: int  # cameras in that adjustment: the new one and those that share most points with it
+    ba_local_num_images: int  # images in it: the new one and those that share most points with it
     continues: bool = False  # only photos left out so far look for pairs, besides those matched so far
     worth: float = 0.0  # share of the photos that pairs must connect, else nothing is mapped
     below: float = 1.0  # the plan runs only if a smaller share of the photos is registered so far

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.ply import has_splats, read_point_ply
 from ambiguous_wild.io.splat_arrays import SplatFile
@@ -124,4 +125,4 @@ def _refuse_elsewhere(path: Path, xyz: np.ndarray, scene: Scene) -> None:
         )
         if max(shares) < _MIN_NEAR:
             raise AwError(f"{found}: give a file of this scene, in its coordinates")
-        warnings.warn(f"{found}: is it of another scene?", stacklevel=2)
+        warnings.warn(plain(f"{found}: is it of another scene?"), stacklevel=2)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.core.names import check_name, quoted
+from ambiguous_wild.core.names import check_name, plain, quoted
 from ambiguous_wild.core.scene import SceneInfo, Split, centred
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelImage
@@ -104,7 +104,7 @@ def load_scene(
     if check:
         info["warnings"] += [*(_mask_warnings(root, scene) if read is None else ()), *check_scene(scene)]
         for warning in info["warnings"]:
-            warnings.warn(f"{name}: {warning}", stacklevel=2)
+            warnings.warn(plain(f"{name}: {warning}"), stacklevel=2)
     return scene if raw else centred(scene)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.names import is_text
 from ambiguous_wild.datasets.readers import recognise
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.harness.grid import plan_cells
@@ -167,8 +169,9 @@ def test_a_scene_that_cannot_be_trained_or_measured_is_refused(make, options, me
 def test_a_bench_that_tests_nothing_is_refused(names, tmp_path):
     root = layouts.native(tmp_path / "scene")
     (root / "test_list.txt").write_bytes(names.encode("utf-16-le"))
-    with pytest.raises(AwError, match="tests nothing"):
+    with warnings.catch_warnings(record=True) as said, pytest.raises(AwError, match="tests nothing"):
         plan_cells(["3dgs"], [root], [0], TrainConfig(iterations=20))
+    assert all(is_text(str(warning.message)) for warning in said)
 
 
 def test_colours_of_start_points_are_read_under_other_names(tmp_path):

@@ -70,10 +70,10 @@ def started(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> Method
         raise AwError(f"{start.path} has changed since the run was planned; bench again")
     if isinstance(content, SplatFile):
         arrays = moved(content.gaussians, content.place, place)
-        _refuse_elsewhere(start.path, arrays["means"], scene)
+        _check_position(start.path, arrays["means"], scene)
         return replace(hooks, given=gaussians_of(arrays))
     xyz = (content[0] - place.centre) * place.scale
-    _refuse_elsewhere(start.path, xyz, scene)
+    _check_position(start.path, xyz, scene)
     return replace(hooks, given=(xyz, content[1]))
 
 
@@ -102,8 +102,8 @@ def _read(path: Path) -> SplatFile | tuple[np.ndarray, np.ndarray]:
     return xyz, rgb
 
 
-def _refuse_elsewhere(path: Path, xyz: np.ndarray, scene: Scene) -> None:
-    """Raise AwError if hardly any of the points [N, 3] lie near the scene's points, nor these near them."""
+def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
+    """Refuse points [N, 3] that hardly lie near those of the scene, nor these near them; warn of few that do."""
     from scipy.spatial import cKDTree
 
     from ambiguous_wild.vision.sparse_surface import some_points

@@ -103,7 +103,7 @@ def _read(path: Path) -> SplatFile | tuple[np.ndarray, np.ndarray]:
 
 
 def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
-    """Refuse points [N, 3] that hardly lie near those of the scene, nor these near them; warn of few that do."""
+    """Refuse points [N, 3] that hardly lie near those of the scene, nor these near them; warn of a few."""
     from scipy.spatial import cKDTree
 
     from ambiguous_wild.vision.sparse_surface import some_points

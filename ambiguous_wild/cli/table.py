@@ -160,9 +160,12 @@ def _width(everything: bool, output: Path | None) -> int | None:
 
 
 def _write_tidy(loaded: Runs, output: Path | None, metrics: Sequence[str], scenes: Sequence[str]) -> None:
-    from ambiguous_wild.report.comparison import tidy
-    from ambiguous_wild.report.plain_formats import to_csv
+    from ambiguous_wild.report.comparison import comparison, tidy
+    from ambiguous_wild.report.plain_formats import UNEQUAL, to_csv
 
+    for note in comparison(loaded, metrics=metrics, scenes=scenes)[-1].notes:
+        if note.startswith(UNEQUAL):
+            click.echo(note, err=True)
     frame = tidy(loaded, metrics=metrics, scenes=scenes)
     text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
     for run in loaded.incomplete:

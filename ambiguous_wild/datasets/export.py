@@ -77,7 +77,7 @@ def _stored(view: View) -> str:
 
 def _sized_model(scene: Scene) -> ColmapModel:
     """Return the model of the listed photos at the size of the loaded files, with equal cameras merged."""
-    model = read_model(model_folder(scene.root))
+    model = read_model(model_folder(scene.root, scene.info.get("files", {})))
     by_name = {view.name: view for view in scene.views}
     cameras: dict[tuple[Any, ...], ModelCamera] = {}
     images = {}

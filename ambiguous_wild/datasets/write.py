@@ -152,8 +152,9 @@ def import_scene(
         bar = Bar(progress)
         try:
             _write_scene(work, foreign, plans, settings, name, key, jobs or os.cpu_count() or 1, bar)
-        except AwError:
+        except AwError as error:
             shutil.rmtree(work, ignore_errors=True)
+            error.args = (str(error).replace(str(work / "scene"), str(root)),)  # what the user knows
             raise
         finally:
             bar.finish()

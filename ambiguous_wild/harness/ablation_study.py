@@ -315,6 +315,9 @@ def read_outcomes(cells: Sequence[Cell], output: Path) -> list[VariantResult]:
             outcomes.append(VariantResult(*where, None, "not run"))
             continue
         result = checked_result(folder)
+        if result["config_hash"] != cell.identity:
+            outcomes.append(VariantResult(*where, None, "a run of another configuration, left as it is"))
+            continue
         done = result["status"] == "ok"
         outcomes.append(VariantResult(*where, result if done else None, "" if done else str(result["error"])))
     return outcomes

@@ -120,10 +120,12 @@ def scene_identity(scene: Scene) -> str:
         else {}
     )
     split = [(v.name, v.split, v.camera.width, v.camera.height) for v in scene.views]
-    if not hashes:
-        hashes = _contents(scene)
     # what was put into the folder later is in no list
     later = [view.keep_path for view in scene.views if view.keep_path is not None]
+    if hashes:
+        later += [*(view.image_path for view in scene.views), *sorted((scene.root / "sparse/0").glob("*"))]
+    else:
+        hashes = _contents(scene)
     later += [scene.root / MOTION, *(p for f in MEASURED_WITH for p in sorted((scene.root / f).rglob("*")))]
     for path in later:
         name = path.relative_to(scene.root).as_posix()
@@ -137,12 +139,15 @@ def _contents(scene: Scene) -> dict[str, object]:
     """Return cameras, points and photos of a plain COLMAP scene, which lists no hashes of its files."""
     cameras = [v.camera for v in scene.views]
     lenses = [(c.fx, c.fy, c.cx, c.cy) for c in cameras]
+    points = scene.points
+    content = points.xyz.round(9).astype("<f8").tobytes() + points.rgb.tobytes()
+    if len(points.track_views):  # scenes without tracks keep the identity that they had
+        content += points.track_offsets.astype("<i8").tobytes() + points.track_views.astype("<i4").tobytes()
+        content += points.track_xy.astype("<f4").tobytes()
     return {
         "poses": np.concatenate([c.cam_from_world.ravel() for c in cameras]).round(9).tolist(),
         "lenses": np.array(lenses).round(9).tolist(),
-        "points": hashlib.sha256(
-            scene.points.xyz.round(9).astype("<f8").tobytes() + scene.points.rgb.tobytes()
-        ).hexdigest(),
+        "points": hashlib.sha256(content).hexdigest(),
         "photos": [_digest(v.image_path) for v in scene.views],
     }
 

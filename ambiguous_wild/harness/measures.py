@@ -21,7 +21,7 @@ import numpy as np
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods.entry import resolve
-from ambiguous_wild.methods.references import error_location, import_file
+from ambiguous_wild.methods.references import error_location, hash_of_package, import_file
 
 if TYPE_CHECKING:
     from ambiguous_wild.core import Scene, View
@@ -139,9 +139,8 @@ own_metrics: dict[str, Metric] = {}
 
 @cache
 def _installed() -> dict[str, Metric]:
-    return {
-        point.name: point.load() for point in importlib.metadata.entry_points(group="ambiguous_wild.metrics")
-    }
+    points = importlib.metadata.entry_points(group="ambiguous_wild.metrics")
+    return {point.name: replace(point.load(), source=hash_of_package(point)) for point in points}
 
 
 def metrics() -> dict[str, Metric]:

@@ -14,9 +14,9 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.start import recorded_start, started
+from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.files import own_json
-from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
@@ -45,7 +45,8 @@ def replay(run: Path) -> Replay:
         run: a run folder with `nonfinite/` in it; the first finding is replayed.
 
     Raises:
-        AwError: the run has no finding, its method or scene is gone, or a file is damaged.
+        AwError: the run has no finding, its method is gone, its scene is gone or changed, or a file is
+            damaged.
     """
     findings = sorted(p.parent for p in (run / FOLDER).glob(f"*/{REPORT}"))
     if not findings:
@@ -74,7 +75,7 @@ def open_run(run: Path | str) -> Trainer:
     photo, at its own size. Nothing is written to the run.
 
     Raises:
-        AwError: the folder is no run, its method or scene is gone, or a file is damaged.
+        AwError: the folder is no run, its method is gone, its scene is gone or changed, or a file is damaged.
     """
     run = Path(run)
     if not (run / "config.yaml").is_file():
@@ -92,7 +93,7 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
     """Return the run's trainer as it was saved, or before its first step, with its files in `folder`."""
     try:
         method, device, options = config["method"], torch.device(config["device"]), config["options"]
-        path, factor, train = config["scene"]["path"], config["scene"]["factor"], config["train"]
+        train = config["train"]
     except (KeyError, TypeError, RuntimeError) as error:
         what = str(error).splitlines()[0]
         raise AwError(f"{run} cannot be opened: its config.yaml is damaged (at {what})") from None
@@ -104,7 +105,7 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
     hooks = entry.build(from_plain(type(entry.options()), options, f"options of {run}"))
     hooks = with_effects(hooks, tuple(config.get("effects", ())))
     settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
-    scene = load_scene(path, factor=factor, check=False)
+    scene = open_scene(run)
     data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
     hooks = started(hooks, recorded_start(config.get("start")), scene)
     trainer = Trainer(data, hooks, settings, folder=folder)

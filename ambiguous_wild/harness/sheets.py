@@ -188,8 +188,8 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None) -> int:
         The number of methods shown.
 
     Raises:
-        AwError: several scenes and no name, no finished run, the scene folder has been moved, or a run lacks
-            its renders.
+        AwError: several scenes and no name, no finished run, the scene folder has been moved or changed, or a
+            run lacks its renders.
     """
     finished = runs.runs[runs.runs["status"] == "ok"]
     names = sorted(finished["scene"].unique())
@@ -200,7 +200,9 @@ def write_sheet(runs: Runs, path: Path, *, scene: str | None = None) -> int:
         raise AwError("no finished run to show; 'aw table' lists what is there")
     first = chosen.sort_values("seed").drop_duplicates("method").sort_values("method")
     folders = {str(row.method): Path(str(row.folder)) for row in first.itertuples()}
-    source = open_scene(next(iter(folders.values())), verify=False)
+    if first["scene_hash"].nunique() > 1:
+        raise AwError(f"scene {first['scene'].iloc[0]!r} differs between these runs: run them again on one")
+    source = open_scene(next(iter(folders.values())))
     rows = [_test_row(view, folders) for view in evenly_spaced(source.test, VIEWS)]
     rows += [_train_row(view, folders) for view in evenly_spaced(source.train, VIEWS)]
     sheet = stack([stack(row, 1) for row in rows], 0)

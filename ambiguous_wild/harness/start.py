@@ -25,6 +25,7 @@ _NEAR = 0.05  # of a point's distance to the nearest train camera
 # errors of 10 % of the depth 0.97, at half and twice the scale 0.02; 75 of 92 models and point clouds of
 # other scenes had less than 0.1, as had points at random in the box of the scene (0.05).
 _MIN_NEAR, _FEW_NEAR = 0.02, 0.1
+_FEW_POINTS = 100  # of a scene; fewer do not say where it lies
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     from ambiguous_wild.vision.sparse_surface import some_points
 
     points = scene.points.xyz
-    if not len(points):
+    if len(points) < _FEW_POINTS:
         return
     cameras = cKDTree([view.camera.center for view in scene.train])
     shares = [

@@ -6,7 +6,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.command_lines import length_text
-from ambiguous_wild.harness.measures import MASK_LABELS, Metric, measure, users_metrics
+from ambiguous_wild.harness.measures import FAMILIES, MASK_LABELS, MEASURES, Metric, measure, users_metrics
 from ambiguous_wild.harness.result_file import (
     CONFIG,
     FAILED,
@@ -36,9 +36,10 @@ from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",
-    "options_hash", "training", "timing", "timing_reason", "timing_kernel", "hardware", "effects", "length",
-    "features", "test_photos", "start", "metric_functions",
+    "options_hash", "training", "unrecorded", "timing", "timing_reason", "timing_kernel", "hardware",
+    "effects", "length", "features", "test_photos", "start", "metric_functions",
 )  # fmt: skip
+IN_FOLDER = " in "  # between a method and its folder, where several folders hold runs of it
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
 ReadConfig = dict[str, Any]
@@ -93,14 +94,21 @@ def read_runs(*folders: Path | str) -> Runs:
     """
     incomplete: list[Incomplete] = []
     roots = list({Path(folder).resolve(): Path(folder) for folder in folders}.values())
-    of_root = [_read_folder(root, incomplete) for root in roots]
+    of_root: list[list[FolderResult]] = []
+    begun: list[tuple[Path, Incomplete]] = []
+    known: set[Path] = set()  # runs of a folder given before, as one may be inside another
+    for root in roots:
+        incomplete.clear()
+        of_root.append([(run, r) for run, r in _read_folder(root, incomplete) if run.resolve() not in known])
+        begun += [(root, i) for i in incomplete if i.folder.resolve() not in known]
+        known |= {run.resolve() for run in (*(r for r, _ in of_root[-1]), *(i.folder for i in incomplete))}
     owners = Counter((r["scene"], r["method"], r["seed"]) for members in of_root for _, r in members)
     shared = {method for (_, method, _), count in owners.items() if count > 1}
     results: list[FolderResult] = []
     for root, members in zip(roots, of_root):
         for run, result in members:
             if result["method"] in shared:
-                result["method"] = f"{result['method']} in {root}"
+                result["method"] = f"{result['method']}{IN_FOLDER}{root}"
             results.append((run, result))
     return Runs(
         images=_frame(_image_rows(results), ["scene", "method", "seed", "image", "metric", "value"]),
@@ -109,8 +117,16 @@ def read_runs(*folders: Path | str) -> Runs:
             ["scene", "method", "seed", "status", "error", "folder", "images"],
         ),
         missing=_frame(_missing_rows(results), ["scene", "method", "seed", "metric", "reason"]),
-        incomplete=tuple(incomplete),
+        incomplete=tuple(
+            replace(i, method=f"{i.method}{IN_FOLDER}{root}") if i.method in shared else i
+            for root, i in begun
+        ),
     )
+
+
+def method_of(label: str) -> str:
+    """Return the method that a row of `read_runs` is of, without the folder."""
+    return label.partition(IN_FOLDER)[0]
 
 
 def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FolderResult]:
@@ -311,6 +327,7 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "source": str(config.get("source", "")),
             "options_hash": config_hash(result["options"]),
             "training": _training(config),
+            "unrecorded": "" if config else result["config_hash"],
             "fit": _fit(result["facts"]),
             "effects": effects_of(result["facts"]),
             "length": str(result["facts"].get("length") or _length(config)),
@@ -330,7 +347,9 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
 def metric_functions(result: RunResult) -> dict[str, str]:
     """Return the identity of each metric that is not of this package: of its file, and what it claims."""
     records = result.get("metrics", {})
-    return {key: f"{r['source']} {r['better']}" for key, r in records.items()}
+    measured = {key for row in result["per_image"] for key in metrics_of(row)} - MEASURES.keys()
+    unknown = {k: f"unknown {result['config_hash']}" for k in measured if k.partition("_")[0] not in FAMILIES}
+    return unknown | {key: f"{r['source']} {r['better']}" for key, r in records.items()}
 
 
 def effects_of(facts: RunFacts) -> str:

@@ -139,15 +139,12 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
 Opened = dict[tuple[Path, int | None], tuple[Scene, str]]  # folder and factor -> scene and its identity
 
 
-def open_scene(
-    run: Path, folder: Path | None = None, *, verify: bool = True, opened: Opened | None = None
-) -> Scene:
-    """Open the scene of a run, with the photos it was trained on.
+def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None = None) -> Scene:
+    """Open the scene of a run, with the photos it was trained on; its files are compared with their hashes.
 
     Args:
         run: the run's folder.
         folder: where the scene lies; None = where the run says.
-        verify: compare the files with their hashes, and the scene with the one that the run used.
         opened: verified scenes of earlier calls, which are not opened again. Who gives it measures runs, so
             the scene is asked what it is asked before training.
 
@@ -167,13 +164,14 @@ def open_scene(
     key, measured = (path, factor if isinstance(factor, int) else None), opened is not None
     opened = {} if opened is None else opened
     if key not in opened:
-        scene = load_scene(path, factor=key[1], verify=verify, check=measured)
-        opened[key] = scene, scene_identity(scene) if verify else ""
+        scene = load_scene(path, factor=key[1], check=measured)
+        opened[key] = scene, scene_identity(scene)
     scene, identity = opened[key]
-    if verify and identity != (before := str(config.get("sha256"))):
+    if identity != (before := str(config.get("sha256"))):
         raise AwError(
             f"{run} was measured on another state of {path}: hash {before[:12]}, now {identity[:12]}; "
-            "restore the scene, name the right one with --scene, or run again on this one"
+            "restore the scene, run again on this one, or name the right one with --scene "
+            "('aw view', 'aw video', 'aw export', 'aw rescore' and 'aw leaderboard add' take it)"
         )
     return scene
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from hashlib import sha256
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +16,16 @@ from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import load_image_float, read_alpha
+from ambiguous_wild.io.images import decode, load_image_float, read_alpha
 
 MIN_TRAIN = 2  # photos: one shows no depth
 ASPECT = 2.0  # largest ratio of focal lengths; pixels of anamorphic lenses are 2:1
 SAME_POSE = 1e-6  # largest difference of two equal poses, relative to the scene's size
 SAME_PHOTO = 0.01  # mean difference of equal pictures that were compressed again, of 1
+NEAR_POSE = 1e-3  # of two photos whose pictures are compared, relative to the scene's size
+NO_BASELINE = 1e-4  # of the points' median distance: cameras, or points, no farther apart are at one place
+FEW_POINTS = 10  # fewer are dummies, of scenes that start from a file
+FEW_SEEN = 0.05  # share of the points in any training photo, below which poses or points are doubted
 MAX_POINTS = 5000  # points that are projected to find out whether photos show any
 SHARED = (
     "test photos are training photos ({names}), so their scores say nothing: use each for training or for "
@@ -50,7 +58,41 @@ def _few_train_photos(scene: Scene) -> list[str]:
 
 def _shared_photos(scene: Scene) -> list[str]:
     pairs = ((test, train) for views in _equal_files(scene) for test in views for train in views)
-    return sorted(f"{a.name} is {b.name}" for a, b in pairs if (a.split, b.split) == ("test", "train"))
+    equal = {(a.name, b.name) for a, b in pairs if (a.split, b.split) == ("test", "train")}
+    return sorted(f"{a} is {b}" for a, b in equal | set(_equal_pixels(scene)))
+
+
+def _equal_pixels(scene: Scene) -> Iterator[tuple[str, str]]:
+    """Test and train photos of equal pixels, as of a PNG that was written again."""
+    if not scene.train or not scene.test:
+        return
+    with ThreadPoolExecutor() as pool:
+        hashes = list(pool.map(_small_hash, (view.image_path for view in scene.views)))
+    alike = defaultdict(list)
+    for view, found in zip(scene.views, hashes, strict=True):
+        if found is not None:
+            alike[found].append(view)
+    for views in alike.values():
+        for test, train in product(*([v for v in views if v.split == side] for side in ("test", "train"))):
+            first, second = (load_image_float(v.image_path) for v in (test, train))
+            if np.array_equal(first, second):
+                yield test.name, train.name
+
+
+def _small_hash(path: Path) -> bytes | None:
+    state = path.stat()
+    return _small_hash_of(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=16_384)
+def _small_hash_of(path: Path, size: int, mtime_ns: int) -> bytes | None:
+    """Return the hash of a photo at an eighth of its size, which JPEG decodes fast; None if of one grey."""
+    import cv2
+
+    small = decode(np.fromfile(path, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8, str(path))
+    if small is None or not np.ptp(small):
+        return None
+    return sha256(repr(small.shape).encode() + small.tobytes()).digest()
 
 
 def _repeated_photos(scene: Scene) -> list[str]:
@@ -78,7 +120,7 @@ def _alike_photos(scene: Scene) -> Iterator[str]:
         return
     train, test = (np.array([_pose(v, scene.extent) for v in views]) for views in (scene.train, scene.test))
     for row, other in zip(test, scene.test):
-        for index in np.flatnonzero(np.abs(train - row).max(axis=1) < SAME_POSE):
+        for index in np.flatnonzero(np.abs(train - row).max(axis=1) < NEAR_POSE):
             view = scene.train[index]
             first, second = (load_image_float(v.image_path) for v in (view, other))
             if first.shape == second.shape and np.abs(first - second).mean() < SAME_PHOTO:
@@ -91,9 +133,17 @@ def _pose(view: View, extent: float) -> np.ndarray:
 
 
 def _one_pose(scene: Scene) -> list[str]:
-    poses = np.array([_pose(view, scene.extent) for view in scene.train])
-    one = len(poses) >= MIN_TRAIN and np.ptp(poses, axis=0).max() < SAME_POSE
+    turns = np.array([view.camera.cam_from_world[:3, :3] for view in scene.train])
+    one = _one_position(scene) and np.ptp(turns, axis=0).max() < SAME_POSE
     return [view.name for view in scene.train if one]
+
+
+def _at_one_place(xyz: np.ndarray, scene: Scene) -> bool:
+    """Whether places [N, 3] lie together, seen from the distance between the cameras and the points."""
+    middle = np.median([view.camera.center for view in scene.train], axis=0)
+    points = scene.points.xyz
+    distance = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0
+    return float(np.ptp(xyz, axis=0).max()) <= NO_BASELINE * distance
 
 
 def _hidden_test_pixels(scene: Scene) -> Iterator[str]:
@@ -116,7 +166,7 @@ def _far_cameras(scene: Scene) -> list[str]:
 
 def _one_position(scene: Scene) -> list[str]:
     centres = np.array([view.camera.center for view in scene.train])
-    one = len(centres) >= MIN_TRAIN and not np.ptp(centres, axis=0).any()
+    one = len(centres) >= MIN_TRAIN and _at_one_place(centres, scene)
     return [view.name for view in scene.train if one]
 
 
@@ -130,21 +180,39 @@ def _odd_focal_lengths(scene: Scene) -> list[str]:
 
 
 def _one_point(scene: Scene) -> list[str]:
-    one = len(scene.points.xyz) > 1 and not np.ptp(scene.points.xyz, axis=0).any()
-    return [scene.name] if one else []
+    xyz = scene.points.xyz
+    return [scene.name] if len(xyz) > 1 and _at_one_place(xyz, scene) else []
 
 
 def _no_point_in_view(scene: Scene) -> list[str]:
     xyz = scene.points.xyz
-    xyz = xyz[:: max(1, len(xyz) // MAX_POINTS)]
-    for view in scene.train if len(xyz) else ():
+    if len(xyz) < FEW_POINTS or _any_share(scene, _some(xyz), 0.0) or _any_share(scene, xyz, 0.0):
+        return []
+    return [scene.name]
+
+
+def _few_points_in_view(scene: Scene) -> list[str]:
+    xyz = _some(scene.points.xyz)
+    return [scene.name] if len(xyz) and not _any_share(scene, xyz, FEW_SEEN) else []
+
+
+def _some(xyz: np.ndarray) -> np.ndarray:
+    return xyz[:: max(1, len(xyz) // MAX_POINTS)]
+
+
+def _any_share(scene: Scene, xyz: np.ndarray, share: float) -> bool:
+    """Whether more than a share of the points [N, 3] lie in any training photo."""
+    seen = np.zeros(len(xyz), bool)
+    for view in scene.train:
         camera = view.camera
         local = camera.to_camera(xyz)
-        x, y, z = local[local[:, 2] > 0].T
+        rows = np.flatnonzero(local[:, 2] > 0)
+        x, y, z = local[rows].T
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        if ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).any():
-            return []
-    return [scene.name] if len(xyz) else []
+        seen[rows[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]] = True
+        if seen.mean() > share:
+            return True
+    return False
 
 
 REFUSED: Checks = {  # the scene would give a wrong number
@@ -167,6 +235,8 @@ WARNED: Checks = {  # it is only unlikely
     _far_cameras: "the cameras of {names} lie far from all others, so their poses are probably wrong; the "
     "scene's size is measured without them: check them, or take them out of train_list.txt",
     _one_position: "all cameras stand at one place, where photos show no depth: check the poses",
+    _few_points_in_view: f"less than {FEW_SEEN:.0%} of the sparse model's points lie in any training photo: "
+    "check that poses and points are of one model",
     _odd_principal_points: "principal points outside of the photos: {names}; check their cameras",
     _odd_focal_lengths: f"focal lengths of x and y differ more than {ASPECT:g} times: {{names}}; check their "
     "cameras",

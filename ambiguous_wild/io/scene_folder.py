@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeGuard, cast
 
@@ -70,12 +70,16 @@ def load_scene(
     if read is not None and verify:
         verify_files(root, read, quick=verify == "quick")
     # The model is looked for first, so that the error for a folder of mere photos says that it has none.
-    sparse = model_folder(root)
+    sparse = model_folder(root, () if read is None else read["files"])
     chosen = _default_factor(root, read) if factor is None else factor
     folder = _image_folder(root, chosen)
     info: SceneInfo = {} if read is None else read.copy()
     # Runs are written to a folder of this name, so the name in a downloaded scene must be safe.
-    name = check_name(f"scene name in {root}", info.get("name", root.resolve().name))
+    try:
+        name = check_name(f"scene name in {root}", info.get("name", root.resolve().name))
+    except AwError as error:
+        cure = 'change "name" in scene.json' if "name" in info else "rename the folder"
+        raise AwError(f"{error}; {cure}") from error
     model = read_model(sparse)
     info["loaded_factor"] = chosen
     split, missing, repeated = _split(root, [image.name for image in model.images.values()])
@@ -102,7 +106,7 @@ def load_scene(
         raise AwError(f"{root} has no training photo: none of train_list.txt is in the model; build it again")
     scene = Scene(root, name, views, _points(model, views), info)
     if check:
-        info["warnings"] += [*(_mask_warnings(root, scene) if read is None else ()), *check_scene(scene)]
+        info["warnings"] += [*_mask_warnings(root, scene, read), *check_scene(scene)]
         for warning in info["warnings"]:
             warnings.warn(plain(f"{name}: {warning}"), stacklevel=2)
     return scene if raw else centred(scene)
@@ -277,14 +281,20 @@ def several_models(models: list[tuple[Path, int]], used: Path) -> str:
     )
 
 
-def model_folder(root: Path) -> Path:
+def model_folder(root: Path, listed: Collection[str] = ()) -> Path:
     """Return the folder of the scene's COLMAP model; of several, the one with most photos.
+
+    Args:
+        root: the scene folder.
+        listed: files of scene.json; a model that is not among them was put there later and is not read.
 
     Raises:
         AwError: there is none.
     """
     if models := models_in(root):
-        return models[0][0]
+        known = {PurePosixPath(name).parent.as_posix() for name in listed}
+        ours = (folder for folder, _ in models if folder.relative_to(root).as_posix() in known)
+        return next(ours, models[0][0])
     raise AwError(
         f"{root} is no scene: neither sparse/0 nor sparse holds a COLMAP model; "
         f"if it holds photos, build one with 'aw build-scene {root} -o SCENE'"
@@ -374,10 +384,16 @@ def _view(
     return View(image.name, path, camera, side, keep_path, image.image_id)
 
 
-def _mask_warnings(root: Path, scene: Scene) -> list[str]:
+def _mask_warnings(root: Path, scene: Scene, read: SceneInfo | None) -> list[str]:
     folder = root / "masks"
     if not folder.is_dir() or (folder / OWN_MASKS).is_file():
         return []
+    if read is not None:  # what it lists was checked when the scene was made
+        own = {root / name for name in read["files"]}
+        own |= {folder / v.split / f"{without_suffix(v.name)}.png" for v in scene.views}
+        strange = shortlist(sorted(p.relative_to(folder).as_posix() for p in mask_files(folder) - own))
+        cure = "the mask of a.jpg is train/a.png or test/a.png, by its side"
+        return [f"masks that belong to no photo: {strange} ({cure})"] if strange else []
     used = {view.name: view.keep_path for view in scene.train if view.keep_path is not None}
     tests = side_masks(folder, [view.name for view in scene.test], "test").values()
     return check_masks(folder, mask_files(folder), used, tests, [view.name for view in scene.train])

@@ -8,6 +8,7 @@ nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see ne
 from __future__ import annotations
 
 import dataclasses
+import importlib.metadata
 import importlib.util
 import inspect
 import os
@@ -28,6 +29,13 @@ _helpers: dict[str, Path] = {}  # files of modules that loaded files imported fr
 _NO_HELPERS = (Path(os.__file__).resolve().parent, Path(__file__).resolve().parents[1])  # Python's and ours
 EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
 _RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
+
+
+def hash_of_package(point: importlib.metadata.EntryPoint) -> str:
+    """Return the identity of what an installed package offers: of its version and its module's file."""
+    spec = importlib.util.find_spec(point.module)
+    code = sha256_file(spec.origin) if spec is not None and spec.origin else ""
+    return config_hash([point.dist.version if point.dist is not None else "", code])
 
 
 def import_file(path: Path) -> tuple[ModuleType, str]:

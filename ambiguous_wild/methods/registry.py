@@ -17,6 +17,7 @@ from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry, second_pass, trained_once
 from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
 from ambiguous_wild.methods.references import (
+    hash_of_package,
     import_file,
     is_reference,
     read_reference,
@@ -56,7 +57,8 @@ def all_methods() -> dict[str, MethodEntry]:
     """Every method by name: built in, installed as entry points, registered."""
     methods = {entry.name: entry for entry in BUILTIN}
     for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        methods.setdefault(point.name, point.load())
+        if point.name not in methods:
+            methods[point.name] = dataclasses.replace(point.load(), source_hash=hash_of_package(point))
     return methods | registered
 
 

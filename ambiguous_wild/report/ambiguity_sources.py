@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -46,7 +46,7 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool
 
     Args:
         scene: the scene.
-        choice: "truth", "scene" (masks/train), "run" or a folder; None = the first of truth, run and scene
+        choice: "truth", "scene" (masks/), "run" or a folder; None = the first of truth, run and scene
             that exists.
         run: folder of a run with masks/.
         keep: in the chosen folder white means keep; else it means distractor.
@@ -64,14 +64,17 @@ def find_masks(scene: Scene, choice: str | None, run: Path | None, *, keep: bool
             choice = "scene"
         else:
             raise AwError(
-                f"{scene.name} has no distractor masks: neither truth/distractor nor masks/train; give "
+                f"{scene.name} has no distractor masks: neither truth/distractor nor masks/; give "
                 "--distractor-masks or --keep-masks DIR (PNG of the photo's stem) or --run RUN of a method "
                 "that masks"
             )
     if choice == "run" and run is None and not keep:
         raise AwError("--distractor-masks run needs --run RUN, a folder of 'aw bench'")
     black, white = (f"add them (all {colour} where there is no distractor)" for colour in ("black", "white"))
-    sources = {"truth": (truth, False, black), "scene": (scene.root / "masks" / "train", True, white)}
+    if choice == "scene" and not keep:  # wherever in masks/ training takes them from
+        taken = {v.name: v.keep_path for v in scene.train}
+        return DistractorMasks(choice, _complete(taken, scene.root / "masks", white), keep=True)
+    sources = {"truth": (truth, False, black)}
     if run is not None:
         sources["run"] = (run / "masks", True, "this method draws no masks; take another run")
     if choice in sources and not keep:
@@ -85,14 +88,18 @@ def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
         raise AwError(
             f"there is no mask folder {folder} for {scene.name}: give --distractor-masks truth|scene|run|DIR"
         )
-    paths = {v.name: folder / f"{stem(v)}.png" for v in scene.train}
-    missing = [name for name, path in paths.items() if not path.is_file()]
+    return _complete({v.name: folder / f"{stem(v)}.png" for v in scene.train}, folder, advice)
+
+
+def _complete(paths: Mapping[str, Path | None], folder: Path, advice: str) -> dict[str, Path]:
+    found = {name: path for name, path in paths.items() if path is not None and path.is_file()}
+    missing = [name for name in paths if name not in found]
     if missing:
         raise AwError(
             f"{len(missing)} of {len(paths)} train photos have no mask in {folder}: {shortlist(missing)}; "
             + advice
         )
-    return paths
+    return found
 
 
 def load_mask(path: Path, view: View) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.io.files import folder_lock, sha256_file, sweep
 from ambiguous_wild.report import board_pictures
@@ -176,7 +176,7 @@ def _conflicts(
             o.entry for o in passed if o.entry.method == e.method
         ]
         edited = [o for o in of_method if o.source != e.source]
-        measures = [o for o in (fixed or [o.entry for o in passed]) if _other_functions(o, e)]
+        measures = list(_other_functions(e, fixed, [o.entry for o in passed]))
         if len(scenes) > 1 and e.scene_hash != board_hashes.get((e.dataset, e.scene)):
             reason = (
                 f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, in another run it has "
@@ -197,9 +197,9 @@ def _conflicts(
                 "averaged or compared; give its version another name, or 'aw leaderboard remove' the other"
             )
         elif measures:
-            keys = shortlist(_other_functions(measures[0], e))
+            key, other = measures[0]
             reason = (
-                f"{v.run}: {keys} comes from another function than in {measures[0].name}, so they cannot be "
+                f"{v.run}: {key} comes from another function than in {other.name}, so they cannot be "
                 "compared; measure both with one by 'aw rescore RUNS --metric-file FILE'"
             )
         else:
@@ -208,10 +208,19 @@ def _conflicts(
     return conflicts
 
 
-def _other_functions(first: Entry, second: Entry) -> list[str]:
-    """Return the users' metrics that two runs measured by different functions."""
-    one, two = (dict(f.split(" ", 1) for f in e.metric_functions.split(", ") if f) for e in (first, second))
-    return [key for key in one if key in two and one[key] != two[key]]
+def _other_functions(
+    entry: Entry, fixed: Sequence[Entry], passed: Sequence[Entry]
+) -> Iterator[tuple[str, Entry]]:
+    """Yield the users' metrics that another run measured by another function: of the board, or else given."""
+    for key, function in _functions(entry).items():
+        rivals = [o for o in fixed if key in _functions(o)] or passed
+        yield from ((key, o) for o in rivals if _functions(o).get(key, function) != function)
+
+
+def _functions(entry: Entry) -> dict[str, str]:
+    """Return the identity of each user's metric of a run, by key."""
+    texts = (text.partition(" ") for text in entry.metric_functions.split(", ") if text)
+    return {key: function for key, _, function in texts}
 
 
 def remove(

@@ -249,7 +249,9 @@ class Scenes:
             board: runs of the board, which give the dataset of scenes that are not on this machine.
         """
         self._folder, self._dataset = folder, dataset
+        board = list(board)
         self._datasets = {e.scene_hash: e.dataset for e in board}
+        self._names = {(e.dataset, e.scene_hash): e.scene for e in board}
         self._opened = Opened()
 
     def find(self, run: Path, config: RunConfig) -> Scene | None:
@@ -290,3 +292,13 @@ class Scenes:
             return self._datasets[scene_hash]
         why = "its scene is not on this machine" if scene is None else f"{scene.root} names none"
         raise AwError(f"{run}: the dataset is unknown, {why}; give it with --dataset NAME")
+
+    def check_name(self, run: Path, entry: Entry) -> None:
+        """Refuse a scene that the dataset holds, or a run before this one had, under another name."""
+        name = self._names.setdefault((entry.dataset, entry.scene_hash), entry.scene)
+        if name != entry.scene:
+            raise AwError(
+                f"{run}: scene {entry.scene!a} of dataset {entry.dataset!a} is {name!a} there, with the same "
+                "files, and would count twice; give its folder that name and bench again, or give another "
+                "--dataset"
+            )

@@ -122,6 +122,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
         reproduce=reproduce,
         metric_functions=", ".join(f"{key} {of}" for key, of in sorted(metric_functions(result).items())),
     )
+    scenes.check_name(run, entry)
     psnr = {row["name"]: _or_nan(row.get("psnr")) for row in result["per_image"]}
     return VerifiedRun(entry, run, tuple(sorted(renders)), psnr, scene)
 
@@ -161,8 +162,9 @@ def _config(run: Path) -> RunConfig:
 
 def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tuple[str, str]:
     """Return (setting, commands) of a configuration, which a stranger may have written."""
+    planned = _planned(run, config)
     try:
-        words = check_text(f"setting of {run}", setting(config, _planned(run)))
+        words = check_text(f"setting of {run}", setting(config, planned))
         return words, command(config, before, recorded)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
@@ -170,8 +172,10 @@ def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tu
         raise AwError(f"{run / 'config.yaml'} was not written by 'aw bench' ({error}): {RESTORE}") from None
 
 
-def _planned(run: Path) -> bool:
+def _planned(run: Path, config: RunConfig) -> bool:
     """Return whether the plan of the scene chose the run's effects."""
+    if config.get("effects") and not (run / EFFECTS).is_file():
+        _partial(run, f"it lacks {EFFECTS}, which says who chose its effects")
     return bool(own_json(run / EFFECTS).get("asked") == "auto")
 
 
@@ -266,10 +270,15 @@ def _check_costs(run: Path, result: RunResult, train: Mapping[str, Any]) -> None
     if steps is not None and isinstance(asked, int) and not train.get("budget_s") and steps < asked:
         _changed(run, f"{RESULT} has {steps} iterations, {CONFIG} asks for {asked}")
     train_s, ms = cost.get("train_s"), cost.get("ms_per_iteration")
+    if train_s is not None and ms is None:
+        _partial(run, f"{RESULT} has train_s but no ms_per_iteration, which every training measures")
     if steps is not None and train_s is not None and ms is not None:
         taken = steps * ms / 1000
         if not math.isclose(train_s, taken, rel_tol=0.01):
             _changed(run, f"train_s is {train_s:g}, but {steps} iterations of {ms:g} ms take {taken:g} s")
+    fps = [cost[key] for key in ("fps_low", "fps", "fps_high") if cost.get(key) is not None]
+    if fps != sorted(fps):
+        _changed(run, f"{RESULT} has fps_low, fps and fps_high out of order: {shortlist(map(str, fps))}")
 
 
 def _impossible(run: Path, what: str, value: float, why: str) -> NoReturn:

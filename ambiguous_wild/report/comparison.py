@@ -19,7 +19,7 @@ import pandas as pd
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
-from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, read_runs
+from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, method_of, read_runs
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.grouping import grouped
@@ -256,7 +256,7 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
             )
             low, high = interval.low, interval.high
         cells.append(TableCell(value, stats.sample_std(values), low, high))
-    ranked = (method, scene) not in index.unfinished and not knows_truth(method)
+    ranked = (method, scene) not in index.unfinished and not knows_truth(method_of(method))
     return Row(method, tuple(cells), runs=len(index.runs[method, scene]), ranked=ranked)
 
 
@@ -311,7 +311,7 @@ def _ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozens
 def _why_unranked(row: Row) -> str:
     if row.ranked:
         return ""
-    return "knows the truth, not ranked" if knows_truth(row.name) else "unfinished, not ranked"
+    return "knows the truth, not ranked" if knows_truth(method_of(row.name)) else "unfinished, not ranked"
 
 
 def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> pd.DataFrame:

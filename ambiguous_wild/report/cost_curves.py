@@ -55,6 +55,10 @@ class Curve:
     def on(self, scene: str) -> list[CostRun]:
         return sorted((run for run in self.runs if run.scene == scene), key=lambda run: run.seed)
 
+    def mixed(self, scenes: Iterable[str]) -> bool:
+        """Return whether runs on one of the scenes differ beside the seed: they have no mean."""
+        return any(len({run.rest for run in self.on(scene)}) > 1 for scene in scenes)
+
     def end(self, scene: str) -> float:
         """Return the PSNR in dB at the end of the training on a scene, mean over seeds."""
         return summary(self, (scene,), lambda run: run.psnr).mean
@@ -100,7 +104,7 @@ def summary(curve: Curve, scenes: Sequence[str], value: Callable[[CostRun], floa
         value: the number of a run; NaN = missing.
     """
     by_scene = [{run.seed: value(run) for run in curve.on(scene)} for scene in scenes]
-    if not all(by_scene) or any(len({run.rest for run in curve.on(s)}) > 1 for s in scenes):
+    if not all(by_scene) or curve.mixed(scenes):
         return MeanAndDeviation()
     mean = stats.mean([stats.mean(list(values.values())) for values in by_scene])
     seeds = by_scene[0].keys()
@@ -121,7 +125,7 @@ def timeline(curve: Curve, scenes: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     """
     by_scene = [curve.on(scene) for scene in scenes]
     points = [run.points for runs in by_scene for run in runs]
-    if not all(by_scene) or not all(points):
+    if not all(by_scene) or not all(points) or curve.mixed(scenes):
         return np.empty(0), np.empty(0)
     begin, end = max(p[0][0] for p in points), min(p[-1][0] for p in points)
     if end < begin:
@@ -326,6 +330,8 @@ def _missing(curve: Curve, scenes: Iterable[str], runs: Sequence[CostRun]) -> st
     lacking = [scene for scene in scenes if not curve.on(scene)]
     if lacking:
         return f"no run on {', '.join(lacking)}"
+    if curve.mixed(scenes):
+        return "runs differ beside the seed (scene, code, device, start or settings)"
     unprobed = [run.unprobed for run in runs if run.unprobed]
     # an unprobed run gives an upper bound at its end, and bounds and times are not averaged together
     return shortlist(unprobed, 2) if unprobed and len(unprobed) < len(runs) else ""

@@ -13,7 +13,7 @@ from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.result_file import Options
-from ambiguous_wild.harness.store import Runs, read_config, section
+from ambiguous_wild.harness.store import Runs, method_of, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.report.grouping import grouped
@@ -33,6 +33,8 @@ IDENTITIES = CONDITIONS | {  # runs of one method on a scene that differ in one 
     "scene_hash": "version of the scene",
     "source": "version of the method's file",
     "options_hash": "options",
+    "device": "device",
+    "unrecorded": "settings that no config.yaml records",
 }
 FITTED = {
     "fitted": "colours fitted on the left half of each test photo, the right half measured",
@@ -123,7 +125,7 @@ def _not_ranked(runs: Runs) -> list[str]:
 
 
 def _references(methods: Sequence[str]) -> list[str]:
-    names = [method for method in methods if knows_truth(method)]
+    names = [method for method in methods if knows_truth(method_of(method))]
     return [f"references, not ranked: {shortlist(names)} (exact masks or clean photos)"] if names else []
 
 
@@ -153,10 +155,10 @@ def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
     """Return the note of each method, and of each donor of a graft, with the options of its runs."""
     entries = all_methods()
     lines = []
-    for name in dict.fromkeys(member for method in methods for member in members(method)):
+    for name in dict.fromkeys(member for method in methods for member in members(method_of(method))):
         if name not in entries or not entries[name].note:
             continue
-        own = runs.runs[[name in members(method) for method in runs.runs["method"]]]
+        own = runs.runs[[name in members(method_of(method)) for method in runs.runs["method"]]]
         options = [_options_of(Path(folder), name) for folder in own["folder"]]
         lines.append(f"{name}: {entries[name].about(options)}")
     return lines
@@ -228,10 +230,16 @@ def mixed_runs(frame: pd.DataFrame) -> dict[tuple[str, str], list[str]]:
     done = frame[frame["status"] == "ok"]
     mixed = {}
     for (method, scene), of in done.groupby(["method", "scene"]):
-        if differ := [what for column, what in IDENTITIES.items() if of[column].astype(str).nunique() > 1]:
+        if differ := _differ(of, [column for column in IDENTITIES if column in of]):
             mixed[str(method), str(scene)] = differ
-    of_file = done.groupby(["method", "scene"])["source"].first().groupby("method").nunique()
-    return mixed | {(str(method), ""): [IDENTITIES["source"]] for method in of_file.index[of_file > 1]}
+    for method, of in done.groupby("method"):
+        if differ := _differ(of.groupby("scene").first(), ["source", "options_hash"]):
+            mixed[str(method), ""] = differ
+    return mixed
+
+
+def _differ(runs: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+    return [IDENTITIES[column] for column in columns if runs[column].astype(str).nunique() > 1]
 
 
 def scenes_apart(runs: Runs) -> frozenset[str]:

@@ -34,13 +34,13 @@ class DistractorPose:
     x_m: float
     y_m: float
     yaw_deg: float
-    phase: float  # stride and arm of a figure, 0 to 1
+    pose: float  # stride and arm of a figure, 0 to 1
 
 
 def shapes_of(distractor: Distractor, placement: DistractorPose, plan: GroundPlan) -> list[Shape]:
     """Make the distractor's shapes in the world, owned by ``placement.which + 1``."""
-    at = (placement.x_m, placement.y_m, distractor.lift_m * placement.phase)
-    parts = [_tinted(s, distractor) for s in _parts(distractor, placement.phase, plan)]
+    at = (placement.x_m, placement.y_m, distractor.lift_m * placement.pose)
+    parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose, plan)]
     moved = placed(parts, at, placement.yaw_deg, distractor.size)
     return [replace(s, owner=placement.which + 1) for s in moved]
 

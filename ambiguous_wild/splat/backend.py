@@ -209,7 +209,7 @@ class GpuBackend(Backend):
     def number(self, value: Tensor) -> float | Tensor:
         return value.detach().double()
 
-    def rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
+    def visible_rows(self, visible: Callable[[], Tensor]) -> Tensor | slice:
         return slice(None)
 
     def mean_of_rows(self, values: Tensor, visible: Callable[[], Tensor]) -> Tensor:

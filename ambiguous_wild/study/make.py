@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -11,9 +12,11 @@ from typing import TypedDict
 
 import cv2
 import numpy as np
+import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.result_file import RENDERS, RESULT, check_render, read_result
 from ambiguous_wild.harness.store import check_names, read_runs
 from ambiguous_wild.harness.trained_models import open_scene
@@ -22,6 +25,8 @@ from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.report.notes import unequal
+from ambiguous_wild.report.plain_formats import UNEQUAL
 from ambiguous_wild.study.answers import KEY_FORMAT, KEY_VERSION, KIND_PAIR, KIND_PHOTO, study_id
 
 OUTLINE = (255, 220, 0)  # sRGB; drawn over a black edge, so that it is visible on any background
@@ -95,7 +100,8 @@ def render_pairs(
         truth: show the test photo next to the renders.
 
     Raises:
-        AwError: no runs, an unknown name, less than two methods on a scene, or missing renders or photos.
+        AwError: no runs, an unknown name, less than two methods on a scene, runs on other photos or pixels,
+            or missing renders or photos.
     """
     frame = read_runs(folder).runs
     frame = frame[frame["status"] == "ok"]
@@ -108,6 +114,7 @@ def render_pairs(
     pairs: list[PairQuestion] = []
     for scene, rows in frame.groupby("scene", sort=True):
         first = rows.sort_values("seed").drop_duplicates("method").sort_values("method")
+        _check_comparable(str(scene), first)
         folders = {str(r["method"]): Path(str(r["folder"])) for r in first.to_dict("records")}
         pairs += _pairs_of_scene(str(scene), folders, truth)
     if not pairs:
@@ -116,6 +123,19 @@ def render_pairs(
             "run a second method with 'aw bench'"
         )
     return pairs
+
+
+def _check_comparable(scene: str, runs: pd.DataFrame) -> None:
+    """Refuse runs that saw other photos or fitted another part of them; warn where settings differ."""
+    for what, of in (("version of the scene", runs["scene_hash"]), ("--protocol", runs["fit"] == "full")):
+        if of.nunique() > 1:
+            raise AwError(
+                f"the runs on {scene} cannot be compared: their {what} differs "
+                f"({shortlist(runs['method'])}); run them again alike, or choose with --method"
+            )
+    for line in unequal(runs):
+        if line.startswith(UNEQUAL):
+            warnings.warn(plain(line), stacklevel=3)
 
 
 def _pairs_of_scene(scene: str, folders: dict[str, Path], truth: bool) -> list[PairQuestion]:
@@ -150,7 +170,7 @@ def _renders(run: Path) -> dict[str, Path]:
 
 def _test_photos(run: Path) -> dict[str, Path]:
     try:
-        scene = open_scene(run, verify=False)
+        scene = open_scene(run)
     except AwError as error:
         raise AwError(f"{error}; --no-truth leaves the photos out") from None
     return {_stem(v.name): v.image_path for v in scene.test}

@@ -120,8 +120,9 @@ def test_thumbnail_ignores_brightness_and_contrast():
     assert np.isfinite(thumbnail(np.full((40, 40, 3), 7, np.uint8))).all()
 
 
-def photo(i, blur=100.0, width=10, **exif):
-    return ScreenedPhoto(f"{i}.jpg", f"{i}.png", blur=blur, width=width, height=8, camera="C", exif=exif)
+def photo(i, sharpness=100.0, width=10, **exif):
+    words = {"width": width, "height": 8, "camera": "C", "exif": exif}
+    return ScreenedPhoto(f"{i}.jpg", f"{i}.png", sharpness=sharpness, **words)
 
 
 def test_drift_is_reported_with_its_number():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -266,6 +267,10 @@ def _other_model(names):
     return lambda root: layouts.write_model(root / "sparse" / "0", layouts.make_model(names))
 
 
+def _one_photo_twice(root):
+    shutil.copy(root / "images" / "clutter000.png", root / "images" / "extra000.png")
+
+
 def _picture(name, *size):
     return lambda root: write_png(root / name, np.zeros(size, np.uint8))
 
@@ -315,6 +320,7 @@ def _picture(name, *size):
         (ngp(_matrix), "clutter000.png"),
         (ngp(_texts), "transform_matrix is not [4, 4] numbers"),
         (lambda root: root.mkdir(), "no known layout"),
+        (spoilt(layouts.native, _one_photo_twice), "raw: test photos are training photos"),
     ],
 )
 def test_a_wrong_dataset_is_one_line_and_nothing_is_left(spoil, message, tmp_path):
@@ -323,6 +329,7 @@ def test_a_wrong_dataset_is_one_line_and_nothing_is_left(spoil, message, tmp_pat
     assert done.returncode == 2
     *stages, error = done.stderr.splitlines()
     assert message in error and len(stages) <= 1 and "Traceback" not in done.stderr
+    assert ".scene.import-" not in error
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
 
 

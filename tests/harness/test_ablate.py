@@ -112,6 +112,7 @@ def save(cells, output, **values):
     """Made-up results: PSNR by (method, scene, seed)."""
     for cell in cells:
         result = fake_result(cell.method.name, cell.scene.name, cell.train.seed, (values["psnr"](cell),))
+        result["config_hash"] = values.get("config_hash", cell.identity)
         result["masks"] = {"iou": values["iou"](cell), "precision": 0.5, "recall": 0.25}
         result["cost"] |= {"setup_s": 2.0, "ms_per_iteration": values["ms"](cell)}
         if cell.method.name == values.get("contended"):
@@ -168,10 +169,19 @@ def test_what_is_missing_or_failed_is_told_never_dropped(scene, tmp_path):
     assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == data["rows"]
 
 
+def test_runs_of_another_configuration_are_left_as_they_are(scene, tmp_path):
+    plan = study(scene)
+    numbers = {"psnr": lambda c: 20.0, "iou": lambda c: 0.5, "ms": lambda c: 1.0}
+    save(plan.cells, tmp_path, config_hash="of 40 iterations", **numbers)
+    outcomes = read_outcomes(plan.cells, tmp_path)
+    assert {outcome.error for outcome in outcomes} == {"a run of another configuration, left as it is"}
+
+
 def test_a_failed_run_brings_its_error(scene, tmp_path):
     plan = study(scene)
     cell = plan.cells[1]
     result = fake_result(cell.method.name, "scene", 0, (), status="failed", error="no weights here", cost={})
+    result["config_hash"] = cell.identity
     write_result(cell_folder(tmp_path, cell) / "failed.json", result)
     (outcome,) = read_outcomes([cell], tmp_path)
     assert outcome.error == "no weights here" and outcome.value("psnr") is None

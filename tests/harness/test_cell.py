@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ambiguous_wild.builder.scene_package import list_files
 from ambiguous_wild.cli.bench import command, parse_budget
 from ambiguous_wild.harness.cell import (
     Cell,
@@ -24,10 +25,12 @@ from ambiguous_wild.harness.cell import (
 )
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.run_cost import peak_rss_mb, reset_peak
+from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin
 from ambiguous_wild.splat.pace import TrainConfig
+from tests.io.model_maker import write_scene
 from tests.tiny_scene import write_tiny_scene
 
 
@@ -80,6 +83,25 @@ def test_a_plain_scene_is_known_by_its_photos_masks_and_model(tmp_path):
         text = (root / "sparse/0" / file).read_text()
         (root / "sparse/0" / file).write_text(text.replace(old, new, 1))
         assert another(), file
+
+
+def test_a_plain_scene_is_known_by_its_tracks(tmp_path):
+    write_scene(tmp_path, [f"p{i}.png" for i in range(9)])
+    scene = load_scene(tmp_path)
+    points = scene.points
+    other = replace(points, track_xy=points.track_xy + np.float32(1.0))
+    assert scene_identity(replace(scene, points=other)) != scene_identity(scene)
+
+
+def test_pictures_that_scene_json_does_not_list_are_part_of_what_a_scene_is(tmp_path):
+    root = write_tiny_scene(tmp_path / "scene")
+    write_json(root / "scene.json", {"schema_version": 1, "factor": 1, "files": list_files(root, 1)})
+    listed = scene_identity(load_scene(root))
+    shutil.copytree(root / "images", root / "images_2")
+    assert scene_identity(load_scene(root)) == listed
+    half = scene_identity(load_scene(root, factor=2))
+    shutil.copy(root / "images/train_1.png", root / "images_2/train_0.png")
+    assert scene_identity(load_scene(root, factor=2)) != half
 
 
 def test_the_environment_names_what_is_there_and_what_is_not():

@@ -14,6 +14,7 @@ from ambiguous_wild.harness.benchmark import bench
 from ambiguous_wild.harness.measures import Metric, load_metrics, measure, metrics
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.methods.references import hash_of_package
 from tests.command_line import aw
 from tests.report.board_runs import write_run
 from tests.tiny_scene import write_tiny_scene
@@ -108,13 +109,20 @@ def test_what_is_wrong_with_it_is_said_before_anything_is_trained(
 
 
 def test_an_installed_package_announces_it_as_an_entry_point(
-    own: Path, monkeypatch: pytest.MonkeyPatch
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     metric = Metric("edges", "edges", "higher", function=lambda render, photo: 1.0)
-    point = SimpleNamespace(name="edges", load=lambda: metric)
+    module = tmp_path / "edges_package.py"
+    module.write_text("one = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    version = SimpleNamespace(version="1.0")
+    point = SimpleNamespace(name="edges", load=lambda: metric, module="edges_package", dist=version)
     monkeypatch.setattr(
         "importlib.metadata.entry_points", lambda group: [point] if "metrics" in group else []
     )
     assert measure("edges").better == "higher" and "edges" in metrics()
+    before = metrics()["edges"].source
+    module.write_text("one = 100\n")
+    assert len(before) == 64 and hash_of_package(point) != before  # type: ignore[arg-type]
     load_metrics(own)
     assert {"edges", "grey_error", "contrast"} <= set(metrics())

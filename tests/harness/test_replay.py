@@ -14,7 +14,7 @@ from ambiguous_wild.harness import replay as replay_module
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.replay import open_run, replay
 from ambiguous_wild.harness.result_file import read_result
-from ambiguous_wild.io.images import read_keep_map
+from ambiguous_wild.io.images import read_keep_map, read_png_rgb, write_png
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
@@ -153,3 +153,21 @@ def test_what_cannot_be_explained_is_named(masked, words, message):
     assert done.exception is not None and message in str(done.exception)
     with pytest.raises(AwError, match="is no run of 'aw bench'"):
         open_run(masked.parent)
+
+
+def test_a_run_is_not_explained_on_another_scene(masked):
+    scene = masked.parents[3] / "scene"
+    path = scene / "images" / "train_0.png"
+    before = path.read_bytes()
+    write_png(path, 255 - read_png_rgb(path))
+    try:
+        with pytest.raises(AwError, match="measured on another state of"):
+            open_run(masked)
+    finally:
+        path.write_bytes(before)
+    scene.rename(scene.with_name("moved"))
+    try:
+        with pytest.raises(AwError, match="move the scene back"):
+            open_run(masked)
+    finally:
+        scene.with_name("moved").rename(scene)

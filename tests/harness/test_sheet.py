@@ -1,15 +1,17 @@
 """The picture that compares runs."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.harness.sheets import BAR, GAP, cell, write_sheet
 from ambiguous_wild.harness.store import read_runs
-from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.viewing.video import labelled
 from tests.tiny_scene import HEIGHT, WIDTH, write_tiny_scene
@@ -55,6 +57,22 @@ def test_a_scene_that_is_not_there_is_named(runs, tmp_path):
             write_sheet(read_runs(runs), tmp_path / "sheet.png")
     finally:
         moved.rename(runs.parent / "scene")
+
+
+def test_photos_of_another_state_are_no_truth(runs, tmp_path):
+    path = runs.parent / "scene" / "images" / "test_0.png"
+    before = path.read_bytes()
+    write_png(path, 255 - read_png_rgb(path))
+    try:
+        with pytest.raises(AwError, match="measured on another state of"):
+            write_sheet(read_runs(runs), tmp_path / "sheet.png")
+    finally:
+        path.write_bytes(before)
+    both = read_runs(runs)
+    other = both.runs.assign(method="other", scene_hash="a")
+    with pytest.raises(AwError, match="'scene' differs between these runs"):
+        write_sheet(replace(both, runs=pd.concat([both.runs, other])), tmp_path / "sheet.png")
+    assert not (tmp_path / "sheet.png").exists()
 
 
 @pytest.mark.parametrize("lost", ["renders", "config.yaml"])

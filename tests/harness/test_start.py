@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ambiguous_wild import bench
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import AwError, SparsePoints
 from ambiguous_wild.harness.benchmark import Callbacks
 from ambiguous_wild.harness.cell import RunOptions, reproduce
 from ambiguous_wild.harness.grid import plan_cells
@@ -147,3 +148,10 @@ def test_a_start_may_cover_a_part_of_the_scene_alone(scene, tmp_path):
     write_point_ply(tmp_path / "part.ply", part, np.zeros(part.shape, np.uint8))
     xyz, _ = started(MethodHooks(), start_file(tmp_path / "part.ply"), load_scene(scene)).given
     assert 4 < len(xyz) < 300
+
+
+def test_a_start_is_not_compared_with_the_few_dummy_points_of_a_scene(scene, tmp_path):
+    given = load_scene(scene)
+    dummy = replace(given, points=SparsePoints.without_tracks(np.full((1, 3), -50.0)))
+    xyz, _ = started(MethodHooks(), start_file(wall_points(tmp_path / "wall.ply", 900)), dummy).given
+    assert len(xyz) == 900

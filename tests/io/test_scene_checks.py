@@ -1,6 +1,7 @@
 """A scene that would give a wrong number is refused by whatever opens it; a doubt is said once."""
 
 import ast
+import dataclasses
 import importlib
 import inspect
 import re
@@ -17,9 +18,10 @@ import ambiguous_wild
 from ambiguous_wild.builder.scene_package import list_files
 from ambiguous_wild.builder.stages import Stages
 from ambiguous_wild.cli.main import cli
-from ambiguous_wild.core import AwError
+from ambiguous_wild.core import AwError, SparsePoints
 from ambiguous_wild.harness import mask_plan
 from ambiguous_wild.io.files import write_json
+from ambiguous_wild.io.scene_checks import MAX_POINTS, check_scene
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.command_line import ROOT, aw
 from tests.tiny_scene import FOCAL, HEIGHT, TEST, TRAIN, WIDTH, write_tiny_scene
@@ -156,7 +158,6 @@ UNASKED = {
     "datasets/export.py": "the same scene at another size",
     "datasets/package.py": "asked a few lines before",
     "harness/job.py": "asked by the process that sent the job",
-    "harness/replay.py": RUNS,
     "harness/trained_models.py": RUNS,
     "simulate/composite_scene.py": "the same scene at another size",
 }
@@ -303,6 +304,67 @@ def test_what_is_only_unlikely_is_said_once(tmp_path, finished, spoil, entrance)
     _, lines = answer(entrance, placed(scene, finished, tmp_path / "use"))
     for words, gone in DOUBTS[spoil].items():
         assert sum(words in line for line in lines) == (entrance not in gone), (words, lines)
+
+
+def rewritten(root):
+    """The pixels of a training photo in another file, at the pose of the test photo."""
+    photo = cv2.imread(str(root / "images" / TRAIN[0]))
+    cv2.imwrite(str(root / "images" / TEST[0]), photo, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+
+
+def nearly_one_pose(root):
+    text = (root / "sparse/0/images.txt").read_text()
+    text = re.sub(r"^(\d+) 1 0 0 0 \S+ 0 0", r"\1 1 0 0 0 0.0000000\1 0 0", text, flags=re.M)
+    (root / "sparse/0/images.txt").write_text(text)
+
+
+def nearly_one_point(root):
+    points_at(root, "0 0 4")
+    text = (root / "sparse/0/points3D.txt").read_text()
+    (root / "sparse/0/points3D.txt").write_text(text.replace(" 0 0 4 ", " 0.000001 0 4 ", 1))
+
+
+def few_points(root, count):
+    """So many points of the wall, behind the cameras."""
+    points_behind(root)
+    lines = (root / "sparse/0/points3D.txt").read_text().splitlines()
+    (root / "sparse/0/points3D.txt").write_text("\n".join(lines[:count]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (rewritten, r"test photos are training photos \(test_0.png is train_0.png\)"),
+        (nearly_one_pose, "all 6 cameras have one pose"),
+        (nearly_one_point, "all points of the sparse model lie at one place"),
+        (lambda root: few_points(root, 10), "no point of the sparse model lies in any training photo"),
+    ],
+)
+def test_what_is_equal_but_for_rounding_is_refused(tmp_path, spoil, words):
+    spoil(write_tiny_scene(tmp_path / "scene"))
+    with pytest.raises(AwError, match=words):
+        load_scene(tmp_path / "scene")
+
+
+@pytest.mark.parametrize("count", [9, 400])
+def test_points_that_hardly_any_photo_shows_are_warned_of(tmp_path, count):
+    root = write_tiny_scene(tmp_path / "scene")
+    few_points(root, count)
+    if count == 400:  # four are right
+        path = root / "sparse/0/points3D.txt"
+        path.write_text(path.read_text().replace(" -4.0 ", " 4.0 ", 4))
+    with pytest.warns(UserWarning, match="less than 5% of the sparse model's points lie in any"):
+        load_scene(root)
+
+
+def test_a_scene_whose_sampled_points_are_not_in_view_is_not_refused(tmp_path):
+    scene = load_scene(write_tiny_scene(tmp_path / "scene"))
+    seen = np.repeat(scene.points.xyz[:1], 15_000, axis=0)
+    assert len(seen) // MAX_POINTS == 3
+    seen[::3] *= [1, 1, -1]
+    points = SparsePoints.without_tracks(seen)
+    (warning,) = check_scene(dataclasses.replace(scene, points=points))
+    assert "less than 5%" in warning
 
 
 def test_a_mask_of_one_grey_is_no_mask(tmp_path):

@@ -126,6 +126,23 @@ def test_extra_files_of_other_tools_do_not_matter(tmp_path):
     assert scene.info["loaded_factor"] == 2 and len(scene.views) == len(NAMES)
 
 
+def test_of_several_models_that_of_scene_json_is_read(tmp_path):
+    write_scene(tmp_path, NAMES[:-1])
+    mark_as_ours(tmp_path, 1)
+    write_png(tmp_path / "images" / NAMES[-1], np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    write_model(tmp_path / "sparse" / "1", make_model(NAMES))
+    assert len(load_scene(tmp_path).views) == len(NAMES) - 1
+
+
+def test_masks_put_beside_a_scene_json_that_no_view_uses_are_named(tmp_path):
+    write_scene(tmp_path, NAMES)
+    mark_as_ours(tmp_path, 1)
+    for name in ("p1.png", "train/p1.png", "test/p0.png", "train/p0.png"):  # p0 is a test photo
+        write_png(tmp_path / "masks" / name, np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.warns(UserWarning, match=r"belong to no photo: p1\.png, train/p0\.png \(the mask of"):
+        load_scene(tmp_path)
+
+
 def test_a_path_that_leaves_the_scene_is_refused(tmp_path):
     write_scene(tmp_path, NAMES)
     with pytest.raises(AwError, match="outside itself"):
@@ -178,7 +195,7 @@ def test_a_scene_json_edited_by_hand_is_one_line_that_says_what_is_wrong(tmp_pat
 def test_the_name_of_a_scene_cannot_choose_where_runs_lie(tmp_path, name):
     write_scene(tmp_path, NAMES[:2])
     (tmp_path / "scene.json").write_text(json.dumps(OURS | {"name": name}))
-    with pytest.raises(AwError, match="scene name"):
+    with pytest.raises(AwError, match=r'(?s)scene name.*; change "name" in scene\.json'):
         load_scene(tmp_path)
 
 
@@ -186,7 +203,7 @@ def test_a_plain_folder_gives_its_own_name_which_is_checked_too(tmp_path):
     write_scene(tmp_path / "yard", NAMES[:2])
     assert load_scene(tmp_path / "yard").name == "yard"
     (tmp_path / "yard").rename(tmp_path / "a\nb")
-    with pytest.raises(AwError, match="scene name"):
+    with pytest.raises(AwError, match=r"(?s)scene name.*; rename the folder"):
         load_scene(tmp_path / "a\nb")
 
 

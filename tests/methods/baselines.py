@@ -59,7 +59,7 @@ def step_of(
         nominal=nominal,
         view=view,
         downsampling=downsampling,
-        ceiling=1000,
+        growth_cap=1000,
         photo=photo[::downsampling, ::downsampling].contiguous(),
         camera=data.cameras[view].resized(image.shape[1], image.shape[0]),
         rendered=rendered,  # type: ignore[arg-type]

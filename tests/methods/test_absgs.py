@@ -35,7 +35,7 @@ def step_of(g, iteration=1, ceiling=100, hidden=()):
     rendered.visible[list(hidden)] = False
     return SimpleNamespace(
         iteration=iteration, nominal=float(iteration), camera=camera, rendered=rendered, gaussians=g,
-        ceiling=ceiling,
+        growth_cap=ceiling,
     )  # fmt: skip
 
 

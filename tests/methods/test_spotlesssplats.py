@@ -125,7 +125,7 @@ def test_harmonics_are_cut_from_above_alone_and_start_anew():
     config = SpotLessDensityConfig(start=1e9, stop=1e9)
     density = PruningDensity(config, extent=1.0, seed=0)
     before = g.sh_rest.clone()
-    step = SimpleNamespace(iteration=100, nominal=9000.0, gaussians=g, ceiling=1000)
+    step = SimpleNamespace(iteration=100, nominal=9000.0, gaussians=g, growth_cap=1000)
     assert density.due(step)  # the host of an accelerator asks then whether the photo was all masked
     density.refine(step, g, adam)
     assert not density.due(step)
@@ -151,7 +151,7 @@ def test_gaussians_without_use_are_removed_but_not_new_ones():
     density.use_sum[:4] = 1e-9
     density.views_seen += 1
     density.grad_sum[10:13] = 1.0
-    step = SimpleNamespace(iteration=10, nominal=10.0, gaussians=g, ceiling=1000)
+    step = SimpleNamespace(iteration=10, nominal=10.0, gaussians=g, growth_cap=1000)
     gone, kept = g.means[:4].clone(), g.means[4:10].clone()
     new, events = density.refine(step, g, adam)
     assert events == ["grow"] and density.log.now.pruned == 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -132,3 +133,15 @@ def test_runs_that_do_not_fit_are_refused(scene: Path, run: Path, tmp_path: Path
     assert "damaged" in error()
     (run / "point_cloud.ply").unlink()
     assert "no finished run" in error() and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("folder", ["masks/train", "masks"])
+def test_masks_of_the_scene_are_those_that_training_takes(scene: Path, run: Path, folder: str) -> None:
+    shutil.rmtree(scene / "truth")
+    shutil.copytree(run / "masks", scene / folder)
+    masks = find_masks(load_scene(scene), None, None)
+    assert (masks.source, masks.keep) == ("scene", True)
+    assert masks.paths == {name: scene / folder / name for name in TRAIN}
+    (scene / folder / TRAIN[0]).unlink()
+    with pytest.raises(AwError, match=f"1 of 6 train photos have no mask in .*masks: {TRAIN[0]}"):
+        find_masks(load_scene(scene), "scene", None)

@@ -14,7 +14,7 @@ from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.report import cost_recommend as advice
 from ambiguous_wild.report.cost_changes import changes
-from ambiguous_wild.report.cost_curves import answers
+from ambiguous_wild.report.cost_curves import answers, timeline, times_to_reach
 from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, value_at, words_of
 from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text
 from tests.report.fake_cost import ALONE, BUSY, RISING, cost_run, curves, read, rising
@@ -252,3 +252,6 @@ def test_runs_of_another_scene_or_metric_are_neither_ranked_nor_averaged(tmp_pat
     assert math.isnan(
         {p.curve: p for p in report.points}["b"].psnr.mean
     )  # seeds of two versions of the scene
+    (curve,) = (curve for curve in curves(tmp_path) if curve.method == "b")
+    assert not len(timeline(curve, ("yard",))[0])
+    assert "differ beside the seed" in times_to_reach([curve])[0].missing

@@ -111,6 +111,10 @@ def anonymous(run: Path) -> None:
     change_result(run, lambda r: r.update(method="mine"))
 
 
+def change_cost(run: Path, **cost: float | None) -> None:
+    change_result(run, lambda r: r["cost"].update(cost))
+
+
 FAILED = {"status": "failed", "error": "loss is not finite"}
 SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "number": (lambda r: change_image(r, 1, psnr=lambda v: v + 0.01), "was changed: psnr of test_1.png"),
@@ -131,6 +135,10 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "path": (lambda r: change_image(r, name="../../../../etc/passwd"), "outside of its folder"),
     "failed": (lambda r: change_result(r, lambda d: d.update(FAILED)), "a failed run has no numbers"),
     "unfinished": (lambda r: (r / "metrics.json").unlink(), "has no metrics.json"),
+    "pace gone": (lambda r: change_cost(r, ms_per_iteration=None), "train_s but no ms_per_iteration"),
+    "fps": (lambda r: change_cost(r, fps=9e9, fps_low=20, fps_high=2089), "of order: 20, 9000000000.0, 2089"),
+    "no effects.json": (lambda r: change_config(r, lambda c: c.update(effects=["dense"]), hashed=True),
+                        "partial: it lacks effects.json"),
     "not JSON": (lambda r: (r / "metrics.json").write_text("{"), "is damaged"),
 }  # fmt: skip
 
@@ -144,6 +152,15 @@ def test_what_is_changed_partial_failed_or_foreign_is_refused(
     lines = done.stdout.splitlines()
     assert done.exit_code == 2 and len(lines) == 1 and lines[0].startswith("refused: ") and why in lines[0]
     assert not (tmp_path / "board").exists()
+
+
+def test_a_scene_is_on_the_board_under_one_name(one: Path, tmp_path: Path) -> None:
+    moved = shutil.copytree(tmp_path / "wall", tmp_path / "moved")
+    done = add(tmp_path / "board", one, write_run(tmp_path / "other", moved))  # in the order of their paths
+    assert done.exit_code == 2 and "scene 'wall' of dataset 'Tiny set' is 'moved' there" in done.stdout
+    assert [e.scene for e in read_board(tmp_path / "board")] == ["moved"]
+    assert "scene 'wall'" in add(tmp_path / "board", one).stdout
+    assert add(tmp_path / "board", one, dataset="Other").exit_code == 0
 
 
 def test_a_run_still_running_is_left_and_the_others_are_taken(one: Path, tmp_path: Path) -> None:
@@ -213,11 +230,15 @@ def test_a_metric_of_another_function_is_refused(tmp_path: Path) -> None:
         return folder
 
     old, same, other = run("3dgs", "1"), run("refinesplat", "1"), run("refinesplat", "2")
+    plain = write_run(tmp_path / "plain", scene, "robustsplat")
+    assert add(board, plain).exit_code == 0
+    both = add(board, old, other)  # neither wins, though the board has no such metric
+    assert both.stdout.count("comes from another function") == 2
     assert add(board, old).exit_code == 0
     done = add(board, other)
     assert done.exit_code == 2 and "tint comes from another function than in 3dgs on wall" in done.stdout
     assert add(board, same).exit_code == 0 and check(board).problems == ()
-    assert {e.metric_functions for e in read_board(board)} == {f"tint {'1' * 64} lower"}
+    assert {e.metric_functions for e in read_board(board)} == {f"tint {'1' * 64} lower", ""}
 
 
 def test_without_its_scene_a_run_is_marked_and_needs_a_dataset(one: Path, tmp_path: Path) -> None:
@@ -237,7 +258,8 @@ def test_without_its_scene_a_run_is_marked_and_needs_a_dataset(one: Path, tmp_pa
 
 def test_settings_and_options_are_cells_of_their_own(one: Path, tmp_path: Path) -> None:
     scene = tmp_path / "wall"
-    write_run(tmp_path / "a", scene, effects=["exposure", "poses"])
+    named = write_run(tmp_path / "a", scene, effects=["exposure", "poses"])
+    (named / "effects.json").write_text('{"asked": "exposure,poses"}')
     write_run(tmp_path / "b", scene, "mine", options={"x": 1})
     write_run(tmp_path / "c", scene, "mine", options={"x": 2})
     planned = write_run(tmp_path / "d", scene, effects=["dense"])

@@ -12,8 +12,7 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from tests.chromium import Browser, needs_chromium
-from tests.report.board_runs import add, aw
-from tests.tiny_scene import write_tiny_scene
+from tests.report.board_runs import add, aw, own_scene
 from tests.viewing.wall_runs import write_shown_run
 
 HOSTILE = "</script><img src=x onerror=alert(1)>/.."
@@ -23,7 +22,7 @@ HOSTILE = "</script><img src=x onerror=alert(1)>/.."
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("board")
     for name in ("porch", "yard"):
-        scene = write_tiny_scene(root / name)
+        scene = own_scene(root / name)
         for seed in (1, 2):
             write_shown_run(root / "runs", scene, "3dgs", seed, noise=20.0, count=300)
         write_shown_run(root / "runs", scene, HOSTILE, noise=5.0, count=300)

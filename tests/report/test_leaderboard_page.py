@@ -17,8 +17,7 @@ from ambiguous_wild.report.board import read_board
 from ambiguous_wild.report.board_publish import Reported, facts
 from tests.chromium import Browser, needs_chromium
 from tests.report.board_page import choose, column, heads, names, ranks, said, tick, type_in
-from tests.report.board_runs import aw, content, write_run
-from tests.tiny_scene import write_tiny_scene as write_scene
+from tests.report.board_runs import aw, content, own_scene, write_run
 
 HOSTILE = '=1+1</script><img src=x onerror="alert(1)">/../../etc'
 REPORTED = (
@@ -34,7 +33,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes; refinesplat is best and slowest, robustsplat lacks a scene, the last has a hostile name."""
     root = tmp_path_factory.mktemp("published")
     for name in ("porch", "yard"):
-        scene = write_scene(root / name)
+        scene = own_scene(root / name)
         for seed in (0, 1):
             write_run(root / "runs", scene, "3dgs", seed, noise=20.0, train_s=60.0, alone=True)
             write_run(root / "runs", scene, "refinesplat", seed, noise=5.0, train_s=600.0, alone=True)

@@ -16,8 +16,7 @@ from ambiguous_wild.report.board_edit import check, remove
 from ambiguous_wild.report.board_publish import publish, read_sources
 from tests.chromium import Browser, needs_chromium
 from tests.report.board_page import choose, column, heads, names, said, type_in
-from tests.report.board_runs import add, write_run
-from tests.tiny_scene import write_tiny_scene
+from tests.report.board_runs import add, own_scene, write_run
 
 GOOD = {"iou": 0.8, "precision": 0.9, "recall": 0.85, "images": 6}
 NOTHING = {"iou": 0.0, "precision": 0.0, "recall": None, "images": 6}  # masked something, nothing was there
@@ -36,7 +35,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes with distractors, and one without; 3dgs has no masks."""
     root = tmp_path_factory.mktemp("views")
     for name in ("porch", "yard", "clean"):
-        scene = write_tiny_scene(root / name, distractors=name != "clean")
+        scene = own_scene(root / name, distractors=name != "clean")
         masks = NOTHING if name == "clean" else GOOD
         for seed in (0, 1):
             write_run(root / "runs", scene, "3dgs", seed, noise=20.0 if name == "yard" else 9.0)

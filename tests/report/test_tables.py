@@ -426,3 +426,38 @@ def test_methods_of_two_protocols_are_not_ranked(tmp_path: Path) -> None:
     read = fake_result("b", psnr=(30.0, 30.0), facts=half | {"fitted": {"read_by": "gs-w"}})
     table = table_of(tmp_path / "half", fake_result("a", facts=half), read)
     assert {cell(table, m, "psnr").rank for m in "ab"} == {1, 2}
+
+
+def test_rows_of_several_folders_are_their_methods(tmp_path: Path) -> None:
+    """An upper bound and an unfinished method are not ranked, whatever their rows are called."""
+    for folder in ("one", "two"):
+        save(
+            tmp_path / folder, *(fake_result(method, psnr=(30.0,)) for method in ("3dgs", "3dgs+truth", "b"))
+        )
+    start(tmp_path / "one", "b", seed=1)
+    table = comparison(read_runs(tmp_path / "one", tmp_path / "two", tmp_path / "two" / "yard"))
+    rows = {row.name: row for row in table[0].rows}
+    assert len(rows) == 6  # the last folder is inside the second: no run is there twice
+    for method in ("3dgs+truth in", "b in"):
+        (row,) = (row for name, row in rows.items() if name.startswith(method) and "one" in name)
+        assert all(cell.rank is None for cell in row.cells)
+    assert any(note.startswith("references, not ranked: 3dgs+truth in") for note in table[-1].notes)
+
+
+def test_what_is_not_recorded_equals_nothing(tmp_path: Path) -> None:
+    """Neither a metric without a record, nor settings without a config.yaml."""
+    rows = [{"name": "0.png", "psnr": 20.0, "ssim": 0.5, "tinge": 1.0}]
+    table = table_of(
+        tmp_path,
+        *(fake_result(m, seed=s, config_hash=f"{m}{s}", per_image=rows) for m in "ab" for s in (0, 1)),
+    )
+    notes = "\n".join(table[-1].notes)
+    assert "differ in settings that no config.yaml records, so they have no mean" in notes
+    assert "tinge comes from different functions" in notes
+    assert cell(table, "a", "psnr").state == "missing"
+
+
+def test_options_that_differ_between_scenes_have_no_mean(tmp_path: Path) -> None:
+    table = table_of(tmp_path, fake_result("a", "one"), fake_result("a", "two", options={"every": 2}))
+    assert "runs of a on all scenes differ in options" in "\n".join(table[-1].notes)
+    assert cell(table, "a", "psnr").state == "missing" and cell(table, "a", "psnr", 1).state == "ok"

@@ -305,11 +305,11 @@ def test_parts_are_timed_by_the_devices_own_events_now_and_then():
         with gpu.part("render"):  # pictures are looked at with the clock stopped
             Event.now += 100.0
     assert Event.waited == 0 and gpu.parts_s == {}
-    gpu.flush()
+    gpu.settle()
     assert Event.waited == 1
     steps = 3 * SAMPLED
     assert gpu.parts_s == pytest.approx({"render": steps * 2e-3, "loss": steps * 0.5e-3})
-    gpu.flush()
+    gpu.settle()
     assert gpu.parts_s == pytest.approx({"render": steps * 2e-3, "loss": steps * 0.5e-3})
     assert type(clock_for(torch.device("cpu"))) is Clock
     assert type(clock_for(torch.device("cuda"))) is GpuClock

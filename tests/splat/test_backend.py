@@ -36,7 +36,7 @@ def test_sums_by_label(labels):
 def test_the_mean_is_of_visible_rows(shape):
     values = torch.rand(shape)
     seen = torch.rand(50) > 0.6
-    means = [b.mean_of_rows(values[b.rows(lambda: seen)], lambda: seen) for b in (CPU, GPU)]
+    means = [b.mean_of_rows(values[b.visible_rows(lambda: seen)], lambda: seen) for b in (CPU, GPU)]
     for mean in means:
         torch.testing.assert_close(mean, values[seen].mean())
     nothing = torch.zeros(50, dtype=torch.bool)
@@ -75,7 +75,7 @@ def test_a_gpu_reads_nothing_on_the_host():
         GPU.label_sums(labels, 3, values)
         GPU.mean_of_rows(values, lambda: values > 0)
         GPU.number(values.sum())
-        assert GPU.rows(lambda: pytest.fail("looked")) == slice(None)
+        assert GPU.visible_rows(lambda: pytest.fail("looked")) == slice(None)
 
 
 def test_each_says_which_sums_it_offers():

@@ -199,3 +199,10 @@ def test_every_kind_of_density_control_leaves_it_alone(data, tmp_path, name):
     train(trainer)
     assert far_rows(trainer) == first > 0
     assert len(trainer.gaussians) != most  # it did act
+
+
+def test_without_points_the_cameras_say_where_the_sphere_is(data):
+    middle, radius = sphere_of(data.cameras, np.zeros((0, 3)))
+    centres = np.array([camera.center for camera in data.cameras])
+    np.testing.assert_allclose(middle, np.median(centres, axis=0))
+    assert radius > np.linalg.norm(centres - middle, axis=1).max() > 0

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import yaml
 
+from ambiguous_wild.harness.cell import scene_identity
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.study.answers import KEY_FORMAT, Key
 from tests.harness.fake_runs import fake_result, save
 from tests.tiny_scene import TEST, write_tiny_scene
@@ -20,12 +22,12 @@ METHODS = ("3dgs", "refinesplat", "robustsplat")
 def write_runs(root: Path, methods: tuple[str, ...] = METHODS, name: str = "yard") -> tuple[Path, Path]:
     """A tiny scene and finished runs on it whose renders are the photos, blurred ever more."""
     scene = write_tiny_scene(root / name)
-    runs = root / "runs"
-    save(runs, *(fake_result(m, name) for m in methods))
+    runs, state = root / "runs", scene_identity(load_scene(scene))
+    save(runs, *(fake_result(m, name, scene_hash=state) for m in methods))
     for number, method in enumerate(methods):
         folder = next((runs / name).glob("".join(c if c.isalnum() else "_" for c in method))) / "seed0"
         (folder / "renders/test").mkdir(parents=True)
-        config = {"method": method, "scene": {"name": name, "path": str(scene), "factor": 1}}
+        config = {"method": method, "scene": {"name": name, "path": str(scene), "factor": 1, "sha256": state}}
         (folder / "config.yaml").write_text(yaml.safe_dump(config))
         for view in TEST:
             photo = cv2.imread(str(scene / "images" / view))

@@ -11,10 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from ambiguous_wild.cli.study import command
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.cell import scene_identity
+from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.study.make import PairQuestion, page_html, render_pairs, sample_questions
 from tests.study.studies import METHODS, write_runs
 from tests.tiny_scene import TEST, TRAIN
@@ -155,6 +158,34 @@ def test_what_cannot_be_is_said(made: tuple[Path, Path], tmp_path: Path) -> None
     assert not out.exists() and not (tmp_path / "s.key.json").exists()
 
 
+def change(run: Path, **values: object) -> None:
+    """Make the run one on another state of the scene (`scene_hash`), or with other facts."""
+    result = json.loads((run / "metrics.json").read_text()) | values
+    (run / "metrics.json").write_text(json.dumps(result))
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["scene"]["sha256"] = result["scene_hash"]
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+
+
+def test_runs_of_other_conditions_are_refused_or_named(made: tuple[Path, Path], tmp_path: Path) -> None:
+    scene, runs = made
+    run, out = runs / "yard/3dgs/seed0", tmp_path / "s.html"
+    change(run, facts={"length": "40 iterations"})
+    change(runs / "yard/refinesplat/seed0", facts={"length": "45 iterations"})
+    with pytest.warns(UserWarning, match="lengths differ on yard: 3dgs: 40 .*, refinesplat: 45"):
+        make(runs, "-o", out, "--overwrite")
+    state = yaml.safe_load((run / "config.yaml").read_text())["scene"]["sha256"]
+    half = {"facts": {"protocol": "half"}}
+    for values, what in ((half, "--protocol"), ({"scene_hash": "a"}, "version of the scene")):
+        change(run, **values)
+        assert what in error(runs, "-o", out, "--overwrite", "--no-truth")
+        change(run, facts={}, scene_hash=state)
+    path = scene / "images" / TEST[0]
+    cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
+    assert "another state of" in (line := error(runs, "-o", out, "--overwrite")) and "--no-truth" in line
+    make(runs, "-o", out, "--overwrite", "--no-truth")
+
+
 def test_an_old_page_is_not_replaced_unasked(made: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "s.html"
     make("--scene", made[0], "-o", out)
@@ -176,6 +207,9 @@ def test_views_of_several_folders_with_equal_names_are_all_asked_about(
             path.rename(path.parent / new)
         for text in (scene / "test_list.txt", scene / "sparse/0/images.txt"):
             text.write_text(text.read_text().replace(old, new))
+    state = scene_identity(load_scene(scene))
+    for method in METHODS:
+        change(runs / "yard" / method / "seed0", scene_hash=state)
     make(runs, "-o", tmp_path / "s.html")
     key = json.loads((tmp_path / "s.key.json").read_text())
     assert sorted(e["view"] for e in key["questions"].values()) == ["back/0"] * 3 + ["front/0"] * 3

@@ -78,10 +78,12 @@ def sphere_of(cameras: list[Camera], xyz: np.ndarray) -> tuple[np.ndarray, float
 
     Args:
         cameras: cameras of the train photos.
-        xyz: [M, 3] SfM points; the farthest hundredth may be wrong and is ignored.
+        xyz: [M, 3] SfM points; the farthest hundredth may be wrong and is ignored. Without any, the cameras
+            alone decide.
     """
-    middle = np.median(xyz, axis=0)
     centres = np.stack([c.center for c in cameras])
+    xyz = xyz if len(xyz) else centres
+    middle = np.median(xyz, axis=0)
     points = float(np.quantile(np.linalg.norm(xyz - middle, axis=1), 0.99))
     return middle, RADIUS * max(points, float(np.linalg.norm(centres - middle, axis=1).max()))
 

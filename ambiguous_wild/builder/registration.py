@@ -28,6 +28,7 @@ from ambiguous_wild.builder.pose_hypothesis import (
 from ambiguous_wild.builder.records import CameraFact
 from ambiguous_wild.builder.relative_poses import Pair, trace_of
 from ambiguous_wild.builder.retrieval import FEW_PHOTOS
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 if TYPE_CHECKING:
@@ -226,10 +227,7 @@ class Registration:
 
     def _photos_of_cameras(self) -> dict[int, list[int]]:
         """Return the registered photos of every camera, by its id."""
-        photos: dict[int, list[int]] = {}
-        for photo in self.poses:
-            photos.setdefault(self.matched.cameras[photo].camera_id, []).append(photo)
-        return photos
+        return grouped(self.poses, lambda photo: int(self.matched.cameras[photo].camera_id))
 
     def _observations(self, photo: int) -> int:
         return int(self.model.images[self.matched.ids[photo]].num_points3D)

@@ -317,7 +317,8 @@ def read_outcomes(cells: Sequence[Cell], output: Path) -> list[VariantResult]:
         result = checked_result(folder)
         if result["config_hash"] != cell.identity:
             outcomes.append(VariantResult(*where, None, "a run of another configuration, left as it is"))
-            continue
-        done = result["status"] == "ok"
-        outcomes.append(VariantResult(*where, result if done else None, "" if done else str(result["error"])))
+        elif result["status"] == "ok":
+            outcomes.append(VariantResult(*where, result))
+        else:
+            outcomes.append(VariantResult(*where, None, str(result["error"])))
     return outcomes

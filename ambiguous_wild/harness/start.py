@@ -104,7 +104,7 @@ def _read(path: Path) -> SplatFile | tuple[np.ndarray, np.ndarray]:
 
 
 def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
-    """Refuse points [N, 3] that hardly lie near those of the scene, nor these near them; warn of a few."""
+    """Refuse points [N, 3] that lie far from the scene's points; warn if few of them lie near."""
     from scipy.spatial import cKDTree
 
     from ambiguous_wild.vision.sparse_surface import some_points

@@ -92,24 +92,18 @@ def read_runs(*folders: Path | str) -> Runs:
     Raises:
         AwError: no such folder, no run in it, or two results in it for the same method, scene and seed.
     """
-    incomplete: list[Incomplete] = []
-    roots = list({Path(folder).resolve(): Path(folder) for folder in folders}.values())
-    of_root: list[list[FolderResult]] = []
-    begun: list[tuple[Path, Incomplete]] = []
     known: set[Path] = set()  # runs of a folder given before, as one may be inside another
-    for root in roots:
-        incomplete.clear()
-        of_root.append([(run, r) for run, r in _read_folder(root, incomplete) if run.resolve() not in known])
-        begun += [(root, i) for i in incomplete if i.folder.resolve() not in known]
-        known |= {run.resolve() for run in (*(r for r, _ in of_root[-1]), *(i.folder for i in incomplete))}
-    owners = Counter((r["scene"], r["method"], r["seed"]) for members in of_root for _, r in members)
+    read = [(Path(folder), *_read_folder(Path(folder), known)) for folder in folders]
+    owners = Counter((r["scene"], r["method"], r["seed"]) for _, members, _ in read for _, r in members)
     shared = {method for (_, method, _), count in owners.items() if count > 1}
     results: list[FolderResult] = []
-    for root, members in zip(roots, of_root):
+    incomplete: list[Incomplete] = []
+    for root, members, begun in read:
+        labels = {method: f"{method}{IN_FOLDER}{root}" for method in shared}
         for run, result in members:
-            if result["method"] in shared:
-                result["method"] = f"{result['method']}{IN_FOLDER}{root}"
+            result["method"] = labels.get(result["method"], result["method"])
             results.append((run, result))
+        incomplete += [replace(run, method=labels.get(run.method, run.method)) for run in begun]
     return Runs(
         images=_frame(_image_rows(results), ["scene", "method", "seed", "image", "metric", "value"]),
         runs=_frame(
@@ -117,10 +111,7 @@ def read_runs(*folders: Path | str) -> Runs:
             ["scene", "method", "seed", "status", "error", "folder", "images"],
         ),
         missing=_frame(_missing_rows(results), ["scene", "method", "seed", "metric", "reason"]),
-        incomplete=tuple(
-            replace(i, method=f"{i.method}{IN_FOLDER}{root}") if i.method in shared else i
-            for root, i in begun
-        ),
+        incomplete=tuple(incomplete),
     )
 
 
@@ -129,19 +120,21 @@ def method_of(label: str) -> str:
     return label.partition(IN_FOLDER)[0]
 
 
-def _read_folder(root: Path, incomplete: list[Incomplete]) -> list[FolderResult]:
-    """Read the results below one folder; runs without a result are added to `incomplete`."""
+def _read_folder(root: Path, known: set[Path]) -> tuple[list[FolderResult], list[Incomplete]]:
+    """Read (results, runs without a result) below one folder but for `known` runs, and add them to these."""
     results: list[FolderResult] = []
-    before = len(incomplete)
-    for run in find_runs([root]):
+    incomplete: list[Incomplete] = []
+    found = find_runs([root])
+    if not found:
+        raise _no_run(root)
+    for run in (run for run in found if run.resolve() not in known):
+        known.add(run.resolve())
         try:
             results.append((run, checked_result(run)))
         except AwError as error:
             incomplete.append(Incomplete(run, str(error), *_method_and_scene(run)))
-    if not results and len(incomplete) == before:
-        raise _no_run(root)
     _refuse_duplicates(results)
-    return results
+    return results, incomplete
 
 
 def checked_result(run: Path) -> RunResult:

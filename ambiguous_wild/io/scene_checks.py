@@ -139,7 +139,7 @@ def _one_pose(scene: Scene) -> list[str]:
 
 
 def _at_one_place(xyz: np.ndarray, scene: Scene) -> bool:
-    """Whether places [N, 3] lie together, seen from the distance between the cameras and the points."""
+    """Whether positions [N, 3] differ by less than `NO_BASELINE` of the points' median distance."""
     middle = np.median([view.camera.center for view in scene.train], axis=0)
     points = scene.points.xyz
     distance = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
+from functools import cache
 from pathlib import Path
 
 from ambiguous_wild.core.errors import AwError, unknown
@@ -55,11 +56,16 @@ def register(entry: MethodEntry) -> MethodEntry:
 
 def all_methods() -> dict[str, MethodEntry]:
     """Every method by name: built in, installed as entry points, registered."""
-    methods = {entry.name: entry for entry in BUILTIN}
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        if point.name not in methods:
-            methods[point.name] = dataclasses.replace(point.load(), source_hash=hash_of_package(point))
-    return methods | registered
+    return _installed() | {entry.name: entry for entry in BUILTIN} | registered
+
+
+@cache
+def _installed() -> dict[str, MethodEntry]:
+    """Load the entry points, and hash their modules, once a process."""
+    return {
+        point.name: dataclasses.replace(point.load(), source_hash=hash_of_package(point))
+        for point in importlib.metadata.entry_points(group=ENTRY_POINTS)
+    }
 
 
 def get_method(name: str) -> MethodEntry:

@@ -17,6 +17,7 @@ from typing import Any, Literal
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts, to_plain
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.ablation_study import (
     DIFFERENCES,
     METRICS,
@@ -36,7 +37,6 @@ from ambiguous_wild.methods.ablation_groups import DEFAULT
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_plots import label_points, new_figure
-from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell, ranks
 

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.report import audit_numbers
 from ambiguous_wild.report.audit_numbers import (
@@ -22,7 +23,6 @@ from ambiguous_wild.report.audit_numbers import (
     method_name,
     place_name,
 )
-from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import markdown_text, to_csv
 
 LOWER = ("lpips", "flip", "memory", "gpu_hours", "train_s", "ms", "model_mb", "peak", "gaussians")

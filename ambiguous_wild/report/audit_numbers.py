@@ -19,7 +19,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.report.grouping import grouped
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.report.plain_formats import read_csv
 
 REQUIRED = ("method", "scene", "metric", "value")

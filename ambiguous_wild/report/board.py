@@ -16,11 +16,11 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.measures import MEASURES
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.report import plain_formats
-from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import shortest
 
 FORMULA = ("=", "+", "-", "@")

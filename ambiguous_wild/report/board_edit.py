@@ -9,6 +9,7 @@ from typing import Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.io.files import folder_lock, sha256_file, sweep
 from ambiguous_wild.report import board_pictures
@@ -24,7 +25,6 @@ from ambiguous_wild.report.board import (
 )
 from ambiguous_wild.report.board_reproduce import Scenes
 from ambiguous_wild.report.board_verify import Unfinished, VerifiedRun, verify
-from ambiguous_wild.report.grouping import grouped
 
 Outcome = Literal["added", "there already", "replaced", "refused", "unfinished"]
 Tick = Callable[[int, int], None]

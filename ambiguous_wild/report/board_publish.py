@@ -19,6 +19,7 @@ from urllib.parse import quote
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.harness.result_file import RESULT, encoded
 from ambiguous_wild.harness.trained_models import TrainedModel, find_models, open_scene
@@ -50,7 +51,6 @@ from ambiguous_wild.report.board import (
     slug,
     to_number,
 )
-from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.viewing.page_file import page_text
 
 COSTS = ("reference_s", "train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")

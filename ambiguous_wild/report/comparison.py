@@ -18,11 +18,11 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
 from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, method_of, read_runs
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
-from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.notes import (
     incomparable,
     metric_versions,

@@ -14,10 +14,10 @@ from typing import Literal
 
 import numpy as np
 
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_curves import MeanAndDeviation
 from ambiguous_wild.report.cost_runs import CostRun, why_unranked
-from ambiguous_wild.report.grouping import grouped
 
 SAME_TIME = 0.01  # of the training: a smaller difference of times counts as none
 ABSENT = "(absent)"

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_runs import CostRun, Length, why_unranked
-from ambiguous_wild.report.grouping import grouped
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
 NEAR_BEST = 0.9  # of the best PSNR

@@ -9,6 +9,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour
@@ -16,7 +17,6 @@ from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.report.cost_changes import KINDS, Change
 from ambiguous_wild.report.cost_curves import Curve, MeanAndDeviation, Point, pareto, summary, timeline
 from ambiguous_wild.report.cost_report import PLOTS, CostReport, TimeUnit, per_minute
-from ambiguous_wild.report.grouping import grouped
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))  # when colours run out
 GREY = "0.45"

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_curves import Curve, curves_of, duration, scenes_of, summary
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
-from ambiguous_wild.report.grouping import grouped
 
 CLOSE_DB = 0.3  # a setting this near the best is marked as equally good
 _TAKEN = ("--method", "--effects", "--resolution", "--max-gaussians", "--set", "--plugin", "--device")

@@ -10,6 +10,7 @@ from typing import Any
 
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.result_file import encoded
 from ambiguous_wild.harness.timing import seconds_range
@@ -28,7 +29,6 @@ from ambiguous_wild.report.cost_curves import (
     times_to_reach,
 )
 from ambiguous_wild.report.cost_runs import CostRuns, why_unranked
-from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.table_layout import Table, text_table
 
 PLOTS = ("timelines", "budgets", "front", "changes")

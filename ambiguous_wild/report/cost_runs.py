@@ -18,6 +18,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.result_file import Cost, Options, RunResult, mean_of
 from ambiguous_wild.harness.store import (
     BOOKKEEPING,
@@ -32,7 +33,6 @@ from ambiguous_wild.harness.store import (
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.io.files import own_json
 from ambiguous_wild.metrics import stats
-from ambiguous_wild.report.grouping import grouped
 
 SETTINGS = ("resolution", "max_gaussians")  # settings of training that are compared like options
 NUMBERS = ("ms_per_iteration", "gaussians", "model_mb", "fps")

@@ -11,12 +11,12 @@ import pandas as pd
 
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.result_file import Options
 from ambiguous_wild.harness.store import Runs, method_of, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
-from ambiguous_wild.report.grouping import grouped
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
 
 LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps

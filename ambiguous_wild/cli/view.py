@@ -235,16 +235,16 @@ def export_command(
         return
     for label, files in reports:
         click.echo(f"{plain(label)}: {files[0].gaussians:,} Gaussians")
-        if told := [f"{e.format}: {_place(e)}" for e in files if e.place != type(e.place)()]:
+        if told := [f"{e.format}: {_transform(e)}" for e in files if e.transform != type(e.transform)()]:
             click.echo(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}")
         for e in files:
             click.echo(f"  {_line(e)}")
 
 
-def _place(e: ExportedModel) -> str:
-    x, y, z = e.place.centre
-    smaller = "" if e.place.scale == 1 else f"divide by {e.place.scale:g}, then "
-    w, *axis = e.place.turn
+def _transform(e: ExportedModel) -> str:
+    x, y, z = e.transform.centre
+    smaller = "" if e.transform.scale == 1 else f"divide by {e.transform.scale:g}, then "
+    w, *axis = e.transform.turn
     back = (
         ""
         if w == 1

@@ -137,7 +137,7 @@ class Scene:
     views: tuple[View, ...]
     points: SparsePoints
     info: SceneInfo = field(default_factory=SceneInfo, repr=False)
-    place: SceneTransform = UNMOVED  # how views and points were moved from the coordinates of the files
+    transform: SceneTransform = UNMOVED  # how views and points were moved from the coordinates of the files
 
     @cached_property
     def train(self) -> tuple[View, ...]:
@@ -178,12 +178,12 @@ def centred(scene: Scene) -> Scene:
     far = np.abs(middle).max() > _FAR_PLACE * size
     x, y, z = (np.round(middle / unit) * unit if far else np.zeros(3)).tolist()
     scale = 1.0 if _ORDINARY[0] <= size <= _ORDINARY[1] else float(2.0 ** np.round(np.log2(_SIZE / size)))
-    place = SceneTransform((x, y, z), scale)
-    if place == UNMOVED:
+    transform = SceneTransform((x, y, z), scale)
+    if transform == UNMOVED:
         return scene
-    views = tuple(replace(v, camera=place.inside(v.camera)) for v in scene.views)
-    points = replace(scene.points, xyz=(xyz - place.centre) * scale)
-    return replace(scene, views=views, points=points, place=place)
+    views = tuple(replace(v, camera=transform.inside(v.camera)) for v in scene.views)
+    points = replace(scene.points, xyz=(xyz - transform.centre) * scale)
+    return replace(scene, views=views, points=points, transform=transform)
 
 
 def together(views: tuple[View, ...]) -> tuple[View, ...]:

@@ -131,7 +131,7 @@ def scene_identity(scene: Scene) -> str:
         name = path.relative_to(scene.root).as_posix()
         if name not in hashes and path.is_file():
             hashes[name] = _digest(path)
-    moved = {} if scene.place == UNMOVED else {"place": [*scene.place.centre, scene.place.scale]}
+    moved = {} if scene.transform == UNMOVED else {"place": [*scene.transform.centre, scene.transform.scale]}
     return config_hash({"files": hashes, "split": split, **moved})
 
 

@@ -166,8 +166,8 @@ def _model(cell: Cell, produced: Produced, folder: Path) -> dict[str, float]:
     with atomic_path(target) as temporary:
         temporary.unlink()
         try:
-            if cell.scene.place != UNMOVED:
-                write_splat_ply(temporary, read_splat_ply(produced.ply), cell.scene.place)
+            if cell.scene.transform != UNMOVED:
+                write_splat_ply(temporary, read_splat_ply(produced.ply), cell.scene.transform)
             else:
                 os.link(produced.ply, temporary)
         except OSError:  # another file system, or one without hard links

@@ -66,14 +66,14 @@ def started(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> Method
         return hooks
     from ambiguous_wild.viewing.model import gaussians_of, moved
 
-    content, place = _read(start.path), scene.place
+    content, transform = _read(start.path), scene.transform
     if sha256_file(start.path) != start.sha256:
         raise AwError(f"{start.path} has changed since the run was planned; bench again")
     if isinstance(content, SplatFile):
-        arrays = moved(content.gaussians, content.place, place)
+        arrays = moved(content.gaussians, content.transform, transform)
         _check_position(start.path, arrays["means"], scene)
         return replace(hooks, given=gaussians_of(arrays))
-    xyz = (content[0] - place.centre) * place.scale
+    xyz = (content[0] - transform.centre) * transform.scale
     _check_position(start.path, xyz, scene)
     return replace(hooks, given=(xyz, content[1]))
 
@@ -118,7 +118,7 @@ def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
         for some, others in ((some_points(xyz), points), (some_points(points), xyz))
     ]  # the greater counts: each of the two may cover a part of the scene alone
     if max(shares) < _FEW_NEAR:
-        middle = np.median(xyz, axis=0) / scene.place.scale + scene.place.centre
+        middle = np.median(xyz, axis=0) / scene.transform.scale + scene.transform.centre
         coordinates = ", ".join(f"{c:.4g}" for c in middle)
         found = (
             f"{path} lies around ({coordinates}), and at most {max(shares):.0%} of its points and those of "

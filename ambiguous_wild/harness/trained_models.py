@@ -68,7 +68,7 @@ def read_models(
         opened = scene_around(files[0]) if scene_folder is None else load_scene(scene_folder)
         if scene_folder is None:
             notes.append(f"no --scene: the cameras are on a circle around {files[0].ply.name}, y down")
-        return SceneModels(opened, tuple(model.within(opened.place) for model in files), tuple(notes))
+        return SceneModels(opened, tuple(model.within(opened.transform) for model in files), tuple(notes))
     trained, more = find_models(folders if files else paths)
     notes += more
     names = sorted({t.scene for t in trained})
@@ -88,7 +88,7 @@ def read_models(
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
     opened = open_scene(trained[0].run, scene_folder)
     notes += [mixed] if (mixed := mixed_tests(opened)) else []
-    models = (*(t.model for t in trained), *(model.within(opened.place) for model in files))
+    models = (*(t.model for t in trained), *(model.within(opened.transform) for model in files))
     return SceneModels(opened, models, tuple(notes))
 
 

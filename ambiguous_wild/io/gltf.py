@@ -19,10 +19,10 @@ from ambiguous_wild.io.splat_arrays import (
     Arrays,
     SplatFile,
     logit,
-    place_facts,
-    place_from,
     rounded,
     sigmoid,
+    transform_from,
+    transform_record,
 )
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -37,8 +37,10 @@ def _harmonics(rest: int) -> list[str]:
     return [f"SH_DEGREE_{d}_COEF_{c}" for d in range(1, degree + 1) for c in range(2 * d + 1)]
 
 
-def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
-    """Return the parts of a .glb; the offset of the place is the node's translation.
+def encode_gltf(
+    gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
+) -> list[bytes]:
+    """Return the parts of a .glb; the offset of the transform is the node's translation.
 
     The format cannot say `antialias`.
 
@@ -83,13 +85,13 @@ def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: b
         "projection": "perspective",
     }
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
-    extras = {"extras": place_facts(place)} if place != UNMOVED else {}
+    extras = {"extras": transform_record(transform)} if transform != UNMOVED else {}
     head = {
         "asset": {"version": "2.0", "generator": "ambiguous_wild", **extras},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [_node(place)],
+        "nodes": [_node(transform)],
         "buffers": [{"byteLength": len(body)}],
         "bufferViews": views,
         "accessors": accessors,
@@ -104,22 +106,24 @@ def encode_gltf(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: b
     return [head_bytes, struct.pack("<II", len(body), _BIN), body]
 
 
-def _node(place: SceneTransform) -> dict[str, object]:
+def _node(transform: SceneTransform) -> dict[str, object]:
     """Return the node that turns and moves the model to where glTF's viewers expect it."""
-    if place.turn != UNMOVED.turn:  # the caller turned the model so that y is up
+    if transform.turn != UNMOVED.turn:  # the caller turned the model so that y is up
         return {"mesh": 0}
-    x, y, z = place.centre
-    return {"mesh": 0, "rotation": _HALF_TURN} | ({"translation": [-x, -y, z]} if any(place.centre) else {})
+    x, y, z = transform.centre
+    return {"mesh": 0, "rotation": _HALF_TURN} | (
+        {"translation": [-x, -y, z]} if any(transform.centre) else {}
+    )
 
 
-def _changed(head: dict[str, Any], place: SceneTransform) -> str:
+def _changed(head: dict[str, Any], transform: SceneTransform) -> str:
     """Name what a file has that ours have not, and that changes where or how Gaussians are read."""
     primitives = [primitive for mesh in head["meshes"] for primitive in mesh["primitives"]]
     named = {name: head["accessors"][index] for name, index in primitives[0]["attributes"].items()}
     used = list(named.values())
     views = [head["bufferViews"][accessor["bufferView"]] for accessor in used]
     found = {
-        "nodes": head["nodes"] != [_node(place)],
+        "nodes": head["nodes"] != [_node(transform)],
         "second mesh": len(primitives) > 1,
         "external buffer": any("uri" in buffer for buffer in head["buffers"]) or len(head["buffers"]) > 1,
         "stride of rows": any("byteStride" in view for view in views),
@@ -145,8 +149,8 @@ def decode_gltf(data: bytes, path: Path | str) -> SplatFile:
         if (magic, version, kind) != (b"glTF", 2, _JSON):
             raise AwError(f"{path} is no binary glTF 2.0")
         attributes = head["meshes"][0]["primitives"][0]["attributes"]
-        place = place_from(head["asset"].get("extras"))
-        if changed := _changed(head, place):
+        transform = transform_from(head["asset"].get("extras"))
+        if changed := _changed(head, transform):
             raise AwError(
                 f"{path} was changed by another program, whose {changed} this reader does not follow; "
                 "export the model again, or save it as PLY there"
@@ -174,7 +178,7 @@ def decode_gltf(data: bytes, path: Path | str) -> SplatFile:
             "sh0": column(f"{EXTENSION}:SH_DEGREE_0_COEF_0"),
             "sh_rest": np.stack(higher, axis=1) if higher else np.zeros((len(means), 0, 3), np.float32),
         }
-        return SplatFile(arrays, place)
+        return SplatFile(arrays, transform)
     except (
         struct.error,
         ValueError,

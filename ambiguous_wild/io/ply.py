@@ -13,7 +13,7 @@ import numpy as np
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE
 from ambiguous_wild.io.files import write_bytes
-from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, checked_place
+from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, checked_transform
 from ambiguous_wild.io.untrusted import read_bytes
 
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
@@ -34,7 +34,7 @@ def _columns(rest: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def write_splat_ply(path: Path | str, gaussians: Arrays, place: SceneTransform = UNMOVED) -> None:
+def write_splat_ply(path: Path | str, gaussians: Arrays, transform: SceneTransform = UNMOVED) -> None:
     """Write Gaussians atomically.
 
     If the scene was moved, the file has the units of the scene's files, and a comment in the header gives the
@@ -44,7 +44,7 @@ def write_splat_ply(path: Path | str, gaussians: Arrays, place: SceneTransform =
         path: the file.
         gaussians: raw parameters as `splat.Gaussians` holds them: means [N, 3], quats [N, 4] (w, x, y,
             z), log_scales [N, 3], opacity_logits [N], sh0 [N, 3], sh_rest [N, K, 3] with K of 0, 3, 8, 15.
-        place: place of the scene that they were trained on, in whose inner coordinates they are.
+        transform: transform of the scene that they were trained on, in whose inner coordinates they are.
 
     Raises:
         AwError: an array is missing or has another shape.
@@ -59,12 +59,14 @@ def write_splat_ply(path: Path | str, gaussians: Arrays, place: SceneTransform =
     rest = gaussians["sh_rest"]
     if rest.ndim != 3 or rest.shape[0] != n or rest.shape[1] not in (0, 3, 8, 15) or rest.shape[2] != 3:
         raise AwError(f"cannot write {path}: sh_rest is {list(rest.shape)}, not [{n}, 0|3|8|15, 3]")
-    write_bytes(path, encode_ply(gaussians, place))
+    write_bytes(path, encode_ply(gaussians, transform))
 
 
-def encode_ply(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
+def encode_ply(
+    gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
+) -> list[bytes]:
     """Return the parts of a splat PLY, see `write_splat_ply`. The format cannot say `antialias`."""
-    gaussians = rescaled(gaussians, 1 / place.scale)
+    gaussians = rescaled(gaussians, 1 / transform.scale)
     n, rest = gaussians["sh_rest"].shape[:2]
     table = np.concatenate(
         [
@@ -80,7 +82,7 @@ def encode_ply(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bo
         dtype="<f4",
         casting="same_kind",
     )
-    header = ["ply", "format binary_little_endian 1.0", *place_comments(place), f"element vertex {n}"]
+    header = ["ply", "format binary_little_endian 1.0", *transform_comments(transform), f"element vertex {n}"]
     header += [f"property float {name}" for name in _columns(rest)] + ["end_header", ""]
     return ["\n".join(header).encode("ascii"), table.tobytes()]
 
@@ -94,26 +96,26 @@ def rescaled(gaussians: Arrays, factor: float) -> Arrays:
     return {**gaussians, "means": (means * factor).astype(means.dtype), **sizes}
 
 
-def place_comments(place: SceneTransform) -> list[str]:
-    """Return header lines of a PLY that record the place of its scene."""
-    values = {"offset": place.centre, "training_scale": (place.scale,), "rotation": place.turn}
-    if place.turn == UNMOVED.turn:
+def transform_comments(transform: SceneTransform) -> list[str]:
+    """Return header lines of a PLY that record the transform of its scene."""
+    values = {"offset": transform.centre, "training_scale": (transform.scale,), "rotation": transform.turn}
+    if transform.turn == UNMOVED.turn:
         del values["rotation"]
     lines = [f"comment {name} {' '.join(map(repr, numbers))}" for name, numbers in values.items()]
-    return [] if place == UNMOVED else lines
+    return [] if transform == UNMOVED else lines
 
 
-def read_place(path: Path | str) -> SceneTransform:
-    """Return the place of the scene of a splat PLY; `UNMOVED` if another tool wrote it.
+def read_transform(path: Path | str) -> SceneTransform:
+    """Return the transform of the scene of a splat PLY; `UNMOVED` if another tool wrote it.
 
     Raises:
         AwError: the numbers in its comments are invalid.
     """
-    return header_place(_head(path), path)
+    return header_transform(_head(path), path)
 
 
-def header_place(data: bytes, path: Path | str) -> SceneTransform:
-    """Return the place as `read_place` does, from the file's bytes."""
+def header_transform(data: bytes, path: Path | str) -> SceneTransform:
+    """Return the transform as `read_transform` does, from the file's bytes."""
     head = data[:_MAX_HEADER].partition(b"\nend_header")[0]
     words = dict(re.findall(rb"^comment (offset|training_scale|rotation) (.+)$", head, re.MULTILINE))
     if not {b"offset", b"training_scale"} <= words.keys():
@@ -123,7 +125,7 @@ def header_place(data: bytes, path: Path | str) -> SceneTransform:
             [float(v) for v in words.get(name, b"1 0 0 0").split()]
             for name in (b"offset", b"training_scale", b"rotation")
         )
-        return checked_place(offset, scale, turn)
+        return checked_transform(offset, scale, turn)
     except ValueError:
         raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
 
@@ -143,7 +145,7 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
 
 def decode_ply(data: bytes, path: Path | str) -> SplatFile:
     """Read a splat PLY from its bytes, see `read_splat_ply`."""
-    table, place = _vertices(data, path), header_place(data, path)
+    table, transform = _vertices(data, path), header_transform(data, path)
     count = len(table)
     present = set(table.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in present)
@@ -170,7 +172,7 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
-    return SplatFile(dict(rescaled(arrays, place.scale)), place)
+    return SplatFile(dict(rescaled(arrays, transform.scale)), transform)
 
 
 def _floats(table: np.ndarray, names: Sequence[str], path: Path | str) -> np.ndarray:

@@ -50,7 +50,7 @@ def load_scene(
         check: ask what `scene_checks` lists, for which photos may be read, and warn; not where a run is only
             looked at, or the scene was asked before.
         raw: keep the files' coordinates; else a scene far from the origin, or too large or small for float32
-            and the nearest depth, is moved and scaled (`Scene.place`).
+            and the nearest depth, is moved and scaled (`Scene.transform`).
 
     Returns:
         The scene: views ordered by name, intrinsics at the size of the loaded files, tracks in px of these

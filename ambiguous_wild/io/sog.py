@@ -24,10 +24,10 @@ from ambiguous_wild.io.splat_arrays import (
     from_largest,
     largest_first,
     logit,
-    place_facts,
-    place_from,
     rounded,
     sigmoid,
+    transform_from,
+    transform_record,
 )
 
 _CODES = 256  # entries of a codebook
@@ -40,8 +40,10 @@ _MAX_TEXTURE = 1 << 28
 _LOSSLESS = 101  # WebP quality above 100
 
 
-def encode_sog(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
-    """Return the file; the place stands in meta.json. The format cannot say `antialias`.
+def encode_sog(
+    gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
+) -> list[bytes]:
+    """Return the file; the transform stands in meta.json. The format cannot say `antialias`.
 
     Raises:
         AwError: more Gaussians than a texture holds.
@@ -65,7 +67,7 @@ def encode_sog(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bo
     }
     meta: dict[str, object] = {
         "version": 2,
-        "asset": {"generator": "ambiguous_wild", **place_facts(place)},
+        "asset": {"generator": "ambiguous_wild", **transform_record(transform)},
         "count": n,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
@@ -105,7 +107,7 @@ def decode_sog(data: bytes, path: Path | str) -> SplatFile:
             meta = json.loads(_member(archive, "meta.json"))
             if meta["version"] != 2:
                 raise AwError(f"{path} is SOG of version {meta['version']!r}; this reads version 2")
-            return SplatFile(_decode(archive, meta), place_from(meta.get("asset")))
+            return SplatFile(_decode(archive, meta), transform_from(meta.get("asset")))
     except (
         zipfile.BadZipFile,
         zlib.error,

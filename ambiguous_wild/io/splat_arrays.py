@@ -21,7 +21,7 @@ class SplatFile:
     """Content of a splat file."""
 
     gaussians: dict[str, np.ndarray]  # raw parameters, see `io.ply.read_splat_ply`
-    place: SceneTransform = UNMOVED  # place of the scene in whose coordinates they are
+    transform: SceneTransform = UNMOVED  # transform of the scene in whose coordinates they are
     antialias: bool = False  # whether the file says that it is drawn with Mip-Splatting's filter
     left_out: int = 0  # number of Gaussians with values that are not finite
 
@@ -103,31 +103,33 @@ def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats
 
 
-def checked_place(
+def checked_transform(
     offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn
 ) -> SceneTransform:
-    """Return the place that a file records.
+    """Return the transform that a file records.
 
     Raises:
         ValueError: the numbers are invalid.
     """
     (x, y, z), (a, b, c, d) = offset, turn
     if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(turn)):
-        raise ValueError("invalid place")
+        raise ValueError("invalid transform")
     return SceneTransform(
         (float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d))
     )
 
 
-def place_facts(place: SceneTransform) -> dict[str, float | list[float]]:
-    """Return the place as written to files: the user's coordinates are positions / scale + offset."""
-    turned = {} if place.turn == UNMOVED.turn else {"rotation": list(place.turn)}
-    return {} if place == UNMOVED else {"offset": list(place.centre), "scale": place.scale, **turned}
+def transform_record(transform: SceneTransform) -> dict[str, float | list[float]]:
+    """Return the transform as written to files: the user's coordinates are positions / scale + offset."""
+    turned = {} if transform.turn == UNMOVED.turn else {"rotation": list(transform.turn)}
+    return (
+        {} if transform == UNMOVED else {"offset": list(transform.centre), "scale": transform.scale, **turned}
+    )
 
 
-def place_from(facts: Any) -> SceneTransform:
-    """Return the place for a result of `place_facts`; `UNMOVED` for anything else."""
+def transform_from(facts: Any) -> SceneTransform:
+    """Return the transform for a result of `transform_record`; `UNMOVED` for anything else."""
     try:
-        return checked_place(facts["offset"], facts["scale"], facts.get("rotation", UNMOVED.turn))
+        return checked_transform(facts["offset"], facts["scale"], facts.get("rotation", UNMOVED.turn))
     except (KeyError, TypeError, ValueError, AttributeError):
         return UNMOVED

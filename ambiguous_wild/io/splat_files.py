@@ -29,12 +29,12 @@ class SplatFormat:
     starts: Callable[[bytes], bool]  # whether a file with these bytes is of this format
     # bytes and name of a file -> its content; AwError with the name if it is damaged
     decode: Callable[[bytes, Path], SplatFile]
-    # finite Gaussians, the place of their scene, whether Mip-Splatting's filter draws them -> parts of a file
+    # finite Gaussians, their scene's transform, whether Mip-Splatting's filter draws them -> parts of a file
     encode: Callable[[Arrays, SceneTransform, bool], list[bytes]]
     ordered: bool = True  # Gaussians are written in the order of a Morton curve
     # whether it holds the sizes of a scene whose unit is 1/x of the unit of training
     holds_units: Callable[[float], bool] = lambda scale: True
-    y_up: bool = False  # y points up in every file, and a node of it states the place
+    y_up: bool = False  # y points up in every file, and a node of it states the transform
 
 
 def _magic(*magic: bytes) -> Callable[[bytes], bool]:
@@ -93,7 +93,7 @@ def write_splats(
     form: SplatFormat,
     path: Path | str,
     gaussians: Arrays,
-    place: SceneTransform = UNMOVED,
+    transform: SceneTransform = UNMOVED,
     antialias: bool = False,
 ) -> int:
     """Write the Gaussians that are finite atomically, and return their number.
@@ -102,7 +102,7 @@ def write_splats(
         form: one of `FORMATS`.
         path: the file.
         gaussians: raw parameters, see `io.ply.write_splat_ply`.
-        place: place of their scene, which the file records.
+        transform: transform of their scene, which the file records.
         antialias: Mip-Splatting's 2D filter draws them; recorded where the format can.
 
     Raises:
@@ -111,5 +111,5 @@ def write_splats(
     kept = drawable(form, gaussians)
     if not len(kept["means"]):
         raise AwError(f"cannot write {path}: no Gaussian is finite")
-    write_bytes(path, form.encode(kept, place, antialias))
+    write_bytes(path, form.encode(kept, transform, antialias))
     return len(kept["means"])

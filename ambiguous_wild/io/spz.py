@@ -23,10 +23,10 @@ from ambiguous_wild.io.splat_arrays import (
     from_largest,
     largest_first,
     logit,
-    place_facts,
-    place_from,
     rounded,
     sigmoid,
+    transform_from,
+    transform_record,
 )
 
 _MAGIC = 0x5053474E  # "NGSP"
@@ -42,8 +42,10 @@ FLIP = np.array([1.0, -1.0, -1.0], np.float32)  # signs that turn positions from
 SH_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
-def encode_spz(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bool = False) -> list[bytes]:
-    """Return the parts of the file; the place is the comment of the gzip stream, `antialias` a flag.
+def encode_spz(
+    gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
+) -> list[bytes]:
+    """Return the parts of the file; the transform is the comment of the gzip stream, `antialias` a flag.
 
     Raises:
         AwError: positions of more than 8 million units.
@@ -66,9 +68,9 @@ def encode_spz(gaussians: Arrays, place: SceneTransform = UNMOVED, antialias: bo
         _pack_harmonics(gaussians["sh_rest"]).tobytes(),
     ]
     packed = gzip.compress(b"".join(parts), 9, mtime=0)
-    if place == UNMOVED:
+    if transform == UNMOVED:
         return [packed]
-    comment = json.dumps(place_facts(place)).encode("ascii")
+    comment = json.dumps(transform_record(transform)).encode("ascii")
     # Set the flag of a comment, which follows the 10 bytes of a gzip header.
     return [packed[:3], b"\x10", packed[4:10], comment, b"\0", packed[10:]]
 
@@ -126,10 +128,10 @@ def decode_spz(packed: bytes, path: Path | str) -> SplatFile:
     }
     comment = packed[10 : packed.find(b"\0", 10)] if zipped and packed[3] == 0x10 else b"0"
     try:
-        place = place_from(json.loads(comment))
+        transform = transform_from(json.loads(comment))
     except (ValueError, RecursionError):  # another program wrote the comment
-        place = UNMOVED
-    return SplatFile(arrays, place, bool(flags & _ANTIALIASED))
+        transform = UNMOVED
+    return SplatFile(arrays, transform, bool(flags & _ANTIALIASED))
 
 
 def _unpacked(packed: bytes, streams: int, sizes: Sequence[int], path: Path | str) -> bytes:

@@ -60,7 +60,7 @@ def stage(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photo
         _link_views(scene.train, {v.name: v.image_path for v in scene.train}, folder, scene)
     elif photos == "nerf-w":
         _stage_nerfw(scene, folder)
-    elif scene.place != UNMOVED:
+    elif scene.transform != UNMOVED:
         write_views(folder / "sparse" / "0", scene.views, scene.points)
     for path in () if photos != "all" else sorted(scene.root.resolve().iterdir()):
         if path.name in _LEFT_OUT or path.name.startswith(".") or (folder / path.name).exists():

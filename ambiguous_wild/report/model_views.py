@@ -102,7 +102,7 @@ def export_runs(
                 scene = open_scene(run, scene_folder)
             elif run is None and scene_folder is not None:
                 scene = load_scene(scene_folder)
-                model = model.within(scene.place)
+                model = model.within(scene.transform)
         except AwError as error:
             if up is not None or run is None:
                 raise

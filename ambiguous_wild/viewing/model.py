@@ -15,7 +15,7 @@ from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.files import sweep_killed
 from ambiguous_wild.io.images import read_png_rgb, to_uint8
-from ambiguous_wild.io.ply import read_place, read_splat_ply, rescaled, splat_count
+from ambiguous_wild.io.ply import read_splat_ply, read_transform, rescaled, splat_count
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite
 from ambiguous_wild.io.splat_files import FORMATS, read_splats, write_splats
 from ambiguous_wild.io.untrusted import read_bytes
@@ -90,7 +90,7 @@ class ViewedModel:
     )  # content of `ply` if it is a splat file and not a run's model
 
     def read(self) -> dict[str, np.ndarray]:
-        """Read the Gaussians, in the coordinates of `place`.
+        """Read the Gaussians, in the coordinates of `transform`.
 
         Raises:
             AwError: no splat PLY.
@@ -98,21 +98,21 @@ class ViewedModel:
         return read_splat_ply(self.ply) if self.splats is None else self.splats.gaussians
 
     @property
-    def place(self) -> SceneTransform:
+    def transform(self) -> SceneTransform:
         """Place of the scene in whose coordinates `read` returns Gaussians."""
-        return read_place(self.ply) if self.splats is None else self.splats.place
+        return read_transform(self.ply) if self.splats is None else self.splats.transform
 
     @property
     def count(self) -> int:
         """Number of Gaussians."""
         return splat_count(self.ply) if self.splats is None else len(self.splats.gaussians["means"])
 
-    def within(self, place: SceneTransform) -> ViewedModel:
+    def within(self, transform: SceneTransform) -> ViewedModel:
         """Move the model of a splat file to a scene's inner coordinates; a run's model has them already."""
         if self.splats is None:
             return self
-        arrays = moved(self.splats.gaussians, self.splats.place, place)
-        return replace(self, splats=replace(self.splats, gaussians=dict(arrays), place=place))
+        arrays = moved(self.splats.gaussians, self.splats.transform, transform)
+        return replace(self, splats=replace(self.splats, gaussians=dict(arrays), transform=transform))
 
 
 def file_model(path: Path) -> tuple[ViewedModel, str]:
@@ -128,7 +128,7 @@ def file_model(path: Path) -> tuple[ViewedModel, str]:
 
 
 def moved(gaussians: Arrays, of: SceneTransform, to: SceneTransform) -> Arrays:
-    """Convert Gaussians from the coordinates of one place to those of another."""
+    """Convert Gaussians from one transform to another."""
     if of == to:
         return gaussians
     factor, shift = to.scale / of.scale, to.rotation @ np.subtract(of.centre, to.centre) * to.scale
@@ -213,7 +213,7 @@ class Renderer:
 
 
 def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:
-    """Return a place in which an axis of `AXES` points up and the floor below the scene's middle is at zero.
+    """Return a transform in which an axis of `AXES` points up and the floor below the middle is at zero.
 
     Args:
         model: model in the coordinates of `space`.
@@ -222,16 +222,16 @@ def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:
     """
     from scipy.spatial.transform import Rotation
 
-    gaussians, place = model.read(), model.place
+    gaussians, transform = model.read(), model.transform
     near = np.linalg.norm(gaussians["means"] - space.middle, axis=1) < 1.5 * space.distance
     near &= gaussians["opacity_logits"] > 0
     heights = gaussians["means"][near] @ space.up
     floor = float(np.quantile(heights, _FLOOR)) if len(heights) else 0.0
     foot = space.middle + (floor - space.middle @ space.up) * space.up
-    x, y, z = (place.rotation.T @ foot / place.scale + place.centre).tolist()
-    turn, _ = Rotation.align_vectors([AXES[axis]], [place.rotation.T @ space.up])
+    x, y, z = (transform.rotation.T @ foot / transform.scale + transform.centre).tolist()
+    turn, _ = Rotation.align_vectors([AXES[axis]], [transform.rotation.T @ space.up])
     a, b, c, d = turn.as_quat().tolist()
-    return SceneTransform((x, y, z), place.scale, (d, a, b, c))
+    return SceneTransform((x, y, z), transform.scale, (d, a, b, c))
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ class ExportedModel:
     psnr_to_model: float | None  # of its renders against the model's, dB; inf = equal pictures
     psnr: float | None  # of its renders against the photos, dB
     lost_db: float | None  # PSNR of the model minus `psnr`
-    place: SceneTransform = (
+    transform: SceneTransform = (
         UNMOVED  # of the file's coordinates; glTF that is not turned has the user's coordinates
     )
     source: str = "the PLY"  # file with whose size `share` compares
@@ -265,7 +265,7 @@ def export(
     """Write the formats into a folder, each atomically, read them back and measure them.
 
     Files have the units of the scene's files if the format can hold them: SPZ's sizes and, for large units,
-    SOG's positions cannot. Each file records how to reach the scene's coordinates (`ExportedModel.place`).
+    SOG's positions cannot. Each file records its `ExportedModel.transform`.
 
     Args:
         model: the model; its PLY is not changed.
@@ -284,7 +284,7 @@ def export(
         if wanted not in FORMATS:
             raise unknown("format", wanted, FORMATS)
     gaussians: Arrays = model.read()
-    place = model.place
+    transform = model.transform
     if not len(finite(gaussians)["means"]):
         raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
     plain = model.ply.stat().st_size
@@ -293,17 +293,17 @@ def export(
     exported = []
     for form in (FORMATS[wanted] for wanted in dict.fromkeys(formats)):
         if up is not None and space is not None:
-            place = upright(model, space, "y" if form.y_up else up)
-            gaussians = moved(model.read(), model.place, place)
+            transform = upright(model, space, "y" if form.y_up else up)
+            gaussians = moved(model.read(), model.transform, transform)
         path = folder / f"{name}{form.suffix}"
         sweep_killed(path)
-        units = place.scale if form.holds_units(place.scale) else 1.0
-        left = replace(place, scale=place.scale / units)
+        units = transform.scale if form.holds_units(transform.scale) else 1.0
+        left = replace(transform, scale=transform.scale / units)
         count = write_splats(
             form, path, rescaled(gaussians, 1 / units), left, model.render_settings.antialias
         )
         read_back = form.decode(read_bytes(path), path).gaussians
-        there = moved(rescaled(read_back, units), place, model.place)
+        there = moved(rescaled(read_back, units), transform, model.transform)
         after = _renders(there, model.render_settings, views)
         old, new = _mean(before, photos), _mean(after, photos)
         size = path.stat().st_size
@@ -317,7 +317,7 @@ def export(
                 psnr_to_model=_mean(after, before),
                 psnr=new,
                 lost_db=None if old is None or new is None else old - new,
-                place=UNMOVED if form.y_up and up is None else left,
+                transform=UNMOVED if form.y_up and up is None else left,
                 source="the PLY" if model.ply.suffix == ".ply" else model.ply.name,
             )
         )

@@ -126,8 +126,8 @@ def page_text(
         "middle": space.middle.tolist(),
         "extent": space.extent,
         "frustum": 0.08 * space.extent,
-        "centre": scene.place.centre,  # converts saved paths to the coordinates of the scene's files
-        "scale": scene.place.scale,
+        "centre": scene.transform.centre,  # converts saved paths to the coordinates of the scene's files
+        "scale": scene.transform.scale,
         "views": [_view_facts(v, uri, points) for v, uri, points in zip(views, uris, _points(scene, views))],
         "map": capture_map,
         "models": facts,

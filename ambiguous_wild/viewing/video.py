@@ -73,12 +73,12 @@ def scene_around(model: ViewedModel) -> Scene:
 
     Up is the axis of the file that is nearest to -y, which often is up in COLMAP's models.
     """
-    place = model.place
+    transform = model.transform
     xyz = model.read()["means"].astype(np.float64)
-    xyz = xyz[:: -(-len(xyz) // _MAX_POINTS)] @ place.rotation / place.scale + place.centre
+    xyz = xyz[:: -(-len(xyz) // _MAX_POINTS)] @ transform.rotation / transform.scale + transform.centre
     middle = np.median(xyz, axis=0)
     size = float(np.median(np.linalg.norm(xyz - middle, axis=1))) or 1.0
-    axes = np.concatenate([place.rotation, -place.rotation])
+    axes = np.concatenate([transform.rotation, -transform.rotation])
     up = axes[(-axes[:, 1]).argmax()]
     first = np.cross(up, axes[(np.abs(axes @ up)).argmin()])
     lens = Camera(_WIDTH, _HEIGHT, _WIDTH, _WIDTH, _WIDTH / 2, _HEIGHT / 2, np.eye(4))
@@ -110,7 +110,7 @@ def from_file(path: Path, scene: Scene, frames: int, size: tuple[int, int]) -> l
     cameras = []
     for number, row in enumerate(rows):
         try:
-            cameras.append(scene.place.inside(_camera(row, lens, size)))
+            cameras.append(scene.transform.inside(_camera(row, lens, size)))
         except (AwError, KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
             raise AwError(f"{path}: camera {number} is invalid: {error}") from None
     return cameras if len(cameras) == frames else _smooth(cameras, frames, size)

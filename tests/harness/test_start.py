@@ -25,7 +25,7 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import START_SHARE, MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.viewing.model import Renderer, RenderSettings
-from tests.io.test_place import UTM, moved
+from tests.io.test_scene_transform import UTM, moved
 from tests.viewing.wall_runs import wall_model
 
 Words = dict[str, object]
@@ -84,15 +84,15 @@ def test_a_start_is_in_the_coordinates_of_the_files(tmp_path, kind, shift, scale
     scene = load_scene(moved(tmp_path / "scene", shift, scale))
     wall, path = wall_model(2500), tmp_path / f"start.{kind}"
     true = wall["means"].astype(np.float64) * scale + shift
-    inner = (true - scene.place.centre) * scene.place.scale
-    sizes = wall["log_scales"] + np.float32(np.log(scale * scene.place.scale))
+    inner = (true - scene.transform.centre) * scene.transform.scale
+    sizes = wall["log_scales"] + np.float32(np.log(scale * scene.transform.scale))
     arrays = {**wall, "means": inner.astype(np.float32), "log_scales": sizes}
     if kind == "points":
         write_point_ply(path, true, np.zeros((2500, 3), np.uint8))
         xyz, _ = started(MethodHooks(), start_file(path), scene).given
         np.testing.assert_allclose(xyz, inner, atol=1e-3)
         return
-    write_splats(FORMATS[kind], path, arrays, scene.place)
+    write_splats(FORMATS[kind], path, arrays, scene.transform)
     parts = started(MethodHooks(sh_degree=2), start_file(path), scene)
     found = parts.first_gaussians(type("Data", (), {"device": "cpu"})())
     assert isinstance(found, Gaussians) and found.sh_rest.shape == (2500, 8, 3)
@@ -135,7 +135,7 @@ def test_what_a_run_cannot_start_from_is_refused_before_anything_is_made(scene, 
 
 def test_a_start_that_lies_near_few_points_of_the_scene_is_warned_of(scene, tmp_path):
     given = load_scene(scene)
-    xyz = given.points.xyz / given.place.scale + given.place.centre
+    xyz = given.points.xyz / given.transform.scale + given.transform.centre
     moved = np.where(np.arange(len(xyz))[:, None] % 40, xyz - np.array([0, 0, 2.0]), xyz)
     write_point_ply(tmp_path / "other.ply", moved, np.zeros(moved.shape, np.uint8))
     with pytest.warns(UserWarning, match="at most [2-9]% of its points .* is it of another scene"):

@@ -131,7 +131,7 @@ def test_other_versions_of_spz_are_read(tmp_path: Path, version: int, rest: int)
     limits = list(OURS["spz"])
     limits[1] = 6e-3 if version == 2 else limits[1]  # w follows from 8 bits of x, y, z
     check_near(splats.gaussians, given, tuple(limits))
-    assert splats.antialias and splats.place == SceneTransform()
+    assert splats.antialias and splats.transform == SceneTransform()
     for cut in (20, 40, path.stat().st_size // 2):
         (tmp_path / "cut.spz").write_bytes(path.read_bytes()[:cut])
         with pytest.raises(AwError, match="cut"):
@@ -183,7 +183,7 @@ def test_any_format_is_told_by_its_bytes_and_has_its_place(tmp_path: Path, endin
     place = SceneTransform((5e5, -4e6, 3.0), 0.25, (0.5, 0.5, -0.5, 0.5))
     assert write_splats(FORMS[ending], path, given, place, antialias=True) == 87
     splats = read_splats(path)
-    assert splats.place == place and splats.antialias == (ending == "spz")
+    assert splats.transform == place and splats.antialias == (ending == "spz")
     assert len(splats.gaussians["means"]) == 87 and splats.left_out == 0
     with pytest.raises(AwError, match="no Gaussian is finite"):
         write(ending, path, model(0))

@@ -26,8 +26,8 @@ from ambiguous_wild.viewing.model import (
     space_of,
 )
 from tests.command_line import aw
-from tests.io.test_place import UTM
-from tests.io.test_place import moved as moved_scene
+from tests.io.test_scene_transform import UTM
+from tests.io.test_scene_transform import moved as moved_scene
 from tests.tiny_scene import write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run
 
@@ -46,15 +46,15 @@ def test_our_exports_show_what_the_run_shows(
 ) -> None:
     scene = load_scene(moved_scene(tmp_path / "scene", shift, scale))
     wall = wall_model()
-    offset = (shift - scene.place.centre) * scene.place.scale
-    times = scale * scene.place.scale
+    offset = (shift - scene.transform.centre) * scene.transform.scale
+    times = scale * scene.transform.scale
     inner = {**wall, "means": (wall["means"] * times + offset).astype(np.float32)}
     inner["log_scales"] = wall["log_scales"] + np.float32(np.log(times))
-    write_splat_ply(tmp_path / "m.ply", inner, scene.place)
+    write_splat_ply(tmp_path / "m.ply", inner, scene.transform)
     model = ViewedModel("m", tmp_path / "m.ply")
     (made,) = export(model, tmp_path / "out", [form], scene.test, name="x")
     shown = read_models([made.path], scene_folder=tmp_path / "scene")
-    assert shown.scene.place == scene.place and [m.label for m in shown.models] == [made.path.name]
+    assert shown.scene.transform == scene.transform and [m.label for m in shown.models] == [made.path.name]
     camera = scene.test[0].camera
     before, after = (
         Renderer(inner, RenderSettings())(camera),
@@ -74,13 +74,17 @@ def test_an_upright_export_renders_the_same_from_turned_cameras(tmp_path: Path, 
         assert file.psnr_to_model is not None and file.psnr_to_model > (35 if file.format == "spz" else 50)
         up = AXES["y" if file.format == "gltf" else axis]
         splats = read_splats(file.path)
-        assert splats.place.turn == pytest.approx(file.place.turn) and splats.place.centre != (0, 0, 0)
-        np.testing.assert_allclose(file.place.rotation @ [0, -1, 0], up, atol=1e-9)  # y is down in photos
+        assert splats.transform.turn == pytest.approx(file.transform.turn) and splats.transform.centre != (
+            0,
+            0,
+            0,
+        )
+        np.testing.assert_allclose(file.transform.rotation @ [0, -1, 0], up, atol=1e-9)  # y is down in photos
         heights = splats.gaussians["means"][splats.gaussians["opacity_logits"] > 0] @ up
         assert 0.01 < (heights < 0).mean() < 0.04 and heights.max() > 3  # the floor, and the wall above it
         if file.format != "spz":
             camera = scene.test[1].camera
-            there = Renderer(splats.gaussians, RenderSettings())(splats.place.inside(camera))
+            there = Renderer(splats.gaussians, RenderSettings())(splats.transform.inside(camera))
             assert psnr(there, Renderer(wall, RenderSettings())(camera)) > 50
 
 

@@ -15,7 +15,7 @@ from ambiguous_wild.core import Camera, SceneTransform
 from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.datasets.points import random_points
 from ambiguous_wild.io.colmap_model import read_model
-from ambiguous_wild.io.ply import read_place, read_point_ply, read_splat_ply, write_splat_ply
+from ambiguous_wild.io.ply import read_point_ply, read_splat_ply, read_transform, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, export, space_of
@@ -49,8 +49,8 @@ def world(gaussians: dict[str, np.ndarray], place: SceneTransform) -> np.ndarray
 
 def test_an_ordinary_scene_is_not_touched(tmp_path: Path) -> None:
     scene = load_scene(write_tiny_scene(tmp_path / "s"))
-    assert scene.place == SceneTransform() and np.array_equal(scene.train[1].camera.center, [0.25, 0, 0])
-    write_splat_ply(tmp_path / "m.ply", wall_model(3), scene.place)
+    assert scene.transform == SceneTransform() and np.array_equal(scene.train[1].camera.center, [0.25, 0, 0])
+    write_splat_ply(tmp_path / "m.ply", wall_model(3), scene.transform)
     assert b"comment" not in (tmp_path / "m.ply").read_bytes()
 
 
@@ -60,9 +60,9 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
 ) -> None:
     plain = load_scene(write_tiny_scene(tmp_path / "plain"))
     scene = load_scene(moved(tmp_path / "moved", shift, scale))
-    times = scene.place.scale * scale
+    times = scene.transform.scale * scale
     assert 0.5 < times * np.median(np.abs(plain.points.xyz[:, 2])) / 4 < 2
-    offset = (shift - scene.place.centre) * scene.place.scale
+    offset = (shift - scene.transform.centre) * scene.transform.scale
     assert np.abs(offset).max() < 10  # near the origin
     np.testing.assert_allclose(scene.points.xyz, plain.points.xyz * times + offset, atol=1e-6)
     assert scene.extent == pytest.approx(plain.extent * times, rel=1e-6)
@@ -73,8 +73,8 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
     inner["means"] = (wall["means"] * times + offset).astype(np.float32)
     inner["log_scales"] = (wall["log_scales"] + np.log(times)).astype(np.float32)
     ply = tmp_path / "m.ply"
-    write_splat_ply(ply, inner, scene.place)
-    assert read_place(ply) == scene.place
+    write_splat_ply(ply, inner, scene.transform)
+    assert read_transform(ply) == scene.transform
     model = ViewedModel("m", ply)
     before = Renderer(wall, model.render_settings)(plain.test[0].camera).astype(int)
     after = Renderer(model.read(), model.render_settings)(scene.test[0].camera).astype(int)
@@ -84,7 +84,7 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
     true = wall["means"].astype(np.float64) * scale + shift
     for made in export(model, tmp_path / "out", list(FORMATS), scene.test):
         assert made.psnr_to_model is not None and made.psnr_to_model > 35, made
-        place = made.place
+        place = made.transform
         if made.format == "gltf":
             data = made.path.read_bytes()
             node = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["nodes"][0]
@@ -98,8 +98,8 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
         elif made.format == "sog":
             told = json.loads(zipfile.ZipFile(made.path).read("meta.json"))["asset"]
             place = SceneTransform(tuple(told.get("offset", (0, 0, 0))), told.get("scale", 1.0))
-        elif any(scene.place.centre):
-            x, y, z = scene.place.centre
+        elif any(scene.transform.centre):
+            x, y, z = scene.transform.centre
             assert f"comment offset {x!r} {y!r} {z!r}\n".encode() in made.path.read_bytes()
         found = world(FORMATS[made.format].decode(made.path.read_bytes(), made.path).gaussians, place)
         for axis in range(3):
@@ -113,7 +113,7 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
     film = from_file(tmp_path / "path.json", scene, 2, (64, 48))
     np.testing.assert_allclose(film[0].center, camera.center, atol=1e-5)
     page = page_text(scene, [model], title="t")[0]
-    assert f'"scale": {scene.place.scale}' in page or f'"scale":{scene.place.scale}' in page
+    assert f'"scale": {scene.transform.scale}' in page or f'"scale":{scene.transform.scale}' in page
 
     # another layout is written in the files' own coordinates, to the last millimetre
     export_scene(tmp_path / "moved", "nerfstudio", tmp_path / "ns")
@@ -154,7 +154,7 @@ def test_one_camera_far_away_is_named_and_changes_no_size(tmp_path: Path, side: 
     scene = load_scene(tmp_path / "far")
     named = [w for w in scene.info["warnings"] if "far from all others" in w]
     assert len(named) == (side == "train") and all(name in w for w in named)
-    assert scene.place == SceneTransform() and scene.extent == pytest.approx(usual.extent, rel=0.3)
+    assert scene.transform == SceneTransform() and scene.extent == pytest.approx(usual.extent, rel=0.3)
     assert space_of(scene).distance == pytest.approx(space_of(usual).distance, rel=0.2)
     model_there = read_model(tmp_path / "far" / "sparse" / "0")
     random = random_points(model_there, {v.name: v.split for v in scene.views}, blender=False)

@@ -384,7 +384,7 @@ def read_plan(path: Path) -> EffectsPlan:
             row | {"value": math.nan if row["value"] is None else row["value"]} for row in data["decisions"]
         ]
         decisions = msgspec.convert(rows, tuple[Decision, ...])
-        name, identity = msgspec.convert([data["scene"], data.get("scene_hash", "")], tuple[str, str])
+        name, identity = msgspec.convert([data["scene"], data["scene_hash"]], tuple[str, str])
         return EffectsPlan(name, decisions, bool(data.get("probed")), identity)
     except FileNotFoundError:
         raise AwError(f"there is no plan {path}; 'aw plan SCENE' makes one") from None

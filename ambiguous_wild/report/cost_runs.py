@@ -210,7 +210,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         "device": config.get("device", cost.get("device")),
         "protocol": config.get("protocol", "full"),
         "start": section(config, "start").get("sha256"),
-        "code": [config.get("source"), result["version"]],
+        "code": [config.get("source"), result["version"], result.get("code_hash")],
         "images": sorted(images),
     }
     points, damage = _points(folder / "timeline.csv", train_s, psnr)

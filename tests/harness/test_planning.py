@@ -222,6 +222,7 @@ def test_a_plan_survives_its_file(tmp_path):
         "[]",
         '{"schema": 2}',
         json.dumps(plan.plain() | {"decisions": [{"decision": "on"}]}),
+        json.dumps({k: v for k, v in plan.plain().items() if k != "scene_hash"}),  # of any scene
     ):
         (tmp_path / "bad.json").write_text(text)
         with pytest.raises(AwError, match="is no plan"):

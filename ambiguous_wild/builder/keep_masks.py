@@ -23,8 +23,8 @@ from ambiguous_wild.io.images import (
     upright,
     write_png,
 )
+from ambiguous_wild.io.mask_files import find_masks as by_name
 from ambiguous_wild.io.photos import TRANSPARENT
-from ambiguous_wild.io.scene_folder import find_masks as by_name
 
 LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the rest
 
@@ -32,7 +32,7 @@ LITTLE_KEPT = 0.3  # share of a photo; distractors rarely cover more than the re
 def find_masks(folder: Path, photos: Sequence[ScreenedPhoto], missing: str) -> dict[str, Path]:
     """Find the mask file of each photo, by stem.
 
-    How files are named: see `io.scene_folder.find_masks`.
+    How files are named: see `io.mask_files.find_masks`.
 
     Args:
         folder: the user's mask folder.
@@ -54,8 +54,8 @@ def find_masks(folder: Path, photos: Sequence[ScreenedPhoto], missing: str) -> d
         if path is None:
             unmasked.append(photo.source)
             continue
-        width, height = upright_size(path)
-        if (width, height) != photo.size:
+        if mask_orientation(path, photo) is None:
+            width, height = _stored_size(path)
             misfits.append(f"{path.name} is {width}x{height} but its photo {photo.width}x{photo.height}")
         mask_files[photo.stem] = path
     if misfits:
@@ -71,14 +71,24 @@ def find_masks(folder: Path, photos: Sequence[ScreenedPhoto], missing: str) -> d
     return mask_files
 
 
-def upright_size(path: Path) -> tuple[int, int]:
-    """Return width and height of a mask file in px, upright by its own EXIF.
+def mask_orientation(path: Path, photo: ScreenedPhoto) -> int | None:
+    """Return the EXIF orientation to apply to a mask: its own, or that of a photo it was drawn on as stored.
+
+    None: neither gives the photo's size.
 
     Raises:
         AwError: the file does not decode.
     """
-    size = header_size(path) or read_mask(path).shape[::-1]
-    return (size[1], size[0]) if orientation(path) > 4 else (size[0], size[1])
+    stored, own = _stored_size(path), orientation(path)
+    for turn in (own, photo.exif.get("orientation", 1) if own == 1 else own):
+        if (stored[::-1] if turn > 4 else stored) == photo.size:
+            return turn
+    return None
+
+
+def _stored_size(path: Path) -> tuple[int, int]:
+    width, height = header_size(path) or read_mask(path).shape[::-1]
+    return width, height
 
 
 def alpha_mask(capture: Path, photo: ScreenedPhoto) -> np.ndarray | None:  # [H, W] uint8 in {0, 255}
@@ -108,7 +118,7 @@ def lay_out_masks(
         if path is None:
             mask = np.full((photo.height, photo.width), 255, np.uint8)
         else:
-            mask = upright(read_mask(path), orientation(path))
+            mask = upright(read_mask(path), mask_orientation(path, photo) or 1)
         if alpha is not None:
             transparent.append(photo.stem)
             mask = np.minimum(mask, alpha)

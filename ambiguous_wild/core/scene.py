@@ -73,6 +73,7 @@ class SceneInfo(TypedDict, total=False):
     license: str
     dataset: str  # name of the data set in result tables
     evaluation: Evaluation
+    background: list[int]  # [3] sRGB codes, behind what the photos show; absent: black
     build_key: str
     inputs: Facts  # what it was built from
     files: dict[str, FileEntry]  # path relative to the scene -> its entry
@@ -92,7 +93,7 @@ class View:
     image_path: Path  # the file that is trained on or measured against, already downsampled
     camera: Camera  # its intrinsics match the size of that file
     split: Split
-    keep_path: Path | None = None  # PNG, white = keep; the user's or the capture's own mask
+    keep_path: Path | None = None  # white = keep; of a test photo: what psnr_valid measures
     image_id: int = -1  # COLMAP's id, -1 where there is none
 
 
@@ -148,6 +149,12 @@ class Scene:
     def test(self) -> tuple[View, ...]:
         """Test views, ordered by name."""
         return tuple(v for v in self.views if v.split == "test")
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """Colour in [0, 1] that was put behind the photos, and is drawn behind the model."""
+        red, green, blue = (code / 255 for code in self.info.get("background", (0, 0, 0)))
+        return red, green, blue
 
     @cached_property
     def extent(self) -> float:

@@ -13,9 +13,7 @@ from ambiguous_wild.core.camera import pose_at
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
-from ambiguous_wild.io.scene_folder import SIDES, TEST_EVERY, without_suffix
-
-SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
+from ambiguous_wild.io.scene_folder import SIDES, without_suffix
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class ForeignScene:
     split: dict[str, Split]  # photos of neither side are left out
     factor: int = 1  # downsampling in the published tables
     missing: dict[Split, list[str]] = field(default_factory=dict)  # listed names that the model lacks
-    masks: dict[str, Path] = field(default_factory=dict)  # keep masks of training photos, white = keep
+    masks: dict[str, Path] = field(default_factory=dict)  # keep masks by photo, white = keep
     max_width: int | None = None  # px; wider photos are reduced to it
     background: tuple[int, int, int] | None = None  # RGB, put behind photos with alpha
     dataset: str = ""  # its name in result tables
@@ -112,27 +110,6 @@ def _index(names: Iterable[str], key: Callable[[str], str]) -> dict[str, list[st
     for name in names:
         names_of.setdefault(key(name), []).append(name)
     return names_of
-
-
-def every_nth(names: Iterable[str]) -> tuple[dict[str, Split], str]:
-    """Split a dataset without a split, every 8th photo into the test set; also return a note about it."""
-    sides: dict[str, Split] = {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(sorted(names))}
-    note = f"no test set given: every {TEST_EVERY}th is a test photo; distractors in it count as truth"
-    return sides, note
-
-
-def find_photo(folder: Path, name: str) -> Path | None:
-    """Find the photo's file below `folder`, if need be with another extension; None if it is absent."""
-    exact = folder / name
-    if exact.is_file():
-        return exact
-    # A copy may be saved in another format; of a name with several dots only the last part is replaced.
-    base = exact.with_suffix("") if exact.suffix in SUFFIXES else exact
-    for suffix in SUFFIXES:
-        path = base.with_name(base.name + suffix)
-        if path.is_file():
-            return path
-    return None
 
 
 def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:

@@ -21,24 +21,29 @@ from ambiguous_wild.builder.resample import (
     make_lens,
 )
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.foreign import ForeignScene, find_photo
+from ambiguous_wild.datasets.foreign import ForeignScene
+from ambiguous_wild.datasets.photo_names import find_photo
 from ambiguous_wild.io.colmap_records import ONE_FOCAL, ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import (
     MAX_PIXELS,
     header_size,
     orientation,
+    photo_profile,
     read_alpha,
     read_mask,
     read_png_rgb,
     upright,
     write_png,
 )
+from ambiguous_wild.io.photos import FROM_PROFILE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
+from ambiguous_wild.io.scene_checks import other_pictures
 from ambiguous_wild.io.scene_folder import refuse_same_stems, without_suffix
 
 ENOUGH_POINTS = 20  # points in a photo whose colours show which way it was turned
 TURNED = 0.7  # a photo was turned if that reduces the difference of colours below this share
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+BACK = {5: 5, 6: 8, 7: 7, 8: 6}  # EXIF orientations that exchange the sides -> the one that undoes it
 
 
 @dataclass(frozen=True)
@@ -129,14 +134,21 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     refuse_same_stems(scene.root, sorted(scene.split))
     total = len(scene.split)
     if absent:
+        there = shortlist(sorted(p.name for p in scene.root.iterdir() if p.is_dir()))
+        where = f"{folder}" if folder.is_dir() else f"{folder}, which is absent; {scene.root} holds {there}"
         raise AwError(
-            f"{len(absent)} of {total} photos that the model registers are not in {folder}: "
+            f"{len(absent)} of {total} photos that the model registers are not in {where}: "
             f"{shortlist(absent, 3)}; copy all of the dataset, or correct the lists"
         )
     if wrong:
         raise AwError(
             f"{len(wrong)} of {total} photos in {folder} do not fit the model: {shortlist(wrong, 3)}; use "
             "the photos that the model was built from"
+        )
+    if other := other_pictures([(plan.small, plan.source) for plan in plans if plan.small is not None]):
+        raise AwError(
+            f"{scene.root}: photos in images_{scene.factor} do not show what their full photos show "
+            f"({shortlist(other, 3)}); remove images_{scene.factor} to make it anew"
         )
     return plans
 
@@ -180,7 +192,11 @@ def _plan(
     lens = lens_of(resized(camera, *size)) if camera.model not in PINHOLES else None
     wide = scene.max_width is not None and size[0] > scene.max_width
     convert = (
-        (lens is not None and lens.map_xy is not None) or wide or scene.background is not None or turn > 1
+        (lens is not None and lens.map_xy is not None)
+        or wide
+        or scene.background is not None
+        or turn > 1
+        or bool(photo_profile(source))
     )
     small = None
     if scene.factor > 1 and not convert and not only_small:
@@ -262,6 +278,8 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
         notes.insert(0, f"undistorted{lost}")
     if plan.turn > 1:
         notes.insert(0, f"turned upright (EXIF orientation {plan.turn})")
+    if profile := photo_profile(plan.source):
+        notes.insert(0, f"{FROM_PROFILE} {profile}")
     if scene.background is not None:
         notes.insert(0, "composited over a background of {}, {}, {}".format(*scene.background))
     small = folder / f"images_{factor}" / name
@@ -334,10 +352,15 @@ def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, folder
     if target.is_file() or (mask is None and alpha is None):
         return alpha is not None
     alpha = upright(alpha, plan.turn) if alpha is not None else None
-    pixels = read_mask(mask) if mask is not None else np.asarray(alpha)
+    pixels = upright(read_mask(mask), orientation(mask)) if mask is not None else np.asarray(alpha)
+    stored = header_size(plan.source) or (plan.camera.width, plan.camera.height)
+    size = stored[::-1] if plan.turn > 4 else stored
     height, width = pixels.shape
-    size = header_size(plan.source) or (plan.camera.width, plan.camera.height)
-    size = size[::-1] if plan.turn > 4 else size
+    # A mask may be drawn on the photo as stored or as shown, whatever the model was made of.
+    turned = plan.turn if plan.turn > 4 else BACK.get(orientation(plan.source), 1)
+    if size != (width, height) == size[::-1] and turned > 4:
+        pixels = upright(pixels, turned)
+        height, width = pixels.shape
     final = (placed.camera.width, placed.camera.height)
     if scene.factor > 1 and not plan.only_small:
         final = downsampled_size(*final, scene.factor)

@@ -34,6 +34,7 @@ from ambiguous_wild.datasets.imported_photos import (
 from ambiguous_wild.datasets.points import drop_test_only, find_motion, random_points, triangulate
 from ambiguous_wild.datasets.readers import read_foreign, with_masks
 from ambiguous_wild.datasets.suites import differences, suite_of
+from ambiguous_wild.datasets.unused_files import what_is_left_out
 from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.files import (
@@ -46,6 +47,7 @@ from ambiguous_wild.io.files import (
     write_text,
 )
 from ambiguous_wild.io.images import read_gray
+from ambiguous_wild.io.photos import FROM_PROFILE
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, SIDES, load_scene, read_scene_json, verify_files
 
 HIDDEN = "alpha hides pixels"
@@ -134,6 +136,7 @@ def import_scene(
         )
     foreign, why = read_foreign(root, settings.kind, settings.model)
     foreign = with_masks(foreign) if settings.masks else dataclasses.replace(foreign, masks={})
+    foreign = dataclasses.replace(foreign, notes=(*foreign.notes, *what_is_left_out(foreign)))
     for side in SIDES:
         if side not in foreign.split.values():
             raise AwError(
@@ -249,6 +252,8 @@ def _write_scene(
     notes += mask_warnings({"kept_share": shares, "alpha": hidden})
     if lost := [note for p in placed for note in p.notes if note.startswith("undistorted without")]:
         notes.append(f"{counted(len(lost), 'photo')} {max(lost)}: the lens sees more than a pinhole camera")
+    if profiles := [note for p in placed for note in p.notes if note.startswith(FROM_PROFILE)]:
+        notes.append(f"{counted(len(profiles), 'photo')}: {shortlist(sorted(set(profiles)))}")
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}
     scene_model = _write_model(folder, model, placed)
     if settings.motion:
@@ -365,6 +370,8 @@ def _record(
     }
     if settings.dataset or foreign.dataset:
         record["dataset"] = settings.dataset or foreign.dataset
+    if foreign.background is not None:
+        record["background"] = list(foreign.background)
     if foreign.evaluation:
         record["evaluation"] = foreign.evaluation
     return record

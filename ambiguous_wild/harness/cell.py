@@ -36,6 +36,7 @@ from ambiguous_wild.harness.result_file import (
     RunConfig,
     RunFacts,
     RunResult,
+    SceneConfig,
     UnusualConfig,
 )
 from ambiguous_wild.harness.start import StartFile
@@ -132,7 +133,8 @@ def scene_identity(scene: Scene) -> str:
         if name not in hashes and path.is_file():
             hashes[name] = _digest(path)
     moved = {} if scene.transform == UNMOVED else {"place": [*scene.transform.centre, scene.transform.scale]}
-    return config_hash({"files": hashes, "split": split, **moved})
+    behind = {"background": scene.background} if any(scene.background) else {}
+    return config_hash({"files": hashes, "split": split, **moved, **behind})
 
 
 def _contents(scene: Scene) -> dict[str, object]:
@@ -195,15 +197,21 @@ class Cell:
             "source": self.method.source_hash,
             "options": to_plain(self.options),
             "train": to_plain(self.train),
-            "scene": {
-                "name": self.scene.name,
-                "sha256": self.scene_id,
-                "factor": self.scene.info.get("loaded_factor"),
-                "path": str(self.scene.root.resolve()),
-            },
+            "scene": self._scene_record(),
             "device": self.device,
             "version": __version__,
         }
+
+    def _scene_record(self) -> SceneConfig:
+        record: SceneConfig = {
+            "name": self.scene.name,
+            "sha256": self.scene_id,
+            "factor": self.scene.info.get("loaded_factor"),
+            "path": str(self.scene.root.resolve()),
+        }
+        if any(self.scene.background):
+            record["background"] = list(self.scene.background)
+        return record
 
     @property
     def identity(self) -> str:

@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.io.images import read_gray, read_keep_map
+from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.metrics import mask_scores
+from ambiguous_wild.splat.data import load_keep
 from ambiguous_wild.vision.sparse_surface import (
     BEHIND,
     in_map,
@@ -165,7 +166,8 @@ def find_regions(scene: Scene) -> Regions:
 def _find_regions(scene: Scene) -> Regions:
     pixels: dict[str, dict[str, np.ndarray]] = {}
     missing: dict[str, str] = {}
-    kept = {view.name: mask for view in scene.test if (mask := _user_keep(scene, view)) is not None}
+    masks = {view.name: load_keep(view, with_alpha=False) for view in scene.test}
+    kept = {name: keep > 0 for name, keep in masks.items() if keep is not None}
     if any(mask.any() for mask in kept.values()):
         pixels[VALID] = kept
     elif kept:
@@ -198,16 +200,3 @@ def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
         return None
     mask = read_gray(path) >= 128
     return mask if mask.shape == (view.camera.height, view.camera.width) else None
-
-
-def _user_keep(scene: Scene, view: View) -> np.ndarray | None:
-    path = scene.root / "masks" / "test" / Path(view.name).with_suffix(".png")
-    if not path.is_file():
-        return None
-    keep = read_keep_map(path) > 0
-    if keep.shape != (view.camera.height, view.camera.width):
-        raise AwError(
-            f"mask {path} is {keep.shape[1]}x{keep.shape[0]} px, its photo is "
-            f"{view.camera.width}x{view.camera.height} px; bring it to the photo's size or remove it"
-        )
-    return keep

@@ -173,6 +173,7 @@ class SceneConfig(TypedDict):
     sha256: str
     factor: int | None  # of images_N; None = not known
     path: str
+    background: NotRequired[list[float]]  # [3] in [0, 1]; absent: black
 
 
 class TrainRecord(TypedDict):

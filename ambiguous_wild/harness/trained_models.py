@@ -219,7 +219,9 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         advice = "it is drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
         return RenderSettings(), f"{name} is an unknown method: {advice}"
     antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
-    return RenderSettings(hooks.sh_degree, antialias, hooks.blur, hooks.background), ""
+    behind = section(config, "scene").get("background", hooks.background)
+    red, green, blue = (float(value) for value in behind)
+    return RenderSettings(hooks.sh_degree, antialias, hooks.blur, (red, green, blue)), ""
 
 
 def _with_labels(trained: list[TrainedModel]) -> list[TrainedModel]:

@@ -32,7 +32,9 @@ from ambiguous_wild.io.colmap_records import (
     points_without_tracks,
 )
 from ambiguous_wild.io.files import write_bytes
+from ambiguous_wild.io.ply import read_point_ply
 
+POINT_CLOUD = "points3D.ply"
 _AGAIN = "the model is damaged; build it again"
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 # An image's line has id, seven numbers, camera id and a name that is no number; observations are numbers.
@@ -45,6 +47,8 @@ _POINT_ROW = np.dtype(
 def read_model(folder: Path | str) -> ColmapModel:
     """Read cameras, images and, if present, points3D of a model folder: .bin files if it has them, else .txt.
 
+    A model without points3D may have a point cloud in its place, as MASt3R and DUSt3R write it.
+
     Raises:
         AwError: files are missing, damaged or contradictory.
     """
@@ -56,8 +60,13 @@ def read_model(folder: Path | str) -> ColmapModel:
     else:
         raise AwError(f"{root} holds no COLMAP model: cameras and images (.bin or .txt) are needed")
     cameras, images, points = _BINARY if suffix == ".bin" else _TEXT
-    none = points_without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    model = ColmapModel(cameras(paths[0]), images(paths[1]), points(paths[2]) if paths[2].is_file() else none)
+    if paths[2].is_file():
+        found = points(paths[2])
+    elif (cloud := root / POINT_CLOUD).is_file():
+        found = points_without_tracks(*read_point_ply(cloud))
+    else:
+        found = points_without_tracks()
+    model = ColmapModel(cameras(paths[0]), images(paths[1]), found)
     for camera in model.cameras.values():
         check_camera(root, camera)
     names: set[str] = set()

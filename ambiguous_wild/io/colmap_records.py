@@ -65,7 +65,7 @@ class ModelCamera:
             return f, f, cx, cy
         raise AwError(
             f"camera {self.camera_id} is {self.model}, which has lens distortion; training needs PINHOLE: "
-            "undistort the photos with 'aw build-scene PHOTOS -o SCENE'"
+            "'aw import FOLDER -o SCENE' undistorts the photos of this model"
         )
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.colour_profile import profile_name, to_srgb
 from ambiguous_wild.io.files import write_bytes
 
 # Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
@@ -27,6 +28,8 @@ def read_png_rgb(
     path: Path | str,
 ) -> np.ndarray:  # [H, W, 3] uint8, sRGB
     """Read an image file as 8-bit RGB; grey is repeated, alpha dropped, 16 bits rounded to 8.
+
+    Colours of an ICC profile become sRGB, here and in the functions below.
 
     Raises:
         AwError: the file is missing or does not decode.
@@ -59,7 +62,7 @@ def load_image_float(
 def load_image_codes(
     path: Path | str,
 ) -> np.ndarray:  # [H, W, 3] sRGB, uint8 or uint16 codes, or float32 in [0, 1], as in the file
-    """Read an image at the file's depth; `as_float` converts it for training.
+    """Read an image at the file's depth, or 8 bits if it has a profile; `as_float` converts it for training.
 
     Raises:
         AwError: the file is missing or does not decode, or its pixels are of another type.
@@ -328,4 +331,25 @@ def _decode(
             f"cannot read image {path}: it is empty, cut short or no PNG, JPEG, "
             "TIFF, BMP or WebP; restore it and try again"
         )
+    if (
+        kind in ("rgb", "deep")
+        and image.dtype != np.float32
+        and profile_name(profile := _profile(data.tobytes()))
+    ):
+        image = to_srgb(image if image.dtype == np.uint8 else (image // 257).astype(np.uint8), profile)
     return image
+
+
+def photo_profile(path: Path | str) -> str:
+    """Return the name of a file's ICC profile if its colours are not those of sRGB, else ""."""
+    return profile_name(_profile(path))
+
+
+def _profile(source: Path | str | bytes) -> bytes | None:
+    opened = BytesIO(source) if isinstance(source, bytes) else source
+    try:
+        with pillow().open(opened, formats=_FORMATS) as image:
+            profile = image.info.get("icc_profile")
+    except Exception:  # as in `header_size`
+        return None
+    return profile if isinstance(profile, bytes) and profile else None

@@ -19,12 +19,14 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, install_command
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
+from ambiguous_wild.io.colour_profile import profile_name, to_srgb
 from ambiguous_wild.io.images import MAX_PIXELS, pillow, upright
 
 PHOTO_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif", ".dng",
 )  # fmt: skip
 TRANSPARENT = "transparency composited over black"  # its alpha may be a keep mask, see `images.read_alpha`
+FROM_PROFILE = "colours converted to sRGB from"
 Named = Callable[[str], Any]  # OpenImageIO's name of a value -> the value; None if it is absent
 MIN_SIDE = 16  # px; smaller photos have no features
 
@@ -121,6 +123,7 @@ def read_photo(
     if pixels is None or error:
         raise UnreadablePhoto(source, f"damaged or cut {form} ({_one_line(error) or _NO_REASON})")
     rgb, notes = _to_rgb(source, np.asarray(pixels), spec)
+    rgb = _in_srgb(rgb, _bytes(spec.getattribute("ICCProfile")), notes)
     exif = read_exif(spec.getattribute)
     if exif.orientation != 1:
         notes.append(f"turned upright (EXIF orientation {exif.orientation})")
@@ -147,7 +150,7 @@ def _read_heic(source: Path) -> tuple[Photo, np.ndarray]:
             notes += [f"{others} more pictures in the file are left out"] if others else []
             names = tuple(picture.getbands())
             pixels = np.array(picture).reshape(height, width, len(names))
-            raw = picture.info.get("exif")
+            raw, profile = picture.info.get("exif"), picture.info.get("icc_profile")
     except UnreadablePhoto:
         raise
     except Exception as error:  # libheif's errors come as several classes
@@ -158,6 +161,7 @@ def _read_heic(source: Path) -> tuple[Photo, np.ndarray]:
         notes.append(_alpha_note(pixels[..., -1]))
         pixels = (pixels[..., :-1] * alpha // 255).astype(np.uint8)
     rgb, more = _three_channels(source, pixels, names, "")
+    rgb = _in_srgb(rgb, _bytes(profile), notes)
     notes += [*more, *_misnamed(source, "heic")]
     return Photo(source, "heic", width, height, _block_exif(raw), False, tuple(notes)), rgb
 
@@ -298,6 +302,17 @@ def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list
         pixels = np.delete(pixels, spec.alpha_channel, axis=2)
     rgb, more = _three_channels(path, pixels, names, str(space))
     return rgb, notes + more
+
+
+def _in_srgb(rgb: np.ndarray, profile: bytes | None, notes: list[str]) -> np.ndarray:
+    if name := profile_name(profile):
+        notes.append(f"{FROM_PROFILE} {name}")
+    return to_srgb(rgb, profile)
+
+
+def _bytes(value: object) -> bytes | None:
+    """Return an attribute of bytes, which OpenImageIO gives as an array."""
+    return None if value is None else bytes(value)  # type: ignore[call-overload]
 
 
 def _alpha_note(alpha: np.ndarray) -> str:

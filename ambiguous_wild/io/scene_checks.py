@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,7 @@ from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import decode, load_image_float, read_alpha
+from ambiguous_wild.io.mask_files import SPELLINGS
 
 MIN_TRAIN = 2  # photos: one shows no depth
 ASPECT = 2.0  # largest ratio of focal lengths; pixels of anamorphic lenses are 2:1
@@ -26,6 +28,9 @@ NEAR_POSE = 1e-3  # of two photos whose pictures are compared, relative to the s
 NO_BASELINE = 1e-4  # of the points' median distance: cameras, or points, no farther apart are at one place
 FEW_POINTS = 10  # fewer are dummies, of scenes that start from a file
 FEW_SEEN = 0.05  # share of the points in any training photo, below which poses or points are doubted
+MAX_COMPARED = 8  # reduced photos that are compared with their full ones
+COMPARED_SIDE = 64  # px, to which both are reduced
+SAME_CONTENT = 0.95  # correlation of a reduced photo with its full one, below which it is another picture
 MAX_POINTS = 5000  # points that are projected to find out whether photos show any
 SHARED = (
     "test photos are training photos ({names}), so their scores say nothing: use each for training or for "
@@ -160,6 +165,35 @@ def _with_alpha(scene: Scene, views: Sequence[View]) -> Iterator[str]:
         yield from (view.name for view in views if read_alpha(view.image_path) is not None)
 
 
+def _other_reduced(scene: Scene) -> list[str]:
+    full = scene.root / "images"
+    if "files" in scene.info or scene.info.get("loaded_factor", 1) == 1 or not full.is_dir():
+        return []
+    pairs = ((view.image_path, full / view.name) for view in scene.views)
+    return other_pictures([(small, photo) for small, photo in pairs if photo.is_file()])
+
+
+def other_pictures(pairs: Sequence[tuple[Path, Path]]) -> list[str]:
+    """Return names of reduced photos that do not show what their full photo shows, of some pairs of both."""
+    chosen = pairs[:: max(1, -(-len(pairs) // MAX_COMPARED))]
+    return [small.name for small, photo in chosen if _correlation(small, photo) < SAME_CONTENT]
+
+
+def _correlation(small: Path, photo: Path) -> float:
+    """Correlation of two pictures at the size of the smaller; 1 where one of them shows no contrast."""
+    import cv2
+
+    read = (decode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE, str(path)) for path in (small, photo))
+    grey = [pixels for pixels in read if pixels is not None]
+    if len(grey) < 2:
+        return 1.0  # reading the photo reports it
+    size = [min(COMPARED_SIDE, side) for side in grey[0].shape[::-1]]
+    first, second = (cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(float) for pixels in grey)
+    first, second = first - first.mean(), second - second.mean()
+    scale = math.sqrt(float((first**2).sum() * (second**2).sum()))
+    return float((first * second).sum()) / scale if scale > 0 else 1.0
+
+
 def _far_cameras(scene: Scene) -> list[str]:
     return sorted({view.name for view in scene.train} - {view.name for view in together(scene.train)})
 
@@ -221,6 +255,8 @@ REFUSED: Checks = {  # the scene would give a wrong number
     "photos from several positions: check the model's poses",
     _hidden_test_pixels: "alpha of test photos hides pixels ({names}), which would be measured as if they "
     "were visible; 'aw import {root} -o SCENE' makes masks of it",
+    _other_reduced: "the reduced photos {names} do not show what their full photos in images/ show: remove "
+    "them, or 'aw import {root} -o SCENE --factor N' without them",
     _one_point: "all points of the sparse model lie at one place, so nothing can be learnt from it: check "
     "the model",
     _no_point_in_view: "no point of the sparse model lies in any training photo: poses and points are of two "
@@ -259,13 +295,12 @@ def check_masks(
         AwError: there are masks, and none is of a photo of the scene.
     """
     strange = shortlist(str(path.relative_to(folder)) for path in sorted(files - {*used.values(), *tests}))
-    cure = "a mask of a.jpg is a.jpg.png or a.png"
     if strange and not used and not tests:
         raise AwError(
             f"{folder} holds {counted(len(files), 'mask')}, none of a photo of the scene ({strange}): "
-            f"{cure}; rename them, move the folder away, or 'aw import --no-masks'"
+            f"{SPELLINGS}; rename them, move the folder away, or 'aw import --no-masks'"
         )
-    warnings = [f"masks that belong to no photo: {strange} ({cure})"] if strange else []
+    warnings = [f"masks that belong to no photo: {strange} ({SPELLINGS})"] if strange else []
     if used:
         without = shortlist(name for name in train if name not in used)
         lacking = f"; without a mask, so all of them trains: {without}" if without else ""
@@ -273,4 +308,6 @@ def check_masks(
             f"keep masks of {len(used)} of {len(train)} training photos in {folder} are used{lacking}; "
             "'aw import --no-masks' makes a scene without"
         )
+    if tests:
+        warnings.append(f"psnr_valid leaves out what keep masks of {counted(len(tests), 'test photo')} hide")
     return warnings

@@ -19,6 +19,7 @@ from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelImage
 from ambiguous_wild.io.files import sha256_file, unique_keys
 from ambiguous_wild.io.images import image_size
+from ambiguous_wild.io.mask_files import OWN_MASKS, mask_files, side_masks
 from ambiguous_wild.io.scene_checks import check_masks, check_scene
 
 SCENE_SCHEMA = 1  # version of scene.json, raised when an older reader would misread it
@@ -26,9 +27,7 @@ MAX_FACTOR = 1000  # largest downsampling factor; the builder allows 64
 SIDES: tuple[Split, Split] = ("train", "test")
 MAP = "map.png"  # in the scene's folder: the cameras from above
 TEST_EVERY = 8  # in scenes without lists every 8th photo is a test photo, as in 3DGS and gsplat
-
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-OWN_MASKS = "masks.json"  # marks a folder with instances of a segmentation, not keep masks
+TESTS_OF_3DGS = "test.txt"  # names of test photos, one a line
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
@@ -82,9 +81,9 @@ def load_scene(
         raise AwError(f"{error}; {cure}") from error
     model = read_model(sparse)
     info["loaded_factor"] = chosen
-    split, missing, repeated = _split(root, [image.name for image in model.images.values()])
+    split, missing, warning = _split(root, [image.name for image in model.images.values()])
     info["missing"] = missing
-    info["warnings"] = [f"the lists name photos twice, which are used once: {repeated}"] if repeated else []
+    info["warnings"] = [warning] if warning else []
     info["warnings"] += [
         f"{len(names)} {side} photos of the list are not in the model: {shortlist(names)}"
         for side, names in missing.items()
@@ -94,7 +93,8 @@ def load_scene(
         info["warnings"].append(note)
     masks: dict[str, Path] = {}
     if read is None and (root / "masks").is_dir() and not (root / "masks" / OWN_MASKS).is_file():
-        masks = side_masks(root / "masks", [n for n, side in split.items() if side == "train"], "train")
+        for side in SIDES:
+            masks |= side_masks(root / "masks", [n for n, of in split.items() if of == side], side)
     views = tuple(
         _view(root, folder, model, image, split[image.name], masks.get(image.name))
         for image in sorted(model.images.values(), key=lambda i: i.name)
@@ -144,6 +144,9 @@ def _check_fields(path: Path, info: dict[str, object]) -> None:
         wrong.append(f"factor must be a whole number from 1 to {MAX_FACTOR}, not {quoted(factor)}")
     if not isinstance(name, str):
         wrong.append(f"name must be a text, not {quoted(name)}")
+    behind = info.get("background", [0, 0, 0])
+    if not isinstance(behind, list) or len(behind) != 3 or not all(_is_count(c) and c < 256 for c in behind):
+        wrong.append(f"background must be three whole numbers from 0 to 255, not {quoted(behind)}")
     if not isinstance(files, dict):
         wrong.append("it lists no files")
     else:
@@ -206,40 +209,11 @@ def read_list(path: Path) -> list[str]:
 def _inside(name: str, root: Path) -> str:
     pure = PurePosixPath(name)
     if pure.is_absolute() or ".." in pure.parts or not pure.parts:
-        raise AwError(f"{root} names a file outside itself: {name!r}; do not use this scene")
+        raise AwError(
+            f"{root} names a file outside itself: {name!r}; if its photos lie in it, "
+            f"'aw import {root} -o SCENE' finds them"
+        )
     return name
-
-
-def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
-    """Find mask files by the name of the photo; photos without one are absent.
-
-    A mask of a.jpg is named a.jpg.png (as in COLMAP) or a.png, in any format and case, and lies under the
-    photo's path or, if no other photo has this base name, directly in `folder`.
-    """
-    there: dict[str, Path] = {}
-    for path in sorted(mask_files(folder)):
-        there.setdefault(path.relative_to(folder).as_posix().casefold(), path)
-    photos = [PurePosixPath(name) for name in names]
-    bases = Counter(pure.name for pure in photos)
-    masks: dict[str, Path] = {}
-    for pure in photos if there else ():
-        spellings = [str(pure), str(pure.with_suffix(""))]
-        spellings += [pure.name, pure.stem] if bases[pure.name] == 1 else []
-        for key in (f"{spelling}{suffix}".casefold() for spelling in spellings for suffix in MASK_SUFFIXES):
-            if key in there:
-                masks[str(pure)] = there[key]
-                break
-    return masks
-
-
-def side_masks(folder: Path, names: Iterable[str], side: Split) -> dict[str, Path]:
-    """Find the masks of one side's photos in `folder`, or in its folder of that side."""
-    return find_masks(folder, names) | find_masks(folder / side, names)
-
-
-def mask_files(folder: Path) -> set[Path]:
-    """Return all files below a folder that may be masks."""
-    return {p for p in folder.rglob("*") if p.suffix.lower() in MASK_SUFFIXES and p.is_file()}
 
 
 def models_in(root: Path, places: Iterable[str] = ("sparse", "colmap/sparse")) -> list[tuple[Path, int]]:
@@ -322,18 +296,36 @@ def _image_folder(root: Path, factor: int) -> Path:
         ]
         raise AwError(
             f"{root} has no images at factor {factor}; it has factor {', '.join(have) or 'none'}; "
-            f"pass one of those or build with 'aw build-scene --factor {max(factor, 1)}'"
+            f"pass one of those, or read it with 'aw import {root} -o SCENE --factor {max(factor, 1)}'"
         )
     return folder
 
 
+def default_split(root: Path, names: Iterable[str]) -> tuple[dict[str, Split], str]:
+    """Split photos without train_list.txt and test_list.txt, and say how.
+
+    By test.txt beside the model, where 3DGS reads it and hierarchical 3DGS writes it; else every 8th, sorted
+    by name, is a test photo.
+    """
+    ordered = sorted(names)
+    for path in (root / place / TESTS_OF_3DGS for place in ("sparse/0", "sparse", ".")):
+        listed = read_list(path) if path.is_file() else []
+        known = {key for name in listed for key in (name, without_suffix(name), PurePosixPath(name).name)}
+        tests = {n for n in ordered if known & {n, without_suffix(n), PurePosixPath(n).name}}
+        if 0 < len(tests) < len(ordered):
+            note = f"{path.relative_to(root)} names {len(tests)} of {len(ordered)} photos: the test photos"
+            return {n: "test" if n in tests else "train" for n in ordered}, note
+    note = f"no test set given: every {TEST_EVERY}th is a test photo; distractors in it count as truth"
+    return {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(ordered)}, note
+
+
 def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[str, list[str]], str]:
-    """Return name -> side of registered photos, by side the names that the model lacks, repeated names."""
+    """Return name -> side of registered photos, by side the names that the model lacks, a warning or ""."""
     paths: dict[Split, Path] = {"train": root / "train_list.txt", "test": root / "test_list.txt"}
     present = [p for p in paths.values() if p.is_file()]
     if not present:
-        ordered = sorted(registered)
-        return {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(ordered)}, {}, ""
+        by_default, note = default_split(root, registered)
+        return by_default, {}, note if TESTS_OF_3DGS in note else ""
     if len(present) == 1:
         raise AwError(f"{root} has {present[0].name} but not the other list; write both or neither")
     # Some published scenes list names with their extension, some without.
@@ -351,7 +343,7 @@ def _split(root: Path, registered: list[str]) -> tuple[dict[str, Split], dict[st
             elif split.setdefault(match, side) != side:
                 raise AwError(f"{root}: {name!r} is in train_list.txt and in test_list.txt; keep it in one")
     repeated = shortlist(name for names in listed.values() for name, count in names.items() if count > 1)
-    return split, missing, repeated
+    return split, missing, f"the lists name photos twice, which are used once: {repeated}" if repeated else ""
 
 
 def refuse_same_stems(root: Path, names: Iterable[str]) -> None:
@@ -379,9 +371,8 @@ def _view(
             "aspect ratio, so the photo was cropped or turned; use the photos the model was built from"
         )
     camera = Camera(full.width, full.height, fx, fy, cx, cy, image.cam_from_world()).resized(width, height)
-    keep = root / "masks" / "train" / f"{without_suffix(image.name)}.png"
-    keep_path = keep if side == "train" and keep.is_file() else mask
-    return View(image.name, path, camera, side, keep_path, image.image_id)
+    keep = root / "masks" / side / f"{without_suffix(image.name)}.png"
+    return View(image.name, path, camera, side, keep if keep.is_file() else mask, image.image_id)
 
 
 def _mask_warnings(root: Path, scene: Scene, read: SceneInfo | None) -> list[str]:
@@ -395,7 +386,7 @@ def _mask_warnings(root: Path, scene: Scene, read: SceneInfo | None) -> list[str
         cure = "the mask of a.jpg is train/a.png or test/a.png, by its side"
         return [f"masks that belong to no photo: {strange} ({cure})"] if strange else []
     used = {view.name: view.keep_path for view in scene.train if view.keep_path is not None}
-    tests = side_masks(folder, [view.name for view in scene.test], "test").values()
+    tests = {view.keep_path for view in scene.test if view.keep_path is not None}
     return check_masks(folder, mask_files(folder), used, tests, [view.name for view in scene.train])
 
 
@@ -405,7 +396,10 @@ def _image_path(folder: Path, name: str) -> Path:
     for path in candidates:
         if path.is_file():
             return path
-    raise AwError(f"{folder} lacks {name}, which the model registers; restore it or build the scene again")
+    raise AwError(
+        f"{folder} lacks {name}, which the model registers; restore it, or let 'aw import' look for photos "
+        "under other names"
+    )
 
 
 def _points(model: ColmapModel, views: tuple[View, ...]) -> SparsePoints:

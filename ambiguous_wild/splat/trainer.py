@@ -79,6 +79,8 @@ class Trainer:
         self.timeline = Timeline()
         self._skipped: set[int] = set()  # views that were fully masked at some step
         data = data.for_method()
+        if any(data.scene.background):
+            hooks = replace(hooks, background=data.scene.background)
         self.hooks = hooks
         self.pyramid = Pyramid(data)
         self._compiled: set[frozenset[str]] = set()  # cotangents for which the backward pass is compiled

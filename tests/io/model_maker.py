@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ambiguous_wild.io.colmap_model import write_model
@@ -76,7 +77,8 @@ def write_scene(root: Path, names: list[str], factor: int = 2, **kwargs) -> Colm
     write_model(root / "sparse" / "0", model)
     rng = np.random.default_rng(1)
     for name in names:
-        write_png(root / "images" / name, rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-        small = rng.integers(0, 256, (HEIGHT // factor, WIDTH // factor, 3), dtype=np.uint8)
+        photo = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        write_png(root / "images" / name, photo)
+        small = cv2.resize(photo, (WIDTH // factor, HEIGHT // factor), interpolation=cv2.INTER_AREA)
         write_png(root / f"images_{factor}" / name, small)
     return model

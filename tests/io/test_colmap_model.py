@@ -87,7 +87,7 @@ def test_an_absurd_count_is_refused_before_allocating(tmp_path, name):
 
 def test_lens_distortion_is_refused_for_training_with_the_command(tmp_path):
     camera = make_model(["a.png"], camera="SIMPLE_RADIAL").cameras[7]
-    with pytest.raises(AwError, match=r"SIMPLE_RADIAL.*aw build-scene"):
+    with pytest.raises(AwError, match=r"SIMPLE_RADIAL.*aw import FOLDER"):
         camera.pinhole()
     assert make_model(["a.png"]).cameras[7].pinhole() == (60.0, 62.0, 33.0, 23.0)
 

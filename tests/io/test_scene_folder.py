@@ -223,7 +223,7 @@ def _cropped(root):
         (
             lambda root: write_model(root / "sparse/0", make_model(NAMES, camera="SIMPLE_RADIAL")),
             {},
-            "aw build-scene",
+            "aw import FOLDER",
         ),
     ],
 )

@@ -20,8 +20,15 @@ from ambiguous_wild.datasets.readers import (
     transforms,
 )
 from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.mask_files import (
+    MASK_FOLDERS,
+    OWN_MASKS,
+    mask_files,
+    masks_beside_photos,
+    side_masks,
+)
 from ambiguous_wild.io.scene_checks import check_masks
-from ambiguous_wild.io.scene_folder import OWN_MASKS, SIDES, mask_files, side_masks
+from ambiguous_wild.io.scene_folder import SIDES
 
 READERS: dict[str, Callable[..., ForeignScene]] = {
     "on-the-go": on_the_go.read_on_the_go,
@@ -148,18 +155,22 @@ def read_foreign(root: Path, kind: str | None = None, model: str = "") -> tuple[
 
 
 def with_masks(scene: ForeignScene) -> ForeignScene:
-    """Add the keep masks in masks/ beside the photos, unless the dataset's files name masks; note their use.
+    """Add the keep masks beside the photos or in a folder of masks, unless the dataset's files name masks.
 
     Raises:
         AwError: there are masks, and none is of a photo of the scene.
     """
-    folder = (scene.photos.parent if scene.photos != scene.root else scene.root) / "masks"
     train, test = ([name for name, of in scene.split.items() if of == side] for side in SIDES)
-    used, files, tests = scene.masks, set(scene.masks.values()), set[Path]()
-    if used:
+    by_side, files = scene.masks, set(scene.masks.values())
+    base = scene.photos.parent if scene.photos != scene.root else scene.root
+    folder = next((base / name for name in MASK_FOLDERS if (base / name).is_dir()), scene.photos)
+    if by_side:
         folder = Path(os.path.commonpath({mask.parent for mask in files}))
     elif scene.kind not in ("drone", "dualsplat", "blender") and not (folder / OWN_MASKS).is_file():
-        used, tests = side_masks(folder, train, "train"), {*side_masks(folder, test, "test").values()}
-        files = mask_files(folder)
+        files = masks_beside_photos(folder) if folder == scene.photos else mask_files(folder)
+        if files:
+            by_side = side_masks(folder, train, "train") | side_masks(folder, test, "test")
+    used = {name: mask for name, mask in by_side.items() if scene.split.get(name) == "train"}
+    tests = {mask for name, mask in by_side.items() if scene.split.get(name) == "test"}
     notes = (*scene.notes, *check_masks(folder, files, used, tests, train))
-    return dataclasses.replace(scene, masks=used, notes=notes)
+    return dataclasses.replace(scene, masks=by_side, notes=notes)

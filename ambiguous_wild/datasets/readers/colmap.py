@@ -8,11 +8,13 @@ from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.errors import AwError, shortlist, unknown
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import ForeignScene, every_nth, inside, split_by_lists
-from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.datasets.foreign import ForeignScene, inside, split_by_lists
+from ambiguous_wild.datasets.photo_names import locate
+from ambiguous_wild.io.colmap_model import POINT_CLOUD, read_model
 from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.scene_folder import (
     SIDES,
+    default_split,
     models_in,
     read_list,
     registered,
@@ -50,11 +52,15 @@ def which_model(root: Path, chosen: str = "") -> str:
     return several_models(models, folder) if folder is not None and models else ""
 
 
-def read_named_model(root: Path, chosen: str = "") -> ColmapModel:
-    """Read the model and check the names of its photos; `chosen` is the name of one of several models.
+def read_named_model(root: Path, chosen: str = "") -> tuple[ColmapModel, Path]:
+    """Read the model and find the folder of its photos, whose paths in it become their names.
+
+    Args:
+        root: the dataset's folder.
+        chosen: name of one of several models.
 
     Raises:
-        AwError: no model, a damaged one, or a name that leads out of the folder.
+        AwError: no model, a damaged one, or a name that no list can hold.
     """
     folder = model_folder(root, chosen)
     if folder is None:
@@ -63,29 +69,15 @@ def read_named_model(root: Path, chosen: str = "") -> ColmapModel:
             "with 'aw build-scene'"
         )
     model = read_model(folder)
+    located = locate(root, [image.name for image in model.images.values()])
     for number, image in model.images.items():
-        if "\\" in image.name:  # the model was made on Windows; the name may be a full path
-            name = image.name.replace("\\", "/")
-            name = f"/{name}".rpartition("/images/")[2].removeprefix("/")
-            name = name.rpartition("/")[2] if name[1:2] == ":" else name
-            model.images[number] = image = replace(image, name=name)
-        inside(image.name, root)
-    return model
+        model.images[number] = replace(image, name=inside(located.names[image.name], root))
+    return model, located.folder
 
 
 def model_names(model: ColmapModel) -> list[str]:
     """Return the names of the registered photos, sorted."""
     return sorted(image.name for image in model.images.values())
-
-
-def photo_folder(root: Path) -> Path:
-    """Return the folder images/, or dense/images/ if there is one."""
-    for folder in (root / "images", root / "dense" / "images"):
-        if folder.is_dir():
-            return folder
-    if registered(root):
-        return root
-    return root / "images"  # absent if a dataset has downsampled photos only
 
 
 def read_lists(root: Path) -> dict[Split, list[str]]:
@@ -114,20 +106,23 @@ def has_lists(root: Path) -> bool:
 
 
 def sides(names: Iterable[str], root: Path) -> tuple[dict[str, Split], dict[Split, list[str]], list[str]]:
-    """Return sides by the folder's lists, else by every 8th photo; listed names without photo; notes."""
+    """Return sides by the folder's lists, else as 3DGS splits; listed names without photo; notes."""
     if has_lists(root):
         return *split_by_lists(names, read_lists(root), root), []
-    split, note = every_nth(names)
+    split, note = default_split(root, names)
     return split, {}, [note]
 
 
 def read_plain(root: Path, chosen: str = "") -> ForeignScene:
     """Read a COLMAP model with images, split by lists, else by every 8th photo."""
-    model = read_named_model(root, chosen)
+    model, photos = read_named_model(root, chosen)
     factors = shipped_factors(root)
-    factor = factors[0] if len(factors) == 1 and not photo_folder(root).is_dir() else 1
+    factor = factors[0] if len(factors) == 1 and not photos.is_dir() else 1
     split, missing, notes = sides(model_names(model), root)
-    return ForeignScene("colmap", root, model, photo_folder(root), split, factor, missing, notes=tuple(notes))
+    folder = model_folder(root, chosen)
+    if len(model.points.ids) and folder is not None and not any(folder.glob("points3D.[bt][ix][nt]")):
+        notes.append(f"points from {POINT_CLOUD}, without the photos that see them")
+    return ForeignScene("colmap", root, model, photos, split, factor, missing, notes=tuple(notes))
 
 
 def keyword_sides(names: Iterable[str]) -> dict[str, Split | None]:
@@ -161,7 +156,7 @@ def has_keywords(names: Iterable[str]) -> bool:
 
 def read_robustnerf(root: Path, chosen: str = "") -> ForeignScene:
     """Read RobustNeRF, also as SpotLessSplats and RobustSplat publish it: the split is in the file names."""
-    model = read_named_model(root, chosen)
+    model, photos = read_named_model(root, chosen)
     sides = keyword_sides(model_names(model))
     split: dict[str, Split] = {name: side for name, side in sides.items() if side is not None}
     lacking = [side for side in SIDES if side not in split.values()]
@@ -172,9 +167,7 @@ def read_robustnerf(root: Path, chosen: str = "") -> ForeignScene:
     notes = (f"{clean} clean repeats of training views are left out",) if clean else ()
     factor = _published_factor(root, model)
     dataset = "" if factor == 1 else "RobustNeRF"
-    return ForeignScene(
-        "robustnerf", root, model, photo_folder(root), split, factor, dataset=dataset, notes=notes
-    )
+    return ForeignScene("robustnerf", root, model, photos, split, factor, dataset=dataset, notes=notes)
 
 
 def _published_factor(root: Path, model: ColmapModel) -> int:
@@ -190,20 +183,20 @@ def first_dot(name: str) -> str:
 
 def read_drone(root: Path, chosen: str = "") -> ForeignScene:
     """Read DroneSplat's Drone Imagery: lists with names up to their first dot, photos at most 1920 px."""
-    model = read_named_model(root, chosen)
+    model, photos = read_named_model(root, chosen)
     split, missing = split_by_lists(model_names(model), read_lists(root), root, first_dot)
     notes: tuple[str, ...] = ()
     if (root / "masks").is_dir():
         notes = ("masks/ holds instances of a segmentation, not keep masks of the dataset: left out",)
-    scene = ForeignScene("drone", root, model, photo_folder(root), split, missing=missing, notes=notes)
+    scene = ForeignScene("drone", root, model, photos, split, missing=missing, notes=notes)
     return replace(scene, max_width=DRONE_WIDTH, dataset="Drone Imagery")
 
 
 def read_dualsplat(root: Path, chosen: str = "") -> ForeignScene:
     """Read scenes as DualSplat prepares them: lists, beside its own masks and depths, which are left out."""
-    model = read_named_model(root, chosen)
+    model, photos = read_named_model(root, chosen)
     split, missing = split_by_lists(model_names(model), read_lists(root), root)
     own = [n for n in ("sam_masks", "pseudo_masks", "depths") if (root / n).is_dir()]
     notes = (f"{', '.join(own)} are results of a method: left out",)
     factor = _published_factor(root, model)
-    return ForeignScene("dualsplat", root, model, photo_folder(root), split, factor, missing, notes=notes)
+    return ForeignScene("dualsplat", root, model, photos, split, factor, missing, notes=notes)

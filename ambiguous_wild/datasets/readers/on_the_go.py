@@ -12,7 +12,6 @@ from ambiguous_wild.datasets.foreign import ForeignScene, plain, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import (
     model_folder,
     model_names,
-    photo_folder,
     read_lists,
     read_named_model,
 )
@@ -90,7 +89,7 @@ def read_on_the_go(root: Path, chosen: str = "") -> ForeignScene:
     }
     notes = [f"{len(positions['clean'])} clean photos are left out"] if positions["clean"] else []
     if model_folder(root) is not None:
-        model, folder = read_named_model(root, chosen), photo_folder(root)
+        model, folder = read_named_model(root, chosen)
         notes.append("poses from the COLMAP model in the folder, names from transforms.json")
         points: Literal["model", "triangulate"] = "model"
     else:
@@ -103,11 +102,11 @@ def read_on_the_go(root: Path, chosen: str = "") -> ForeignScene:
 
 
 def _undistorted(root: Path, chosen: str = "") -> ForeignScene:
-    model = read_named_model(root, chosen)
+    model, photos = read_named_model(root, chosen)
     odd = sorted({c.model for c in model.cameras.values()} - {"PINHOLE", "SIMPLE_PINHOLE"})
     split, missing = split_by_lists(model_names(model), read_lists(root), root)
     notes = (f"cameras are {shortlist(odd)}: undistorted here",) if odd else ()
-    photos, factor = photo_folder(root), _undistorted_factor(root, model)
+    factor = _undistorted_factor(root, model)
     return ForeignScene(
         "on-the-go", root, model, photos, split, factor, missing, dataset=DATASET, notes=notes
     )

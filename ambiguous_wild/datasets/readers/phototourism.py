@@ -11,7 +11,6 @@ from ambiguous_wild.datasets.foreign import ForeignScene, split_by_lists
 from ambiguous_wild.datasets.readers.colmap import (
     has_lists,
     model_names,
-    photo_folder,
     read_lists,
     read_named_model,
 )
@@ -66,7 +65,7 @@ def read_table(path: Path) -> dict[Split, list[str]]:
 
 def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
     """Read dense/images, dense/sparse and <name>.tsv, or the published lists."""
-    model = read_named_model(root, chosen)
+    model, photos = read_named_model(root, chosen)
     names = model_names(model)
     table = find_table(root)
     if table is not None:
@@ -90,7 +89,7 @@ def read_phototourism(root: Path, chosen: str = "") -> ForeignScene:
     split, missing = split_by_lists(names, listed, where)
     unlisted = len(names) - len(split)
     notes = (f"{unlisted} photos of the model are in no list: left out",) if unlisted else ()
-    name, photos = "Photo Tourism", photo_folder(root)
+    name = "Photo Tourism"
     return ForeignScene(
         "photo-tourism", root, model, photos, split, 1, missing, dataset=name, evaluation=NERF_W, notes=notes
     )

@@ -12,16 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core.errors import AwError, shortlist
-from ambiguous_wild.datasets.foreign import (
-    SUFFIXES,
-    ForeignScene,
-    find_photo,
-    inside,
-    pose_from_opengl,
-)
+from ambiguous_wild.datasets.foreign import ForeignScene, inside, pose_from_opengl
+from ambiguous_wild.datasets.photo_names import find_photo
 from ambiguous_wild.datasets.readers.colmap import sides
 from ambiguous_wild.io.colmap_model import check_camera
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, points_without_tracks
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 from ambiguous_wild.io.ply import read_point_ply
 
 FIT_PX = 0.05  # largest error of the rational lens that replaces another lens
@@ -59,7 +55,9 @@ def find_posed(folder: Path, names: Sequence[str], where: Path) -> list[str]:
         AwError: a photo is absent or named twice, or a name fits several photos.
     """
     below: dict[str, list[str]] = {}
-    for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES and p.name[:2] != "._"):
+    for path in sorted(
+        p for p in folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.name[:2] != "._"
+    ):
         for key in {path.name, path.stem}:
             below.setdefault(key, []).append(path.relative_to(folder).as_posix())
     photos, lost = [], []

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.scene import Split
-from ambiguous_wild.datasets.foreign import ForeignScene, find_photo, inside, split_by_lists
+from ambiguous_wild.datasets.foreign import ForeignScene, inside, split_by_lists
+from ambiguous_wild.datasets.photo_names import find_photo
 from ambiguous_wild.datasets.readers.colmap import sides
-from ambiguous_wild.datasets.readers.posed_photos import brown_camera, model_of_poses
+from ambiguous_wild.datasets.readers.posed_photos import brown_camera, model_of_poses, only_file
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, points_without_tracks
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.ply import read_point_ply
@@ -166,6 +168,8 @@ def read_transforms(root: Path) -> ForeignScene:
     points = data.get("ply_file_path")
     studio = isinstance(points, str) or "camera_model" in data or "applied_transform" in data
     kind = "nerfstudio" if studio else "instant-ngp"
+    if studio and notes:
+        notes.append("nerfstudio itself tests a tenth of the photos, evenly: results are not comparable")
     if isinstance(points, str):
         xyz, rgb = read_point_ply(root / below(points, root))
         model = ColmapModel(model.cameras, model.images, points_without_tracks(xyz, rgb))
@@ -191,11 +195,11 @@ def _listed(data: Mapping[str, object], path: Path, root: Path, folder: Path) ->
 def _masks(
     named: Mapping[str, Mapping[str, object]], split: Mapping[str, Split], root: Path
 ) -> dict[str, Path]:
-    """Find nerfstudio's masks of training photos: black is ignored, so they are keep masks."""
+    """Find nerfstudio's masks of the split's photos: black is ignored, so they are keep masks."""
     mask_files = {}
     for name, frame in named.items():
         mask = frame.get("mask_path")
-        if isinstance(mask, str) and split.get(name) == "train":
+        if isinstance(mask, str) and name in split:
             mask_files[name] = root / below(mask, root)
     absent = [str(p) for p in mask_files.values() if not p.is_file()]
     if absent:
@@ -219,6 +223,12 @@ def read_blender(root: Path) -> ForeignScene:
                 raise AwError(f"{path} lists {name!r} twice, or it is in both files")
             rows.append((name, frame["transform_matrix"], frame_camera(frame, data, photo, path)))
             split[name] = side
-    note = "photos with alpha are composited over white; initial points are random, as there is no model"
-    model = model_of_poses(rows)
-    return ForeignScene("blender", root, model, root, split, background=WHITE, points="random", notes=(note,))
+    notes = ["photos with alpha are composited over white, which is drawn behind the model"]
+    model, points = model_of_poses(rows), only_file(root, ".ply")
+    scene = ForeignScene("blender", root, model, root, split, background=WHITE, points="random")
+    if points is None:
+        notes.append("initial points are random, as there is no model")
+        return replace(scene, notes=tuple(notes))
+    model = ColmapModel(model.cameras, model.images, points_without_tracks(*read_point_ply(points)))
+    notes.append(f"points from {points.name}")
+    return replace(scene, model=model, points="model", notes=tuple(notes))

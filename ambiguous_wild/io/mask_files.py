@@ -1,0 +1,78 @@
+"""Find keep masks by the names of photos, in the spellings of the field's tools."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePosixPath
+
+from ambiguous_wild.core.scene import Split
+
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+MASK_FOLDERS = ("masks", "mask", "segmentation", "dynamic_masks")  # of COLMAP, nerfstudio, LichtFeld
+OWN_MASKS = "masks.json"  # marks a folder with instances of a segmentation, not keep masks
+# a.jpg.mask.png: RealityScan; a.mask.png: OpenMVS; a_mask.png: Metashape
+MARKS = (".mask", "_mask", "-mask")
+SPELLINGS = "a mask of a.jpg is called a.png, a.jpg.png, a.mask.png, a.jpg.mask.png, a_mask.png or mask_a.png"
+
+
+def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Find mask files by the name of the photo; photos without one are absent.
+
+    A mask is called as in `SPELLINGS`, in any format and case, and lies under the photo's path or, if no
+    other photo has this base name, directly in `folder`. In a folder that holds the photos too, only files
+    that are marked as masks are.
+    """
+    files = masks_beside_photos(folder) or mask_files(folder)
+    there: dict[str, Path] = {}
+    for path in sorted(files):
+        there.setdefault(_key(path.relative_to(folder).as_posix()), path)
+    photos = [PurePosixPath(name) for name in names]
+    bases = Counter(pure.name for pure in photos)
+    masks: dict[str, Path] = {}
+    for pure in photos if there else ():
+        paths = [pure, PurePosixPath(pure.name)] if bases[pure.name] == 1 else [pure]
+        for spelling in (s for path in paths for s in _spellings(path)):
+            if (key := _key(spelling)) in there:
+                masks[str(pure)] = there[key]
+                break
+    return masks
+
+
+def side_masks(folder: Path, names: Iterable[str], side: Split) -> dict[str, Path]:
+    """Find the masks of one side's photos in `folder`, or in its folder of that side."""
+    listed = list(names)
+    return find_masks(folder, listed) | find_masks(folder / side, listed)
+
+
+def mask_files(folder: Path) -> set[Path]:
+    """Return all files below a folder that may be masks."""
+    files = folder.rglob("*")
+    return {p for p in files if p.suffix.lower() in MASK_SUFFIXES and p.name[:2] != "._" and p.is_file()}
+
+
+def masks_beside_photos(folder: Path) -> set[Path]:
+    """Return the files that are marked as masks of photos in the same folder, in it or below."""
+    files = mask_files(folder)
+    names = {(p.parent, _key(part)) for p in files for part in (p.name, p.stem)}
+    return {p for p in files if any((p.parent, _key(name)) in names for name in _masked(p))}
+
+
+def _masked(path: Path) -> Iterator[str]:
+    """Yield the names that the photo of a marked mask may have, with or without its extension."""
+    for mark in MARKS:
+        if path.stem.casefold().endswith(mark):
+            yield path.stem[: -len(mark)]
+    if path.stem.casefold().startswith("mask_"):
+        yield path.stem[len("mask_") :]
+
+
+def _spellings(photo: PurePosixPath) -> Iterator[str]:
+    for name in (photo.name, photo.stem):
+        for spelling in (name, *(name + mark for mark in MARKS), f"mask_{name}"):
+            yield from (str(photo.with_name(f"{spelling}{suffix}")) for suffix in MASK_SUFFIXES)
+
+
+def _key(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()

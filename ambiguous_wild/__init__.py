@@ -4,6 +4,8 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
+from ambiguous_wild.core.machine import allowed_cores, usable_cores
+
 # Two OpenMP pools share the cores, Numba's and torch's. By default their idle threads spin, each on the
 # core the other needs: 63 ms an iteration where sleeping threads take 4 (2 cores, 64x48 px). OpenMP reads
 # this when it is loaded, so it must stand before the first import of either.
@@ -11,6 +13,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # numpy's BLAS spins likewise, and is given small matrices here: with three runs on two cores, depth maps from
 # sparse points took 39 s instead of 2.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Numba and torch start a thread for each core that they may run on, whatever a container's quota is.
+if usable_cores() < len(allowed_cores()):
+    for _name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(_name, str(usable_cores()))
 
 __version__ = "0.1.0"
 

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.photos import PHOTO_SUFFIXES
+from ambiguous_wild.io.images import header_size
+from ambiguous_wild.io.mask_files import masks_beside_photos
+from ambiguous_wild.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, is_photo
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
 Side = Literal["train", "test"] | None
@@ -76,11 +78,12 @@ def collect(
     files: list[tuple[Path, Side]] = []
     labels: list[str] = []
     ignored: list[str] = []
+    marked = {path for folder, _ in folders for path in masks_beside_photos(folder)}
     for (folder, side), label in zip(folders, _labels(root, folders), strict=True):
         for path in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
             if path.name.startswith(".") or not path.is_file():
                 continue
-            if path.suffix.lower() in PHOTO_SUFFIXES:
+            if path not in marked and is_photo(path):
                 files.append((path, side))
                 labels.append(label)
             else:
@@ -104,8 +107,14 @@ def collect(
         any(side for _, side in folders),
         truth if truth.is_dir() and len(roots) == 1 else None,
         tuple(sorted(ignored)),
-        tuple(_folder_notes(roots, folders, labels, masks)),
+        (*_folder_notes(roots, folders, labels, masks), *_file_notes(marked, ignored, masks)),
     )
+
+
+def largest_photo(capture: Capture) -> int:
+    """Return the pixels of the largest photo, by the files' headers; 0 where none can be read."""
+    sizes = (header_size(photo.path) for photo in capture.sources)
+    return max((width * height for width, height in filter(None, sizes)), default=0)
 
 
 def _check_roots(given: Sequence[Path | str]) -> list[Path]:
@@ -196,8 +205,22 @@ def _folder_notes(
                 yield f"{root} holds photos itself, so its folders {shortlist(left)} are left out"
 
 
+def _file_notes(marked: set[Path], ignored: Sequence[str], masks: Path | None) -> Iterator[str]:
+    if marked and masks is None:
+        folder = min(marked).parent
+        yield (
+            f"{counted(len(marked), 'mask')} beside photos, as {min(marked).name}, not used; "
+            f"--keep-masks '{folder}' does (white = keep)"
+        )
+    kinds = Counter(s for name in ignored if (s := Path(name).suffix.lower()) in UNREAD_SUFFIXES)
+    if kinds:
+        each = shortlist(f"{suffix} ({count})" for suffix, count in sorted(kinds.items()))
+        count = counted(kinds.total(), "picture")
+        yield f"{count} of formats that are not read, left out: {each}; export what has no JPEG beside it"
+
+
 def _has_photos(folder: Path) -> bool:
-    return folder.is_dir() and any(p.suffix.lower() in PHOTO_SUFFIXES for p in folder.iterdir())
+    return folder.is_dir() and any(p.name[0] != "." and p.is_file() and is_photo(p) for p in folder.iterdir())
 
 
 def _too_few(root: Path, count: int, ignored: list[str]) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import cast
 
 from ambiguous_wild.builder import scene_record
-from ambiguous_wild.builder.collect import collect
+from ambiguous_wild.builder.collect import collect, largest_photo
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import SceneRecord
 from ambiguous_wild.builder.settings import BuildSettings
@@ -21,6 +21,7 @@ from ambiguous_wild.builder.sfm import SfmCrash
 from ambiguous_wild.builder.stages import Stages
 from ambiguous_wild.builder.workspace import Workspace
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.machine import photo_threads, usable_cores
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.files import check_output, folder_lock, refuse_foreign_files
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_files
@@ -86,9 +87,9 @@ def build_scene(
     settings = replace(settings, name=name)
     for one in [raw] if isinstance(raw, (str, Path)) else raw:
         _check_paths(one, target)
-    count = jobs or os.cpu_count() or 1
     mask_folder = Path(masks).resolve() if masks is not None else None
-    capture = collect(raw, count, mask_folder)
+    capture = collect(raw, jobs or usable_cores(), mask_folder)
+    count = jobs or photo_threads(largest_photo(capture))
     target = check_output(target)
     with folder_lock(target, "aw build-scene"):
         stages = Stages(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 import shlex
 from pathlib import Path
@@ -14,6 +13,7 @@ import click
 
 from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, threads_option
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.machine import usable_cores
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.checks import CaptureReport
@@ -56,7 +56,7 @@ def capture_command(
     paths = [Path(source) for source in sources]
     absent = next((source for source in sources if not Path(source).exists()), None)
     if absent is None:
-        jobs = threads or os.cpu_count() or 1
+        jobs = threads or usable_cores()
         facts = capture_photos.photos_from(paths, output, frames=frames, jobs=jobs, bar=bar)
     elif len(sources) == 1 and (camera := re.fullmatch(r"camera(?::(\d{1,3}))?", absent)):
         facts = capture_photos.photos_from_camera(
@@ -112,7 +112,7 @@ def screen_command(
 
     if output is not None:
         check_target(output, raw)
-    report = check_capture(raw, jobs=threads or os.cpu_count() or 1, bar=Bar(not as_json))
+    report = check_capture(raw, jobs=threads or usable_cores(), bar=Bar(not as_json))
     if output is not None:
         write_map(report.overlap_map(), output)
     if as_json:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 from dataclasses import asdict
 from pathlib import Path
@@ -20,6 +19,7 @@ from ambiguous_wild.cli.options import (
     threads_option,
 )
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.machine import usable_cores
 
 if TYPE_CHECKING:
     from ambiguous_wild.datasets.write import ImportRecord
@@ -233,7 +233,7 @@ def package_command(
         info,
         keep_metadata=keep_metadata,
         look_for_people=people,
-        jobs=threads or os.cpu_count() or 1,
+        jobs=threads or usable_cores(),
         progress=not as_json,
     )
     if as_json:

@@ -5,7 +5,6 @@ This module imports nothing heavy: imports that may crash or hang are tested in 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib.metadata
 import importlib.util
@@ -26,8 +25,9 @@ import click
 
 from ambiguous_wild.cli.options import json_option
 from ambiguous_wild.core.errors import AwError, install_command, installed
+from ambiguous_wild.core.machine import usable_cores, usable_memory
 from ambiguous_wild.core.processes import python_command
-from ambiguous_wild.harness.callbacks import allowed_cores
+from ambiguous_wild.io.images import ximgproc
 from ambiguous_wild.splat import readiness
 
 TIMEOUT_S = 60
@@ -129,6 +129,7 @@ def all_checks() -> list[SystemCheck]:
         _library(
             "pycolmap", probed["pycolmap"], "structure from motion; PNG files are written correctly after it"
         ),
+        _opencv(),
         *_numba(probed["numba"]),
         *_gpu(probed["torch"]),
         _torchvision(probed.get("torchvision")),
@@ -143,12 +144,11 @@ def _machine() -> list[SystemCheck]:
     python = _system_install("python3.11", "https://www.python.org/downloads")
     checks = [
         _core("python", sys.version_info >= (3, 11), platform.python_version(), python),
-        _core("cpu", True, f"{len(allowed_cores())} cores usable of {os.cpu_count()}, {platform.machine()}"),
+        _core("cpu", True, f"{usable_cores()} cores usable of {os.cpu_count()}, {platform.machine()}"),
     ]
-    with contextlib.suppress(AttributeError, ValueError, OSError):  # a system that does not report it
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    if (memory := usable_memory()) is not None:
         fix = f"# use {SMALL_MEMORY_GB:.0f} GB or more, or train with aw bench --max-gaussians 50000"
-        checks.append(_core("memory", memory >= SMALL_MEMORY_GB, f"{memory:.1f} GB", fix))
+        checks.append(_core("memory", memory >= SMALL_MEMORY_GB * 1e9, f"{memory / 1e9:.1f} GB", fix))
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     fix = f"df -h .  # free at least {SMALL_DISK_GB:.0f} GB, or use a folder on another disk"
     return [*checks, _core("disk", free >= SMALL_DISK_GB, f"{free:.0f} GB free in {Path.cwd()}", fix)]
@@ -219,6 +219,15 @@ def _install_again(words: str) -> str:
 def _library(name: str, probed: Probe, use: str) -> SystemCheck:
     detail = probed.error if probed.facts is None else str(probed.facts["version"])
     return _core(name, probed.facts is not None, f"{detail} ({use})", _install_again(f"--no-deps {name}"))
+
+
+def _opencv() -> SystemCheck:
+    try:
+        ximgproc()
+    except AwError as error:
+        fault, _, fix = str(error).partition(": ")
+        return _core("opencv", False, fault, f"{_PIP.removesuffix('pip')}{fix}")
+    return _core("opencv", True, "with ximgproc (masks, segments)")
 
 
 def _numba(probed: Probe) -> list[SystemCheck]:

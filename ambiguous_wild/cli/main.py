@@ -157,6 +157,9 @@ def main() -> None:
     # Python sets a closed standard output (`>&-`) to None.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - until the process ends
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):  # Windows writes to files in code pages that lack some signs
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
     try:
         _check_threads()
         with warnings.catch_warnings():

@@ -6,6 +6,7 @@ torch is imported only when a file is read.
 from __future__ import annotations
 
 import os
+import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-DEFAULT_FOLDER = "~/.cache/ambiguous_wild/weights"
+CACHE = "~/.cache"
+DEFAULT_FOLDER = f"{CACHE}/ambiguous_wild/weights"
 
 
 def weights_folder() -> Path:
@@ -28,12 +30,17 @@ def weights_folder() -> Path:
 def expanded(path: str | Path, name: str) -> Path:
     """Replace the ~ of a path; `name` is the variable or option that holds it.
 
+    A cache of a user without a home, as in containers, lies in a temporary folder.
+
     Raises:
         AwError: the home folder of its user is not known.
     """
     try:
         return Path(path).expanduser()
     except RuntimeError:
+        if str(path).startswith(f"{CACHE}/") or str(path) == CACHE:
+            user = os.getuid() if hasattr(os, "getuid") else 0
+            return Path(tempfile.gettempdir()) / f"ambiguous_wild-home-{user}" / str(path).removeprefix("~/")
         raise AwError(
             f"{name} is {str(path)!r}, but no home folder is known for its '~'; give the full path"
         ) from None
@@ -51,7 +58,7 @@ def folder_fault() -> str:
 
 def torch_hub_folder() -> Path:
     """Return the folder of checkpoints that torch downloads: TORCH_HOME/hub/checkpoints or its default."""
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    cache = os.environ.get("XDG_CACHE_HOME") or CACHE
     home = os.environ.get("TORCH_HOME")
     folder = expanded(home, "TORCH_HOME") if home else expanded(cache, "XDG_CACHE_HOME") / "torch"
     return folder / "hub" / "checkpoints"

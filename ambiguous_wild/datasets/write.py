@@ -20,6 +20,7 @@ from ambiguous_wild.builder.scene_package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.scene_record import point_checks
 from ambiguous_wild.builder.workspace import content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
+from ambiguous_wild.core.machine import photo_threads
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.core.scene import SceneInfo, Split
 from ambiguous_wild.datasets.foreign import ForeignScene
@@ -153,8 +154,9 @@ def import_scene(
             return ImportResult(target, existing, why, True)
         work = target.parent / f".{target.name}.import-{key[:16]}"
         bar = Bar(progress)
+        largest = max(plan.camera.width * plan.camera.height for plan in plans)
         try:
-            _write_scene(work, foreign, plans, settings, name, key, jobs or os.cpu_count() or 1, bar)
+            _write_scene(work, foreign, plans, settings, name, key, jobs or photo_threads(largest), bar)
         except AwError as error:
             shutil.rmtree(work, ignore_errors=True)
             error.args = (str(error).replace(str(work / "scene"), str(root)),)  # what the user knows

@@ -54,13 +54,6 @@ class Engine:
         return self.engine == "ray" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
 
-def allowed_cores() -> set[int]:
-    """Return the numbers of the processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return set(os.sched_getaffinity(0))
-    return set(range(os.cpu_count() or 1))
-
-
 class Callbacks:
     """Called while runs are made; does nothing. A subclass overrides what it needs."""
 

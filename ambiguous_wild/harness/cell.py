@@ -6,7 +6,6 @@ Identities are hashes that anybody can compute again from the files.
 from __future__ import annotations
 
 import hashlib
-import os
 import platform
 import shlex
 import sys
@@ -23,6 +22,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import UNMOVED, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.core.errors import installed
+from ambiguous_wild.core.machine import usable_cores
 from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.command_lines import bench_command, length_options, length_text, option_text
 from ambiguous_wild.harness.measures import ImageRow, records
@@ -73,7 +73,7 @@ def environment(device: str) -> Environment:
         "python": sys.version.split()[0],
         "platform": platform.platform(),
         "cpu": _cpu_name(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "device": device,
         "packages": {name: installed(name) for name in PACKAGES},
     }

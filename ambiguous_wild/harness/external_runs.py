@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from ambiguous_wild.core import UNMOVED, AwError, Scene, View
+from ambiguous_wild.core.machine import allowed_cores
 from ambiguous_wild.harness import evaluate
-from ambiguous_wild.harness.callbacks import allowed_cores
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.chosen_effects import EXTERNAL_NO_EFFECTS
 from ambiguous_wild.harness.meter import Meter, own_s

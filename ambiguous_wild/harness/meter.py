@@ -22,7 +22,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from ambiguous_wild.core.config import State
-from ambiguous_wild.harness.callbacks import allowed_cores
+from ambiguous_wild.core.machine import allowed_cores
 from ambiguous_wild.harness.result_file import Cost, TimeRecord
 from ambiguous_wild.harness.timing import Verdict, in_reference_seconds
 from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration

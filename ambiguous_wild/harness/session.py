@@ -14,7 +14,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ambiguous_wild.harness.callbacks import Callbacks, Engine, allowed_cores
+from ambiguous_wild.core.machine import usable_cores
+from ambiguous_wild.harness.callbacks import Callbacks, Engine
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions
@@ -94,7 +95,7 @@ class Session:
         threads = self.threads or (
             max(1, int(engine.cpus_per_cell or 1))
             if cluster
-            else max(1, len(allowed_cores()) // (engine.jobs or 1))
+            else max(1, usable_cores() // (engine.jobs or 1))
         )
         folders = checked_folders(cells, output, options)
         jobs = [make_job(cell, folder, options, sources, threads) for cell, folder in zip(cells, folders)]

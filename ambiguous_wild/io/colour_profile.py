@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-LATTICE = np.arange(0, 256, 51).astype(np.uint8)  # codes of each channel at which a profile is compared with sRGB
+LATTICE = np.arange(0, 256, 51).astype(np.uint8)  # codes at which a profile is compared with sRGB
 SAME_CODES = 3  # largest difference of a profile that is sRGB under another name
 DAMAGED = "a profile that cannot be read"
 

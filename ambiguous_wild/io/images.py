@@ -6,6 +6,7 @@ For photos of any kind (EXIF, CMYK, damaged files) see `io/photos.py`.
 from __future__ import annotations
 
 import functools
+import importlib.metadata
 import warnings
 from io import BytesIO
 from pathlib import Path
@@ -19,6 +20,7 @@ from ambiguous_wild.io.files import write_bytes
 
 # Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
 MAX_PIXELS = 120_000_000
+OPENCV = "opencv-contrib-python-headless"
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 _WHITE = 192  # least grey of a mask that keeps all
 _SLACK = {"JPEG": 8}  # tolerance of black and white; 2 in lossless formats
@@ -243,6 +245,25 @@ def pillow() -> Any:
     Image.MAX_IMAGE_PIXELS = None
     warnings.filterwarnings("ignore", module=r"PIL\.")  # about damaged headers: our errors say it in one line
     return Image
+
+
+def ximgproc() -> Any:
+    """Return OpenCV's extended image processing.
+
+    Raises:
+        AwError: another OpenCV package has replaced the one that has it.
+    """
+    import cv2
+
+    if hasattr(cv2, "ximgproc") and hasattr(cv2.ximgproc, "guidedFilter"):
+        return cv2.ximgproc
+    installed = {d.metadata["Name"] for d in importlib.metadata.distributions()}
+    others = sorted(name for name in installed if name and name.startswith("opencv-") and name != OPENCV)
+    removed = f"pip uninstall -y {' '.join(others)} && " if others else ""
+    cause = f", as {' and '.join(others)} overwrote it" if others else ""
+    raise AwError(
+        f"this OpenCV has no ximgproc{cause}: {removed}pip install --force-reinstall --no-deps {OPENCV}"
+    )
 
 
 def write_png(

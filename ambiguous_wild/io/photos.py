@@ -23,7 +23,12 @@ from ambiguous_wild.io.colour_profile import profile_name, to_srgb
 from ambiguous_wild.io.images import MAX_PIXELS, pillow, upright
 
 PHOTO_SUFFIXES = (
-    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif", ".dng",
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif",
+    ".hif", ".avif", ".dng",
+)  # fmt: skip
+UNREAD_SUFFIXES = (  # of pictures that are not read, most of them raw
+    ".3fr", ".arw", ".cr2", ".cr3", ".erf", ".gif", ".jxl", ".mef", ".nef", ".nrw", ".orf", ".pef", ".raf",
+    ".raw", ".rw2", ".srw", ".x3f",
 )  # fmt: skip
 TRANSPARENT = "transparency composited over black"  # its alpha may be a keep mask, see `images.read_alpha`
 FROM_PROFILE = "colours converted to sRGB from"
@@ -34,7 +39,10 @@ MIN_SIDE = 16  # px; smaller photos have no features
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _NO_REASON = "OpenImageIO gives no reason"
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
-_FORMAT_OF_SUFFIX = {".jpg": "jpeg", ".jpeg": "jpeg", ".tif": "tiff", ".jp2": "jpeg2000", ".heif": "heic"}
+_FORMAT_OF_SUFFIX = {
+    ".jpg": "jpeg", ".jpe": "jpeg", ".jfif": "jpeg", ".tif": "tiff", ".jp2": "jpeg2000", ".heif": "heic",
+    ".hif": "heic",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -101,8 +109,8 @@ def read_photo(
 
     source = Path(path)
     form = _sniff(source)
-    if form == "heic":
-        return _read_heic(source)
+    if form in ("heic", "avif"):
+        return _read_by_pillow(source, form)
     _check_whole(source, form)
     reader = oiio.ImageInput.open(str(source))
     if reader is None:
@@ -134,15 +142,28 @@ def read_photo(
     return Photo(source, form, width, height, exif, plain, tuple(notes)), np.ascontiguousarray(rgb)
 
 
-def _read_heic(source: Path) -> tuple[Photo, np.ndarray]:
-    """Read HEIC and HEIF photos of phones through libheif (extra [heic]), a plugin of Pillow.
+def is_photo(path: Path) -> bool:
+    """Whether a file is taken for a photo: by its suffix, or as a JPEG under any name."""
+    suffix = path.suffix.lower()
+    if suffix in PHOTO_SUFFIXES or suffix in UNREAD_SUFFIXES:
+        return suffix in PHOTO_SUFFIXES
+    try:
+        with open(path, "rb") as f:
+            return f.read(3) == b"\xff\xd8\xff"
+    except OSError:
+        return False
 
-    libheif applies the rotation in the file, so by the standard EXIF's orientation is not applied again.
+
+def _read_by_pillow(source: Path, form: str) -> tuple[Photo, np.ndarray]:
+    """Read HEIC and HEIF photos through libheif (extra [heic]), a plugin of Pillow, and AVIF by Pillow.
+
+    libheif applies the rotation in the file, so by the standard EXIF's orientation is not applied again;
+    Pillow writes AVIF's rotation into it.
     """
-    if not _register_heif():
+    if form == "heic" and not _register_heif():
         raise UnreadablePhoto(source, f"HEIC photos need the extra [heic]: {install_command('heic')}")
     try:
-        with pillow().open(source, formats=("HEIF",)) as picture:
+        with pillow().open(source, formats=("AVIF" if form == "avif" else "HEIF",)) as picture:
             width, height = picture.size
             _check_size(source, width, height)
             depth, others = int(picture.info.get("bit_depth") or 8), getattr(picture, "n_frames", 1) - 1
@@ -155,15 +176,19 @@ def _read_heic(source: Path) -> tuple[Photo, np.ndarray]:
         raise
     except Exception as error:  # libheif's errors come as several classes
         reason = _one_line(error) or type(error).__name__
-        raise UnreadablePhoto(source, f"damaged or cut HEIC ({reason})") from error
+        raise UnreadablePhoto(source, f"damaged or cut {form.upper()} ({reason})") from error
     if "A" in names:
         alpha = pixels[..., -1:].astype(np.uint16)
         notes.append(_alpha_note(pixels[..., -1]))
         pixels = (pixels[..., :-1] * alpha // 255).astype(np.uint8)
     rgb, more = _three_channels(source, pixels, names, "")
     rgb = _in_srgb(rgb, _bytes(profile), notes)
-    notes += [*more, *_misnamed(source, "heic")]
-    return Photo(source, "heic", width, height, _block_exif(raw), False, tuple(notes)), rgb
+    exif = _block_exif(raw)
+    if form == "avif" and exif.orientation != 1:
+        more.append(f"turned upright (EXIF orientation {exif.orientation})")
+        rgb = np.ascontiguousarray(upright(rgb, exif.orientation))
+    notes += [*more, *_misnamed(source, form)]
+    return Photo(source, form, rgb.shape[1], rgb.shape[0], exif, False, tuple(notes)), rgb
 
 
 def _register_heif() -> bool:
@@ -233,6 +258,8 @@ def _sniff(path: Path) -> str:
         return "webp"
     if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
         return "heic"
+    if head[4:8] == b"ftyp" and head[8:12] in (b"avif", b"avis"):
+        return "avif"
     raise UnreadablePhoto(path, "no image (the content is of no photo format)")
 
 

@@ -8,7 +8,6 @@ its photo is copied or read while the step before computes.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -19,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
+from ambiguous_wild.core.machine import usable_memory
 from ambiguous_wild.io.images import as_float, load_image_codes, read_alpha, read_keep_map
 from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.splat.step import TrainData
@@ -264,6 +264,5 @@ def fit(needed: int, device: torch.device) -> bool:
     """Whether this many bytes of photos may stay in the device's memory for the whole run."""
     if device.type == "cuda":
         return needed <= RESIDENT * torch.cuda.mem_get_info(device)[0]
-    if not hasattr(os, "sysconf"):  # Windows
-        return True
-    return needed <= RESIDENT * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = usable_memory()
+    return memory is None or needed <= RESIDENT * memory

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits, config_hash
+from ambiguous_wild.io.images import ximgproc
 from ambiguous_wild.vision.protocols import Features
 
 _REFERENCE_PIXELS = 240 * 135  # k and min_size are for this size and scale with the pixel count
@@ -79,7 +80,8 @@ def segment(lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
     best_miss = math.inf
     for _ in range(config.tries):
         labels = (
-            cv2.ximgproc.segmentation.createGraphSegmentation(config.sigma, math.exp(log_k), smallest)
+            ximgproc()
+            .segmentation.createGraphSegmentation(config.sigma, math.exp(log_k), smallest)
             .processImage(lab)
             .astype(np.int32)
         )

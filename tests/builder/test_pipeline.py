@@ -222,7 +222,7 @@ def test_masks_are_used_and_carried_to_their_photos(raw, tmp_path, alpha):
     carried = sorted(p.name for p in (result.scene / "masks" / "train").iterdir())
     assert carried == ["p00.png", "p02.png", "p03.png", "p05.png"]
     loaded = load_scene(result.scene)
-    assert {v.name for v in loaded.views if v.keep_path} == set(carried)
+    assert {v.name for v in loaded.train if v.keep_path} == set(carried)
     keep = read_gray(loaded.train[0].keep_path)
     assert keep.shape[::-1] == image_size(loaded.train[0].image_path)
     assert keep[60, 5] == 0

@@ -28,6 +28,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.io.images import ximgproc
 from ambiguous_wild.methods.refinesplat.maps import Ranks, common_offset
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
@@ -262,7 +263,7 @@ def _smoothed(answer: np.ndarray, photo: np.ndarray, smooth: float) -> np.ndarra
     if smooth <= 0:
         return answer
     radius = max(round(smooth * math.sqrt(answer.size / PIXELS)), 1)
-    return np.clip(cv2.ximgproc.guidedFilter(photo, answer, radius, _EDGE), 0.0, 1.0)
+    return np.clip(ximgproc().guidedFilter(photo, answer, radius, _EDGE), 0.0, 1.0)
 
 
 def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> np.ndarray | None:

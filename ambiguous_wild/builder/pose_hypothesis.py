@@ -17,6 +17,7 @@ MIN_AREA = 0.2  # share of a photo that inliers must cover: what is smaller may 
 # coverage of the inliers, relative to as many features drawn at random: those of a distractor are clustered.
 LITTLE_AREA, LITTLE_COVERAGE = 0.05, 0.2
 MIN_COVERAGE = 0.28  # coverage of the inliers below which they must cover `AREA_NEW` of a photo
+TWO_POSES = "two poses"  # begins the reason against a photo whose covisible photos contradict each other
 AREA_NEW = 0.3  # share of a photo that is not registered yet, from which on the support of two is enough
 
 
@@ -54,5 +55,5 @@ def reason_against(best: PoseHypothesis, competing: PoseHypothesis, needed: int)
         part = f"{best.area:.0%}, coverage {best.coverage:.2f}"
         return f"only a small part of it agrees with {len(best.support)} placed photos ({part})"
     if len(competing.support) >= MIN_SUPPORT and competing.weight > COMPETING_WEIGHT * best.weight:
-        return f"two poses: {len(best.support)} photos agree on one, {len(competing.support)} on another"
+        return f"{TWO_POSES}: {len(best.support)} photos agree on one, {len(competing.support)} on another"
     return None

@@ -21,6 +21,7 @@ from ambiguous_wild.builder.keep_masks import (
 )
 from ambiguous_wild.builder.map_drawing import draw_built
 from ambiguous_wild.builder.moving_features import write_motion
+from ambiguous_wild.builder.pose_hypothesis import TWO_POSES
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     TURNED,
@@ -36,7 +37,7 @@ from ambiguous_wild.builder.records import (
     ScreenResult,
 )
 from ambiguous_wild.builder.resample import auto_factor, check_factor, resample
-from ambiguous_wild.builder.retrieval import RELATIVE_POSES
+from ambiguous_wild.builder.retrieval import FEW_PHOTOS, RELATIVE_POSES
 from ambiguous_wild.builder.scene_package import SceneParts, package
 from ambiguous_wild.builder.scene_record import BuildResults
 from ambiguous_wild.builder.screen import panorama_warnings, screen, without_copies
@@ -63,6 +64,11 @@ class SfmStages:
     def registered(self) -> int:
         """Number of photos in the largest component."""
         return max(map(len, self.mapping.facts["components"]), default=0)
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether covisible photos give a photo two poses, as where a bent path does not close."""
+        return any(reason.startswith(TWO_POSES) for reason in self.mapping.facts["left_out"].values())
 
 
 @dataclass
@@ -248,7 +254,8 @@ class Stages:
         attempts: list[SfmStages] = []
         for plan in plans(photos, self.settings):
             registered = max((attempt.registered for attempt in attempts), default=0)
-            if registered >= plan.below * len(photos):
+            bent = bool(attempts) and attempts[-1].contradicted and len(photos) <= FEW_PHOTOS
+            if registered >= plan.below * len(photos) and not bent:
                 break
             if attempts:
                 self.bar.say(f"{registered} of {len(photos)} photos placed: trying harder")

@@ -254,7 +254,8 @@ class Stages:
         attempts: list[SfmStages] = []
         for plan in plans(photos, self.settings):
             registered = max((attempt.registered for attempt in attempts), default=0)
-            bent = bool(attempts) and attempts[-1].contradicted and len(photos) <= FEW_PHOTOS
+            most = [attempt for attempt in attempts if attempt.registered == registered]
+            bent = bool(most) and most[-1].contradicted and len(photos) <= FEW_PHOTOS
             if registered >= plan.below * len(photos) and not bent:
                 break
             if attempts:

@@ -31,13 +31,13 @@ from ambiguous_wild.harness.result_file import (
     Cost,
     Environment,
     MaskScores,
-    Options,
     Provenance,
     RunConfig,
     RunFacts,
     RunResult,
     SceneConfig,
     UnusualConfig,
+    config_identity,
 )
 from ambiguous_wild.harness.start import StartFile
 from ambiguous_wild.io.files import sha256_file
@@ -51,13 +51,6 @@ Overwrite = Literal["never", "missing", "changed", "always"]
 Protocol = Literal["full", "half"]
 Outcome = Literal["trained", "kept", "skipped", "failed"]
 PACKAGES = ("numpy", "numba", "torch", "opencv-contrib-python-headless", "scipy", "gsplat", "transformers")
-# Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
-# values that are not finite (the result says so where there were any), where the scene lies.
-IGNORED: dict[str, tuple[str, ...]] = {
-    "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
-    "scene": ("path",),
-    "start": ("path",),
-}
 # Files that record how a scene was made, versions included. Nothing is trained or scored on them: the same
 # photos simulated by a later version are the same scene.
 RECORDS = ("truth/capture.json",)
@@ -94,22 +87,6 @@ def _cpu_name() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
-
-
-def config_identity(config: RunConfig | Mapping[str, Any]) -> str:
-    """Return the sha256 of the settings that decide a run's result.
-
-    Args:
-        config: the resolved configuration, as in config.yaml; its own "config_hash" is ignored.
-
-    Raises:
-        ValueError: a number in it is not finite.
-        TypeError: a value in it has no form in JSON.
-    """
-    settings: Options = {k: v for k, v in config.items() if k != "config_hash"}
-    for part in IGNORED.keys() & settings.keys():
-        settings[part] = {k: v for k, v in settings[part].items() if k not in IGNORED[part]}
-    return config_hash(settings)
 
 
 def scene_identity(scene: Scene) -> str:

@@ -17,7 +17,6 @@ from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import disk_line, logged_to
 from ambiguous_wild.harness.callbacks import outcome_line, run_name
 from ambiguous_wild.harness.cell import (
-    IGNORED,
     Cell,
     CellReport,
     Overwrite,
@@ -31,6 +30,7 @@ from ambiguous_wild.harness.pictures import ROWS
 from ambiguous_wild.harness.result_file import (
     CONFIG,
     FAILED,
+    IGNORED,
     RESULT,
     RunConfig,
     artefact_hashes,

@@ -19,6 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.measures import MASK_LABELS, ImageRow, MetricRecord, measure, register_columns
 from ambiguous_wild.io.files import sha256_file, unique_keys, write_json
@@ -56,6 +57,15 @@ def mask_scores(result: RunResult) -> dict[str, float]:
     """Return the mask scores that a result has, by the keys of `MASK_LABELS`."""
     scores = result["masks"] or {}
     return {k: v for k, v in scores.items() if k in MASK_LABELS and isinstance(v, float | int)}
+
+
+# Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
+# values that are not finite (the result says so where there were any), where the scene lies.
+IGNORED: dict[str, tuple[str, ...]] = {
+    "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
+    "scene": ("path",),
+    "start": ("path",),
+}
 
 
 class MaskScores(TypedDict, total=False):
@@ -247,6 +257,22 @@ def read_result(path: Path | str) -> RunResult:
     return _checked(data, str(path))
 
 
+def config_identity(config: RunConfig | Mapping[str, Any]) -> str:
+    """Return the sha256 of the settings that decide a run's result.
+
+    Args:
+        config: the resolved configuration, as in config.yaml; its own "config_hash" is ignored.
+
+    Raises:
+        ValueError: a number in it is not finite.
+        TypeError: a value in it has no form in JSON.
+    """
+    settings: Options = {k: v for k, v in config.items() if k != "config_hash"}
+    for part in IGNORED.keys() & settings.keys():
+        settings[part] = {k: v for k, v in settings[part].items() if k not in IGNORED[part]}
+    return config_hash(settings)
+
+
 def artefact_hashes(run: Path, rows: Sequence[ImageRow]) -> dict[str, str | dict[str, str]]:
     """Return the hashes of a run's model and renders, as metrics.json keeps them."""
     model = {"model_sha256": sha256_file(run / MODEL)} if (run / MODEL).is_file() else {}
@@ -266,11 +292,8 @@ def check_render(run: Path, result: RunResult, name: str) -> Path:
     path = render_path(run, name)
     if not path.is_file():
         raise AwError(f"{run} lacks its render {path.relative_to(run)}: {RESTORE}")
-    measured = result.get("render_sha256", {}).get(name)  # earlier versions kept no hash
-    if measured is not None and sha256_file(path) != measured:
-        raise AwError(
-            f"{path} is not the render that was measured (another hash than in {RESULT}): {RESTORE}"
-        )
+    if sha256_file(path) != result.get("render_sha256", {}).get(name):
+        raise AwError(f"{path} is not the render that was measured (not the hash in {RESULT}): {RESTORE}")
     return path
 
 
@@ -286,9 +309,10 @@ def check_whole(run: Path, result: RunResult) -> None:
 
 
 def check_model(run: Path, result: RunResult) -> None:
-    """Raise AwError if the run's model is not the one that was measured; earlier versions kept no hash."""
-    measured = result.get("model_sha256")
-    if measured is not None and not ((run / MODEL).is_file() and sha256_file(run / MODEL) == measured):
+    """Raise AwError if the run's model is not the one that was measured; a program may keep none."""
+    if "model_sha256" not in result and not (run / MODEL).is_file():
+        return
+    if not (run / MODEL).is_file() or sha256_file(run / MODEL) != result.get("model_sha256"):
         raise AwError(
             f"{run / MODEL} is not the model that was measured (another hash than in {RESULT}): {RESTORE}"
         )

@@ -16,15 +16,17 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.command_lines import length_text
-from ambiguous_wild.harness.measures import FAMILIES, MASK_LABELS, MEASURES, Metric, measure, users_metrics
+from ambiguous_wild.harness.measures import MASK_LABELS, MEASURES, Metric, measure, users_metrics
 from ambiguous_wild.harness.result_file import (
     CONFIG,
     FAILED,
+    MODEL,
     RESULT,
     Environment,
     Options,
     RunFacts,
     RunResult,
+    config_identity,
     mask_scores,
     metrics_of,
     read_result,
@@ -32,6 +34,7 @@ from ambiguous_wild.harness.result_file import (
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
+from ambiguous_wild.io.ply import splat_count
 
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
@@ -104,6 +107,10 @@ def read_runs(*folders: Path | str) -> Runs:
             result["method"] = labels.get(result["method"], result["method"])
             results.append((run, result))
         incomplete += [replace(run, method=labels.get(run.method, run.method)) for run in begun]
+    starts: dict[str, str] = {}  # hash of a file -> its first name: the same file may have several
+    for _, result in results:
+        if hashed := start_hash(result["facts"]):
+            result["facts"]["start"] = starts.setdefault(hashed, str(result["facts"]["start"]))
     return Runs(
         images=_frame(_image_rows(results), ["scene", "method", "seed", "image", "metric", "value"]),
         runs=_frame(
@@ -143,8 +150,11 @@ def checked_result(run: Path) -> RunResult:
     if path is None:
         raise AwError(f"no {RESULT}: still running, or stopped; run the same command again to finish it")
     result = read_result(path)
-    for contradiction in contradictions(read_config(run), result):
+    config = read_config(run)
+    for contradiction in (*contradictions(config, result), *cost_contradictions(run, result, config)):
         raise AwError(f"{run} was changed: {contradiction}")
+    if "config_hash" in config and config["config_hash"] != config_identity(config):
+        raise AwError(f"{run} was changed: {CONFIG} has another hash than it states")
     for what, value, why in impossible_values(result):
         raise AwError(f"{path} was changed: {what} is {value:g}, but such a number {why}")
     return result
@@ -162,10 +172,31 @@ def contradictions(config: ReadConfig, result: RunResult) -> Iterator[str]:
         "options": (config.get("options"), result["options"]),
         "version": (config.get("version"), result["version"]),
         "protocol": (config.get("protocol"), facts.get("protocol", "full")),
+        "hash of the settings": (config.get("config_hash"), result["config_hash"]),
+        "start": (str(section(config, "start").get("sha256", ""))[:8] or None, start_hash(facts)),
     }
+    if config.get("effects"):
+        pairs["effects"] = config["effects"], facts.get("effects")
     for what, (asked, got) in pairs.items():
         if asked is not None and asked != got:
             yield f"{what} is {str(asked)[:40]!a} in {CONFIG} and {str(got)[:40]!a} in {RESULT}"
+
+
+def start_hash(facts: RunFacts) -> str:
+    """Return the first digits of the hash of the file that a run started from; "" for the scene's points."""
+    return str(facts.get("start", "")).rpartition("(")[2].rstrip(")")
+
+
+def cost_contradictions(run: Path, result: RunResult, config: ReadConfig) -> Iterator[str]:
+    """Yield in what costs differ from the model and the settings of the run; times are believed."""
+    cost, train = result["cost"], section(config, "train")
+    if result["status"] != "ok" or config.get("source"):  # a program of its own may write other files
+        return
+    if "gaussians" in cost and (run / MODEL).is_file() and cost["gaussians"] != splat_count(run / MODEL):
+        yield f"{RESULT} has {cost['gaussians']} Gaussians, {MODEL} {splat_count(run / MODEL)}"
+    steps, asked = cost.get("iterations"), train.get("iterations")
+    if steps is not None and isinstance(asked, int) and not train.get("budget_s") and steps < asked:
+        yield f"{RESULT} has {steps} iterations, {CONFIG} asks for {asked}"
 
 
 def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
@@ -341,7 +372,7 @@ def metric_functions(result: RunResult) -> dict[str, str]:
     """Return the identity of each metric that is not of this package: of its file, and what it claims."""
     records = result.get("metrics", {})
     measured = {key for row in result["per_image"] for key in metrics_of(row)} - MEASURES.keys()
-    unknown = {k: f"unknown {result['config_hash']}" for k in measured if k.partition("_")[0] not in FAMILIES}
+    unknown = dict.fromkeys(measured, f"unknown {result['config_hash']}")
     return unknown | {key: f"{r['source']} {r['better']}" for key, r in records.items()}
 
 
@@ -363,6 +394,8 @@ def _training(config: ReadConfig) -> str:
     """Return the other settings of training that config.yaml holds, as text."""
     own = (*BOOKKEEPING, "torch_threads")
     settings = sorted((key, value) for key, value in section(config, "train").items() if key not in own)
+    if not settings:
+        return "not recorded"
     return ", ".join(f"{key} {'auto' if value is None else value}" for key, value in settings)
 
 

@@ -7,34 +7,38 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn, cast
+from typing import NoReturn, cast
 
 import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.cell import config_identity
 from ambiguous_wild.harness.cell_run import EFFECTS, ENVIRONMENT
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.measures import ImageRow, Metric, measure, measure_images, metrics
 from ambiguous_wild.harness.result_file import (
-    CONFIG,
     FAILED,
     MODEL,
     RESULT,
     RunConfig,
     RunResult,
     check_model,
+    config_identity,
     mask_scores,
     mean_of,
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.store import contradictions, impossible_values, metric_functions, read_config
+from ambiguous_wild.harness.store import (
+    contradictions,
+    cost_contradictions,
+    impossible_values,
+    metric_functions,
+    read_config,
+)
 from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.images import read_png_rgb
-from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.report.board import ALONE, COST, FIRST, LAST, Entry, check_text
 from ambiguous_wild.report.board_reproduce import (
     Scenes,
@@ -88,7 +92,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
         )
     _check_values(run, result, photos=scene is not None)
     if not config["source"]:
-        _check_costs(run, result, dict(config["train"]))
+        _check_costs(run, result, config)
     if scene is not None:
         half = config.get("protocol", "full") == "half"
         check_photos(run, scene, result["per_image"], renders, half=half, quick=quick)
@@ -261,17 +265,12 @@ def _check_values(run: Path, result: RunResult, *, photos: bool) -> None:
                 _impossible(run, f"{metric} of {row['name']}", value, why)
 
 
-def _check_costs(run: Path, result: RunResult, train: Mapping[str, Any]) -> None:
+def _check_costs(run: Path, result: RunResult, config: RunConfig) -> None:
     """Compare costs with the model, the settings and each other; what is left of times is believed."""
+    for contradiction in cost_contradictions(run, result, dict(config)):
+        _changed(run, contradiction)
     cost = result["cost"]
-    if "gaussians" in cost and cost["gaussians"] != splat_count(run / MODEL):
-        _changed(run, f"{RESULT} has {cost['gaussians']} Gaussians, {MODEL} {splat_count(run / MODEL)}")
-    steps, asked = cost.get("iterations"), train.get("iterations")
-    if steps is not None and isinstance(asked, int) and not train.get("budget_s") and steps < asked:
-        _changed(run, f"{RESULT} has {steps} iterations, {CONFIG} asks for {asked}")
-    train_s, ms = cost.get("train_s"), cost.get("ms_per_iteration")
-    if train_s is not None and ms is None:
-        _partial(run, f"{RESULT} has train_s but no ms_per_iteration, which every training measures")
+    steps, train_s, ms = cost.get("iterations"), cost.get("train_s"), cost.get("ms_per_iteration")
     if steps is not None and train_s is not None and ms is not None:
         taken = steps * ms / 1000
         if not math.isclose(train_s, taken, rel_tol=0.01):
@@ -279,6 +278,8 @@ def _check_costs(run: Path, result: RunResult, train: Mapping[str, Any]) -> None
     fps = [cost[key] for key in ("fps_low", "fps", "fps_high") if cost.get(key) is not None]
     if fps != sorted(fps):
         _changed(run, f"{RESULT} has fps_low, fps and fps_high out of order: {shortlist(map(str, fps))}")
+    if train_s is not None and ms is None:
+        _partial(run, f"{RESULT} has train_s but no ms_per_iteration, which every training measures")
 
 
 def _impossible(run: Path, what: str, value: float, why: str) -> NoReturn:

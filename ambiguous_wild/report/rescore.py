@@ -14,12 +14,13 @@ from typing import Literal, cast
 from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.cell import code_hash, config_identity
+from ambiguous_wild.harness.cell import code_hash
 from ambiguous_wild.harness.evaluate import kernel_threads
 from ambiguous_wild.harness.measures import ImageRow, Metric, measure_images, metrics, records
 from ambiguous_wild.harness.result_file import (
     RESULT,
     RunResult,
+    config_identity,
     metrics_of,
     read_result,
     write_result,

@@ -11,6 +11,7 @@ import pytest
 
 from ambiguous_wild.builder import stages
 from ambiguous_wild.builder.pipeline import build_scene
+from ambiguous_wild.builder.pose_hypothesis import TWO_POSES
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
@@ -26,8 +27,12 @@ def attempts(
     photos: int,
     reliable: dict[str, int] | None = None,
     part: int = 1,
+    two_poses: tuple[str, ...] = (),
 ) -> tuple[list[str], Any]:
-    """The plans that were tried, and what was chosen, where each registers so many photos."""
+    """The plans that were tried, and what was chosen, where each registers so many photos.
+
+    Those in `two_poses` leave a photo out to which covisible photos give two poses.
+    """
     tried: list[str] = []
 
     def attempt(
@@ -40,6 +45,7 @@ def attempts(
         model = {"images": registered[plan.name], "points": 9999} if registered[plan.name] else None
         components = [["p.jpg"] * registered[plan.name]]
         facts = {"model": model, "plan": plan.name, "fixed": [], "components": components}
+        facts["left_out"] = {"p.jpg": f"{TWO_POSES}: ..."} if plan.name in two_poses else {}
         facts["reliable"] = (reliable or registered)[plan.name]
         part = SimpleNamespace(folder=Path("nowhere"), facts=facts)
         return SfmStages(part, part, part)
@@ -53,6 +59,13 @@ def attempts(
 
 def test_fast_is_enough_where_it_places_everything(monkeypatch):
     assert attempts(monkeypatch, {"fast": 30, "wider": 30}, 30) == (["fast"], "fast")
+
+
+def test_a_path_that_does_not_close_is_mapped_again(monkeypatch):
+    registered = {"fast": 29, "thorough": 30}
+    assert attempts(monkeypatch, registered, 30) == (["fast"], "fast")
+    tried, chosen = attempts(monkeypatch, registered, 30, two_poses=("fast",))
+    assert (tried[-1], chosen) == ("thorough", "thorough")
 
 
 def test_a_part_that_does_not_exist_is_refused(monkeypatch):

@@ -16,8 +16,8 @@ from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.leaderboard import command
 from ambiguous_wild.core.config import config_hash
-from ambiguous_wild.harness.cell import config_identity, scene_identity
-from ambiguous_wild.harness.result_file import write_result
+from ambiguous_wild.harness.cell import scene_identity
+from ambiguous_wild.harness.result_file import artefact_hashes, config_identity, write_result
 from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
@@ -115,7 +115,7 @@ def write_run(
         "schema": 1, "method": method, "scene": opened.name, "seed": seed, "status": "ok", "error": None,
         "options": config["options"], "per_image": rows,
         "missing": {"lpips_alex": "weights missing"}, "masks": masks,
-        "facts": {"protocol": more["protocol"]} if "protocol" in more else {},
+        "facts": {key: more[key] for key in ("protocol", "effects") if key in more},
         "cost": {
             "train_s": (train_s := train_s * rng.uniform(0.95, 1.05)), "iterations": iterations,
             "ms_per_iteration": 1e3 * train_s / max(iterations, 1), "gaussians": 1000 + seed,
@@ -134,7 +134,7 @@ def write_run(
             keep = np.full((view.camera.height, view.camera.width), 255, np.uint8)
             keep[: view.camera.height // 4] = 0
             cv2.imwrite(str((run / "masks" / view.name).with_suffix(".png")), keep)
-    write_result(run / "metrics.json", result)
+    write_result(run / "metrics.json", result | artefact_hashes(run, rows))
     return run
 
 

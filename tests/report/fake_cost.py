@@ -51,6 +51,8 @@ def cost_run(
         if timing is not None:
             seconds = train_s if reference_s is None else reference_s
             result["cost"] |= {"timing": timing, "reference_s": seconds}
+    if effects:
+        result["facts"]["effects"] = list(effects)
     write_result(folder / ("failed.json" if result["status"] == "failed" else "metrics.json"), result)
     config = {
         "method": method,

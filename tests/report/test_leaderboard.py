@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cell import config_identity
+from ambiguous_wild.harness.result_file import config_identity
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.report.board import board_csv, guard, read_board, read_csv, unguard, unique_slug
 from ambiguous_wild.report.board_edit import check
@@ -89,6 +89,11 @@ def change_train(run: Path, *, hashed: bool, **values: int) -> None:
     change_config(run, lambda config: config["train"].update(values), hashed=hashed)
 
 
+def add_effect(run: Path) -> None:
+    change_config(run, lambda c: c.update(effects=["dense"]), hashed=True)
+    change_result(run, lambda r: r["facts"].update(effects=["dense"]))
+
+
 def repaint(run: Path) -> None:
     path = run / "renders" / "test" / "test_0.png"
     image = read_png_rgb(path)
@@ -125,7 +130,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "image unlisted": (lambda r: change_result(r, lambda d: d["per_image"].pop()), "test_1.png was rendered"),
     "image dropped": (drop_image, "is partial: 1 images were measured"),
     "render damaged": (lambda r: (r / "renders/test/test_0.png").write_bytes(b"x"), "test_0.png"),
-    "model": (lambda r: (r / "point_cloud.ply").write_bytes(b"p"), "the size of point_cloud.ply differs"),
+    "model": (lambda r: (r / "point_cloud.ply").write_bytes(b"p"), "is not the model that was measured"),
     "no environment": (lambda r: (r / "env.json").unlink(), "it lacks env.json"),
     "config": (lambda r: change_train(r, hashed=False, iterations=9), "hashes to"),
     "seed": (lambda r: change_train(r, hashed=True, seed=4), "seed is '4'"),
@@ -137,7 +142,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "unfinished": (lambda r: (r / "metrics.json").unlink(), "has no metrics.json"),
     "pace gone": (lambda r: change_cost(r, ms_per_iteration=None), "train_s but no ms_per_iteration"),
     "fps": (lambda r: change_cost(r, fps=9e9, fps_low=20, fps_high=2089), "of order: 20, 9000000000.0, 2089"),
-    "no effects.json": (lambda r: change_config(r, lambda c: c.update(effects=["dense"]), hashed=True),
+    "no effects.json": (add_effect,
                         "partial: it lacks effects.json"),
     "not JSON": (lambda r: (r / "metrics.json").write_text("{"), "is damaged"),
 }  # fmt: skip

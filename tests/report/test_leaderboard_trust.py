@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.cell import config_identity
 from ambiguous_wild.harness.measures import measure_images, metrics
+from ambiguous_wild.harness.result_file import config_identity
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import lpips

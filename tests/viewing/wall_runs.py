@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
@@ -40,7 +41,10 @@ def write_shown_run(
     write_splat_ply(ply, wall_model(count, seed))
     run = write_run(root, scene, method, seed, size_b=ply.stat().st_size, **more)
     ply.replace(run / "point_cloud.ply")
-    change_result(run, lambda result: result["cost"].update(gaussians=count))
+    digest = sha256_file(run / "point_cloud.ply")
+    change_result(
+        run, lambda result: result["cost"].update(gaussians=count) or result.update(model_sha256=digest)
+    )
     for name in TRAIN[:2]:
         keep = np.full((HEIGHT, WIDTH), 255, np.uint8)
         keep[14:26, 14:26] = 0

@@ -18,6 +18,7 @@ from ambiguous_wild.cli.options import (
     only_option,
 )
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.names import plain
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.cost_runs import CostRuns
@@ -92,7 +93,7 @@ def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> 
     from ambiguous_wild.report.cost_recommend import in_words, recommend, speed_here
 
     seconds = parse_budget(budget)
-    opened = load_scene(scene, verify="quick")
+    opened = load_scene(scene)
     speed = speed_here(cost_runs) if cost_runs.reference else 1.0
     advice = recommend(cost_runs.runs, opened.name, seconds, speed=speed, scene_hash=scene_identity(opened))
     if not cost_runs.reference:
@@ -101,4 +102,4 @@ def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> 
         facts = dataclasses.asdict(advice) | {"command": advice.command(str(scene))}
         click.echo(json.dumps(encoded(facts), indent=2))
     else:
-        click.echo(in_words(advice, str(scene)), nl=False)
+        click.echo("\n".join(map(plain, in_words(advice, str(scene)).splitlines())))

@@ -11,6 +11,7 @@ import click
 
 from ambiguous_wild.cli.options import PathName, prepare_cpu, say, threads_option
 from ambiguous_wild.core.errors import AwError, counted
+from ambiguous_wild.io.files import own_json
 
 METHODS = ("3dgs", "refinesplat")
 IN_3DGS = 1 + 1.2  # an iteration of 3dgs and one of refinesplat, in iterations of 3dgs (docs/refinesplat.md)
@@ -66,6 +67,9 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
             ) from None
 
     if video:
+        record = own_json(photos / "capture.json").get("source")
+        if record is not None and Path(str(record)).name != source.name:
+            raise AwError(f"{photos} holds frames of {record}, not of {source}: choose another -o")
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
     if not (scene / "scene.json").exists():
         step("screen", photos, *cores)

@@ -169,6 +169,9 @@ def register(metric: Metric) -> Metric:
         raise AwError(f"{metric.key[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
     if metric.key in MEASURES:
         raise AwError(f"metric {metric.key!r} is built in: give yours another key")
+    other = own_metrics.get(metric.key)
+    if other is not None and other.function and other.source != metric.source and metric.source:
+        raise AwError(f"two files hold a metric {metric.key!r}: give one of them another key")
     for field, value, right, form in (
         ("better", metric.better, metric.better in get_args(Better), "'higher', 'lower' or None"),
         ("digits", metric.digits, type(metric.digits) is int and metric.digits >= 0, "a whole number"),

@@ -97,7 +97,13 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
     except (KeyError, TypeError, RuntimeError) as error:
         what = str(error).splitlines()[0]
         raise AwError(f"{run} cannot be opened: its config.yaml is damaged (at {what})") from None
-    entry = get_method(method)
+    try:
+        entry = get_method(method)
+    except AwError:
+        raise AwError(
+            f"{run} was trained by {method}, not a method of this package, and code is not loaded from a "
+            "run's record; in Python, registry.load_reference('FILE.py:NAME') loads it"
+        ) from None
     if entry.passes > 1:
         raise AwError(
             f"{run} was trained twice, the second time with the masks in {run / 'masks'}: look there"

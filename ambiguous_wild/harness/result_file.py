@@ -32,6 +32,13 @@ Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
 Options = dict[str, Any]  # plain values of a method's options: every method has its own keys
 RunFacts = dict[str, Any]  # of a run; beside the keys of `Cell.result`, methods and effects add their own
+# Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
+# values that are not finite (the result says so where there were any), where the scene lies.
+IGNORED: dict[str, tuple[str, ...]] = {
+    "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
+    "scene": ("path",),
+    "start": ("path",),
+}
 SCHEMA = 1
 RESULT = "metrics.json"
 FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
@@ -57,15 +64,6 @@ def mask_scores(result: RunResult) -> dict[str, float]:
     """Return the mask scores that a result has, by the keys of `MASK_LABELS`."""
     scores = result["masks"] or {}
     return {k: v for k, v in scores.items() if k in MASK_LABELS and isinstance(v, float | int)}
-
-
-# Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
-# values that are not finite (the result says so where there were any), where the scene lies.
-IGNORED: dict[str, tuple[str, ...]] = {
-    "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
-    "scene": ("path",),
-    "start": ("path",),
-}
 
 
 class MaskScores(TypedDict, total=False):

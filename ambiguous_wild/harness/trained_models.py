@@ -216,8 +216,10 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         chosen = from_plain(type(entry.options()), section(config, "options"), "options")
         hooks = entry.build(chosen)
     except AwError:
-        advice = "it is drawn as plain 3DGS; if it is a method of yours, name its file with --plugin"
-        return RenderSettings(), f"{name} is an unknown method: {advice}"
+        advice = "if it is a method of yours, name its file with --plugin"
+        return RenderSettings(), f"{name} is an unknown method and drawn as plain 3DGS: {advice}"
+    if entry.source_hash != str(config.get("source", "")):
+        return RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"
     antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
     behind = section(config, "scene").get("background", hooks.background)
     red, green, blue = (float(value) for value in behind)

@@ -37,6 +37,14 @@ def _harmonics(rest: int) -> list[str]:
     return [f"SH_DEGREE_{d}_COEF_{c}" for d in range(1, degree + 1) for c in range(2 * d + 1)]
 
 
+_DRAWN = {  # how the Gaussians of our files are to be drawn
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "sortingMethod": "cameraDistance",
+    "projection": "perspective",
+}
+
+
 def encode_gltf(
     gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
 ) -> list[bytes]:
@@ -78,13 +86,7 @@ def encode_gltf(
         parts.append(np.ascontiguousarray(data).tobytes())
         offset += data.nbytes  # every row has a multiple of 4 bytes, so views stay aligned
     body = b"".join(parts)
-    extension = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "sortingMethod": "cameraDistance",
-        "projection": "perspective",
-    }
-    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: extension}}
+    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _DRAWN}}
     extras = {"extras": transform_record(transform)} if transform != UNMOVED else {}
     head = {
         "asset": {"version": "2.0", "generator": "ambiguous_wild", **extras},
@@ -125,6 +127,11 @@ def _changed(head: dict[str, Any], transform: SceneTransform) -> str:
     found = {
         "nodes": head["nodes"] != [_node(transform)],
         "second mesh": len(primitives) > 1,
+        "kernel, colours, order or projection": primitives[0].get("extensions", {}).get(EXTENSION) != _DRAWN,
+        "kind of primitive": primitives[0].get("mode") != _POINTS,
+        "required extension": bool(set(head.get("extensionsRequired", ())) - {EXTENSION}),
+        "scene": (head.get("scene"), head.get("scenes")) != (0, [{"nodes": [0]}]),
+        "counts of rows": len({accessor["count"] for accessor in used}) > 1,
         "external buffer": any("uri" in buffer for buffer in head["buffers"]) or len(head["buffers"]) > 1,
         "stride of rows": any("byteStride" in view for view in views),
         "types of numbers": any(

@@ -7,6 +7,7 @@ nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see ne
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib.metadata
 import importlib.util
@@ -49,6 +50,8 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
     if not path.is_file():
         raise AwError(f"no plugin file {path}: give the path of a .py file")
     name = f"aw_plugin_{path.stem}"
+    if name in sys.modules and getattr(sys.modules[name], "__file__", None) != str(path):
+        name += f"_{config_hash(str(path.resolve()))[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise AwError(f"plugin {path} is no Python file: its name must end in .py")
@@ -56,8 +59,9 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
     sys.modules[name] = module
     _loaded.add(str(spec.origin))
     folder = path.resolve().parent
-    # helpers are imported anew: they may have been edited, and the hash needs those of this file
-    for helper in [name for name, file in _helpers.items() if file.is_relative_to(folder)]:
+    # helpers are imported anew: they may have been edited, another file's may have the same name, and the
+    # hash needs those of this file
+    for helper in list(_helpers):
         del _helpers[helper]
         sys.modules.pop(helper, None)
     before = set(sys.modules)
@@ -76,9 +80,31 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
         files = {new: _file_of(new) for new in sys.modules.keys() - before}
         own = {new: file for new, file in files.items() if file and file.is_relative_to(folder)}
         _helpers.update(own)
+    own |= {str(file): file for file in _imported_later(path.resolve(), folder)}
     each = {file.relative_to(folder).as_posix(): sha256_file(file) for file in own.values()}
     digest = sha256_file(path)
     return module, config_hash({**each, "": digest}) if each else digest
+
+
+def _imported_later(path: Path, folder: Path) -> set[Path]:
+    """Return the files below a folder that a file, or one of these, names in an import, also in functions."""
+    found: set[Path] = set()
+    waiting = [path]
+    while waiting:
+        try:
+            tree = ast.parse(waiting.pop().read_bytes())
+        except (SyntaxError, ValueError):
+            continue
+        names = {
+            alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names
+        }
+        names |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
+        for place in (folder.joinpath(*name.split(".")) for name in names):
+            for file in (place.with_suffix(".py"), place / "__init__.py"):
+                if file.is_file() and file != path and file not in found:
+                    found.add(file)
+                    waiting.append(file)
+    return found
 
 
 def _file_of(name: str) -> Path | None:

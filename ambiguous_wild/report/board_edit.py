@@ -176,6 +176,11 @@ def _conflicts(
             o.entry for o in passed if o.entry.method == e.method
         ]
         edited = [o for o in of_method if o.source != e.source]
+        of_setting = [
+            o for o in of_method if (o.scene, o.setting, o.options) == (e.scene, e.setting, e.options)
+        ]
+        devices = [o for o in of_setting if o.device.partition(":")[0] != e.device.partition(":")[0]]
+        planned = [o for o in passed if o.effects != v.effects and replace(o.entry, seed=e.seed).key == e.key]
         measures = list(_other_functions(e, fixed, [o.entry for o in passed]))
         if len(scenes) > 1 and e.scene_hash != board_hashes.get((e.dataset, e.scene)):
             reason = (
@@ -195,6 +200,15 @@ def _conflicts(
             reason = (
                 f"{v.run}: the file of {e.method!a} differs from that of {edited[0].name}, so they cannot be "
                 "averaged or compared; give its version another name, or 'aw leaderboard remove' the other"
+            )
+        elif devices:
+            reason = (
+                f"{v.run}: it ran on {e.device!a}, {devices[0].name} on {devices[0].device!a}: leave one out"
+            )
+        elif planned:
+            reason = (
+                f"{v.run}: its plan chose other effects than that of {planned[0].run}, so they have no mean: "
+                "name the effects by --effects, or give one of them"
             )
         elif measures:
             key, other = measures[0]

@@ -13,6 +13,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.cell_run import EFFECTS, ENVIRONMENT
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.measures import ImageRow, Metric, measure, measure_images, metrics
@@ -67,6 +68,7 @@ class VerifiedRun:
     names: tuple[str, ...]  # of the test images
     psnr: Mapping[str, float]  # by image
     scene: Scene | None  # None: it is not on this machine
+    effects: tuple[str, ...] = ()
 
 
 def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
@@ -128,7 +130,7 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
     )
     scenes.check_name(run, entry)
     psnr = {row["name"]: _or_nan(row.get("psnr")) for row in result["per_image"]}
-    return VerifiedRun(entry, run, tuple(sorted(renders)), psnr, scene)
+    return VerifiedRun(entry, run, tuple(sorted(renders)), psnr, scene, tuple(config.get("effects") or ()))
 
 
 def _changed(run: Path, what: str) -> NoReturn:
@@ -146,7 +148,7 @@ def _result(run: Path) -> RunResult:
         )
     result = read_result(run / (RESULT if (run / RESULT).is_file() else FAILED))
     if result["status"] != "ok":
-        error = " ".join(str(result["error"]).split())[:120]
+        error = plain(" ".join(str(result["error"]).split())[:120])
         raise AwError(f"{run} failed ({error}); a failed run has no numbers: run it again")
     if result["seed"] < 0:
         raise AwError(f"{run / RESULT} has seed {result['seed']}; seeds count from 0")

@@ -24,7 +24,10 @@ from ambiguous_wild.report.cost_curves import Curve, curves_of, duration, scenes
 from ambiguous_wild.report.cost_runs import CostRun, CostRuns, why_unranked
 
 CLOSE_DB = 0.3  # a setting this near the best is marked as equally good
-_TAKEN = ("--method", "--effects", "--resolution", "--max-gaussians", "--set", "--plugin", "--device")
+_TAKEN = (  # options of a run's command that belong to its setting
+    "--method", "--effects", "--resolution", "--max-gaussians", "--set", "--plugin", "--device", "--start",
+    "--protocol", "--factor",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,10 @@ def recommend(
     usable = [
         run for run in runs if not run.error and math.isfinite(run.psnr) and not knows_truth(run.method)
     ]
+    if not usable and any(knows_truth(run.method) for run in runs):
+        raise AwError("all runs know the truth (references), which no capture has: add runs of a method")
+    if apart := sorted({run.apart for run in usable if run.apart}):
+        raise AwError(f"nothing can be recommended: {apart[0]}; give folders of comparable runs")
     alone = [run for run in usable if run.timing.verdict == "alone"]
     notes = []
     if len(alone) < len(usable):
@@ -93,7 +100,7 @@ def recommend(
         shortest = min((run.train_s for run in usable), default=math.nan)
         raise AwError(
             f"no run was trained within {reference:.0f} s (the shortest took {shortest:.0f} s): "
-            "give a longer --budget, or add runs with a shorter one: aw bench --budget 30s"
+            "ask for a longer time, or add runs with a shorter one: aw bench --budget 30s"
         )
     parts, rest = additive(values)
     if own and len(values) < 2:

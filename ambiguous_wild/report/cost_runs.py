@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,8 @@ class CostRun:
     kernel_reference_s: float = math.nan
     metric_functions: dict[str, str] = field(default_factory=dict)  # of users' metrics, by key
     scene_hash: str = ""
+    start: str = ""  # hash of the file that training started from; "" for the scene's points
+    factor: str = ""  # downsampling of the photos
     protocol: str = "full"
     reproduce: str = ""  # the command that makes it again; empty in results of earlier versions
     error: str = ""
@@ -143,16 +145,60 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
     runs = _without_mixed_metrics(runs, notes)
     for scene in sorted({run.scene for run in runs}):
         of = [run for run in runs if run.scene == scene and not run.error]
-        if len({(run.scene_hash, run.protocol, *sorted(run.images)) for run in of}) > 1:
-            apart = f"runs on {scene} differ in the scene's version, protocol or test images"
+        if differ := _differ(of):
+            apart = f"runs on {scene} differ in {' and '.join(differ)}"
             notes.append(f"not comparable: {apart}")
             runs = [replace(run, apart=apart) if run.scene == scene else run for run in runs]
+        notes += _unequal_methods(scene, of)
+    runs = _with_effects_of_plans(runs)
     reference = _all_calibrated(runs)
     if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
         notes.append(
             "times are wall seconds: some runs were not calibrated, or ran on another kind of device"
         )
     return CostRuns(tuple(map(_in_reference, runs) if reference else runs), tuple(notes), reference)
+
+
+def _differ(runs: Sequence[CostRun]) -> list[str]:
+    """Return in what runs on a scene differ that no setting of a method explains."""
+    values: dict[str, set[Hashable]] = {
+        "the scene's version": {run.scene_hash for run in runs},
+        "protocol": {run.protocol for run in runs},
+        "test images": {tuple(sorted(run.images)) for run in runs},
+        "downsampling": {run.factor for run in runs},
+        "start": {run.start for run in runs},
+    }
+    return [what for what, of in values.items() if len(of) > 1]
+
+
+def _unequal_methods(scene: str, runs: Sequence[CostRun]) -> list[str]:
+    """Return a note where no two methods have runs with the same effects, or the same limit of Gaussians."""
+    notes = []
+    for what, value in (
+        ("effects", lambda run: ", ".join(sorted(run.effects)) or "none"),
+        ("limits of Gaussians", lambda run: str(dict(run.options).get("max_gaussians", "auto"))),
+    ):
+        by_method = {method: {value(run) for run in of} for method, of in grouped(runs, _base).items()}
+        if len(by_method) > 1 and not set.intersection(*by_method.values()):
+            each = "; ".join(f"{method}: {', '.join(sorted(of))}" for method, of in by_method.items())
+            notes.append(f"methods on {scene} differ in their {what} ({each})")
+    return notes
+
+
+def _base(run: CostRun) -> str:
+    return run.base
+
+
+def _with_effects_of_plans(runs: list[CostRun]) -> list[CostRun]:
+    """Name the effects of runs where plans of one scene chose different ones: they are no seeds of a cell."""
+    planned = grouped((run for run in runs if run.asked == "auto"), lambda run: (run.method, run.scene))
+    mixed = {key for key, of in planned.items() if len({run.effects for run in of if not run.error}) > 1}
+    return [
+        replace(run, asked=", ".join(sorted(run.effects)) or "none")
+        if run.asked == "auto" and (run.method, run.scene) in mixed
+        else run
+        for run in runs
+    ]
 
 
 def _without_mixed_metrics(runs: list[CostRun], notes: list[str]) -> list[CostRun]:
@@ -225,6 +271,8 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         options=tuple(sorted((_options(result["options"]) | _settings(train)).items())),
         length=_length(train, cost),
         rest=config_hash(rest),
+        start=str(rest["start"] or ""),
+        factor=str(rest["factor"]),
         protocol=str(rest["protocol"]),
         psnr=psnr,
         images=images,

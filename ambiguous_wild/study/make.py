@@ -71,7 +71,7 @@ def scene_photos(folder: Path, *, outline: bool = True) -> list[PhotoQuestion]:
     Raises:
         AwError: there is no scene, or no photo with distractors.
     """
-    scene = load_scene(folder, verify="quick")
+    scene = load_scene(folder)
     questions = []
     for view in scene.train:
         mask = scene.root / "truth" / "distractor" / f"{_stem(view.name)}.png"

@@ -46,6 +46,9 @@ def test_a_video_is_captured_once(tmp_path: Path) -> None:
         assert _commands(done.stderr) == ["capture", "screen", "build-scene"]
         assert end in done.stdout + done.stderr
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["photos"]
+    (tmp_path / "dark.avi").rename(tmp_path / "other.avi")
+    done = aw("try", "other.avi", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 2 and "holds frames of dark.avi, not of other.avi" in done.stderr
 
 
 @pytest.mark.parametrize(("folder", "name"), [("statue/images", "statue"), ("statue/left", "left")])

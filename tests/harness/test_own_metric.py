@@ -108,6 +108,15 @@ def test_what_is_wrong_with_it_is_said_before_anything_is_trained(
     assert said in str(error.value) and not list((tmp_path / "runs").glob("**/config.yaml"))
 
 
+def test_two_files_with_one_key_are_refused(own: Path, tmp_path: Path) -> None:
+    load_metrics(own)
+    load_metrics(own)  # again, as in a notebook
+    other = tmp_path / "other.py"
+    other.write_text(own.read_text() + "# another one\n")
+    with pytest.raises(AwError, match="two files hold a metric"):
+        load_metrics(other)
+
+
 def test_an_installed_package_announces_it_as_an_entry_point(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -181,6 +182,31 @@ def test_numbers_that_no_measurement_gives_are_left_out_and_named(
     runs = read_runs(tmp_path)
     assert list(runs.runs["method"]) == ["3dgs"]
     assert "such a number" in runs.incomplete[0].reason and str(path) in runs.incomplete[0].reason
+
+
+@pytest.mark.parametrize(
+    ("config", "result", "why"),
+    [
+        ({"config_hash": "f" * 64}, {}, "hash of the settings"),
+        ({"effects": ["skybox"]}, {"facts": {"effects": []}}, "effects is"),
+        ({"start": {"sha256": "ab" * 32}}, {}, "start is"),
+        ({"train": {"iterations": 900}}, {}, "iterations, config.yaml asks for 900"),
+    ],
+)
+def test_results_that_contradict_their_settings_are_left_out(
+    config: dict[str, Any], result: dict[str, Any], why: str, tmp_path: Path
+) -> None:
+    save(tmp_path, fake_result("3dgs"), fake_result("b") | result)
+    (folder,) = (path.parent for path in tmp_path.rglob("b/seed0/metrics.json"))
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    runs = read_runs(tmp_path)
+    assert list(runs.runs["method"]) == ["3dgs"] and why in runs.incomplete[0].reason
+
+
+def test_one_start_under_two_names_is_one(tmp_path: Path) -> None:
+    starts = [{"facts": {"start": f"{name}.ply (0123abcd)"}} for name in "ab"]
+    save(tmp_path, *(fake_result("3dgs", seed=seed) | start for seed, start in enumerate(starts)))
+    assert set(read_runs(tmp_path).runs["start"]) == {"a.ply (0123abcd)"}
 
 
 def test_a_failed_run_counts_unless_it_was_finished_since(tmp_path: Path) -> None:

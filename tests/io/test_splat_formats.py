@@ -285,12 +285,21 @@ def test_gltf_follows_the_extension(tmp_path: Path) -> None:
     assert np.allclose(scale, np.exp(given["log_scales"]), rtol=1e-6)
 
 
+def drawn(head: dict) -> dict:
+    return head["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda head: head["nodes"][0].update(translation=[5, 0, 0]), "whose nodes"),
         (lambda head: head["nodes"].append({"mesh": 0}), "whose nodes"),
         (lambda head: head["buffers"][0].update(uri="other.bin"), "whose external buffer"),
+        (lambda head: drawn(head).update(colorSpace="lin_rec709_display"), "whose kernel, colours"),
+        (lambda head: head["meshes"][0]["primitives"][0].update(mode=4), "whose kind of primitive"),
+        (lambda head: head.update(extensionsRequired=["KHR_draco"]), "whose required extension"),
+        (lambda head: head["scenes"][0].update(nodes=[]), "whose scene"),
+        (lambda head: head["accessors"][1].update(count=5), "whose counts of rows"),
         (lambda head: head["bufferViews"][0].update(byteStride=24), "whose stride of rows"),
         (lambda head: head["accessors"][0].update(componentType=5123), "whose types of numbers"),
         (lambda head: head["accessors"][0].update(byteOffset=4), "whose offsets of columns"),

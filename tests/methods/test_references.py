@@ -104,10 +104,33 @@ def test_a_changed_helper_is_another_method(recipe, tmp_path, monkeypatch):
         hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
         import_file(tmp_path / "sibling.py")
         hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
-        assert sys.modules["aw_plugin_recipe"].degree == degree
+        loaded = [m for m in list(sys.modules.values()) if getattr(m, "__file__", None) == str(recipe)]
+        assert [module.degree for module in loaded] == [degree]
     (tmp_path / "lib/site-packages/bench_installed.py").write_text("degree = 1000\n")
     hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
     assert hashes[0] == hashes[1] != hashes[2] == hashes[3] == hashes[4] and alone not in hashes
+
+
+def test_a_helper_that_is_imported_in_a_function_belongs_to_the_hash(recipe, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    recipe.write_text(CODE + "\n\ndef later():\n    import late_helper\n    return late_helper\n")
+    hashes = []
+    for text in ("k = 1\n", "k = 100\n"):
+        (tmp_path / "late_helper.py").write_text(text)
+        hashes.append(registry.get_method(f"{recipe}:plain").source_hash)
+    assert hashes[0] != hashes[1]
+
+
+def test_two_files_have_a_helper_of_one_name(tmp_path):
+    code = "import os, sys\nsys.path.insert(0, os.path.dirname(__file__))\nfrom name_shared import k\n"
+    modules = {}
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "name_shared.py").write_text(f"k = {name!r}\n")
+        (tmp_path / name / "plug.py").write_text(code)
+        modules[name] = import_file(tmp_path / name / "plug.py")[0]
+    assert [module.k for module in modules.values()] == ["a", "b"]
+    assert len({module.__name__ for module in modules.values()}) == 2
 
 
 def test_hashes_do_not_depend_on_the_order_of_loading(recipe, tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,9 +29,11 @@ from ambiguous_wild.report.cost_curves import (
     times_to_reach,
 )
 from ambiguous_wild.report.cost_plots import draw_all, spread_out
+from ambiguous_wild.report.cost_recommend import recommend
 from ambiguous_wild.report.cost_report import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_runs import read_cost_runs
 from tests.harness.fake_runs import failed
+from tests.report.board_runs import change_result
 from tests.report.fake_cost import RISING, cost_run, curves, read, rising
 
 HOSTILE = "=cmd|$x_1$<script>\x1b[31m"
@@ -119,6 +122,27 @@ def test_runs_that_were_measured_differently_are_said(tmp_path: Path) -> None:
     assert (
         notes.count("not comparable") == 2 and "runs on one differ" in notes and "runs on two differ" in notes
     )
+
+
+def test_what_started_elsewhere_is_not_recommended(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", "yard", effects=("skybox",))
+    started = cost_run(tmp_path, "b", "yard")
+    config = yaml.safe_load((started / "config.yaml").read_text()) | {"start": {"sha256": "ab" * 32}}
+    (started / "config.yaml").write_text(yaml.safe_dump(config))
+    change_result(started, lambda result: result["facts"].update(start="s.ply (abababab)"))
+    runs = read(tmp_path)
+    notes = "\n".join(runs.notes)
+    assert "not comparable: runs on yard differ in start" in notes
+    assert "differ in their effects (a: skybox; b: none)" in notes
+    with pytest.raises(AwError, match="nothing can be recommended: runs on yard differ in start"):
+        recommend(runs.runs, "yard", 60.0)
+
+
+def test_plans_of_one_scene_that_differ_make_no_seeds(tmp_path: Path) -> None:
+    for seed, effects in enumerate([("skybox",), ("exposure",)]):
+        run = cost_run(tmp_path, "a", seed=seed, effects=effects)
+        (run / "effects.json").write_text('{"asked": "auto"}')
+    assert {run.asked for run in read(tmp_path).runs} == {"skybox", "exposure"}
 
 
 def test_an_effect_is_measured_on_pairs_that_differ_in_it_alone(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.splat_files import FORMATS
 
 if TYPE_CHECKING:
-    from ambiguous_wild.viewing.model import ExportedModel
+    from ambiguous_wild.viewing.model_export import ExportedModel
 
 MAX_GAUSSIANS = 150_000
 THIS_MACHINE = "127.0.0.1"
@@ -198,6 +198,13 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
     help="Turn the files so that this axis points up, with the floor at zero below the middle of the scene; "
     "always y in glTF.  [default: the scene's coordinates]",
 )  # fmt: skip
+@click.option("--clean", is_flag=True, help="Leave out Gaussians that no training photo needs (floaters).")
+@click.option(
+    "--no-skybox", "skybox", is_flag=True, flag_value=False, default=True, help="Leave out the skybox."
+)
+@click.option(
+    "--pad-harmonics", is_flag=True, help="Write harmonics of degree 3, padded by zeros: Unity, SIBR."
+)
 @click.option("--overwrite", is_flag=True, help="Replace existing files of the same names.")
 @click.option(
     "--loss/--no-loss", default=True, show_default=True, help="Render the test views to measure the loss."

@@ -181,7 +181,7 @@ def _measured_views(
 
 def _write_model(trainer: Trainer, path: Path) -> None:
     model = {k: v.cpu().numpy() for k, v in trainer.neutral_model().items()}
-    write_splat_ply(path, model, trainer.data.scene.transform)
+    write_splat_ply(path, model, trainer.data.scene.transform, trainer.hooks.antialias)
 
 
 def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto]) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
-from ambiguous_wild.io.ply import header_transform, transform_comments
+from ambiguous_wild.io.ply import header_antialias, header_transform, splat_comments
 from ambiguous_wild.io.splat_arrays import (
     SH_C0,
     Arrays,
@@ -39,7 +39,7 @@ _SQRT_2 = 2.0**0.5
 def encode_compressed_ply(
     gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
 ) -> list[bytes]:
-    """Return the parts of the file; the transform stands in comments. The format cannot say `antialias`."""
+    """Return the parts of the file; transform and `antialias` stand in comments."""
     n, rest = gaussians["sh_rest"].shape[:2]
     colour = gaussians["sh0"] * SH_C0 + 0.5
     position, position_bounds = _in_chunks(gaussians["means"])
@@ -52,7 +52,7 @@ def encode_compressed_ply(
     with_alpha = np.column_stack([tint, sigmoid(gaussians["opacity_logits"])])
     words = [_pack(position, _POSITION_BITS), rotation, _pack(scale, _POSITION_BITS)]
     packed = np.column_stack([*words, _pack(with_alpha, _COLOUR_BITS)]).astype("<u4")
-    header = ["ply", "format binary_little_endian 1.0", *transform_comments(transform)]
+    header = ["ply", "format binary_little_endian 1.0", *splat_comments(transform, antialias)]
     header += [f"element chunk {-(-n // _CHUNK)}"]
     header += [f"property float {name}" for name in _BOUNDS] + [f"element vertex {n}"]
     header += [f"property uint {name}" for name in _PACKED]
@@ -115,7 +115,7 @@ def decode_compressed_ply(data: bytes, path: Path | str) -> SplatFile:
         "sh0": ((colour - 0.5) / SH_C0).astype(np.float32),
         "sh_rest": (((codes.transpose(0, 2, 1) + 0.5) / 256.0 - 0.5) * 8.0).astype(np.float32),
     }
-    return SplatFile(arrays, header_transform(data, path))
+    return SplatFile(arrays, header_transform(data, path), header_antialias(data))
 
 
 def _in_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

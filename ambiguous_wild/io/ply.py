@@ -16,6 +16,7 @@ from ambiguous_wild.io.files import write_bytes
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, checked_transform
 from ambiguous_wild.io.untrusted import read_bytes
 
+RENDER_MODE = "SplatRenderMode"  # a comment of splat PLYs
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2",
@@ -34,7 +35,9 @@ def _columns(rest: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def write_splat_ply(path: Path | str, gaussians: Arrays, transform: SceneTransform = UNMOVED) -> None:
+def write_splat_ply(
+    path: Path | str, gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
+) -> None:
     """Write Gaussians atomically.
 
     If the scene was moved, the file has the units of the scene's files, and a comment in the header gives the
@@ -45,6 +48,8 @@ def write_splat_ply(path: Path | str, gaussians: Arrays, transform: SceneTransfo
         gaussians: raw parameters as `splat.Gaussians` holds them: means [N, 3], quats [N, 4] (w, x, y,
             z), log_scales [N, 3], opacity_logits [N], sh0 [N, 3], sh_rest [N, K, 3] with K of 0, 3, 8, 15.
         transform: transform of the scene that they were trained on, in whose inner coordinates they are.
+        antialias: Mip-Splatting's 2D filter draws them; said in the comment that nerfstudio, gsplat and Brush
+            read.
 
     Raises:
         AwError: an array is missing or has another shape.
@@ -59,13 +64,13 @@ def write_splat_ply(path: Path | str, gaussians: Arrays, transform: SceneTransfo
     rest = gaussians["sh_rest"]
     if rest.ndim != 3 or rest.shape[0] != n or rest.shape[1] not in (0, 3, 8, 15) or rest.shape[2] != 3:
         raise AwError(f"cannot write {path}: sh_rest is {list(rest.shape)}, not [{n}, 0|3|8|15, 3]")
-    write_bytes(path, encode_ply(gaussians, transform))
+    write_bytes(path, encode_ply(gaussians, transform, antialias))
 
 
 def encode_ply(
     gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
 ) -> list[bytes]:
-    """Return the parts of a splat PLY, see `write_splat_ply`. The format cannot say `antialias`."""
+    """Return the parts of a splat PLY, see `write_splat_ply`."""
     gaussians = rescaled(gaussians, 1 / transform.scale)
     n, rest = gaussians["sh_rest"].shape[:2]
     table = np.concatenate(
@@ -82,7 +87,8 @@ def encode_ply(
         dtype="<f4",
         casting="same_kind",
     )
-    header = ["ply", "format binary_little_endian 1.0", *transform_comments(transform), f"element vertex {n}"]
+    header = ["ply", "format binary_little_endian 1.0", *splat_comments(transform, antialias)]
+    header += [f"element vertex {n}"]
     header += [f"property float {name}" for name in _columns(rest)] + ["end_header", ""]
     return ["\n".join(header).encode("ascii"), table.tobytes()]
 
@@ -96,13 +102,21 @@ def rescaled(gaussians: Arrays, factor: float) -> Arrays:
     return {**gaussians, "means": (means * factor).astype(means.dtype), **sizes}
 
 
-def transform_comments(transform: SceneTransform) -> list[str]:
-    """Return header lines of a PLY that record the transform of its scene."""
+def splat_comments(transform: SceneTransform, antialias: bool) -> list[str]:
+    """Return header lines of a PLY that record its scene's transform and how its Gaussians are drawn."""
     values = {"offset": transform.centre, "training_scale": (transform.scale,), "rotation": transform.turn}
     if transform.turn == UNMOVED.turn:
         del values["rotation"]
     lines = [f"comment {name} {' '.join(map(repr, numbers))}" for name, numbers in values.items()]
-    return [] if transform == UNMOVED else lines
+    lines = [] if transform == UNMOVED else lines
+    return [*lines, f"comment {RENDER_MODE}: mip"] if antialias else lines
+
+
+def header_antialias(data: bytes) -> bool:
+    """Whether a PLY says that Mip-Splatting's 2D filter (opacity compensation) draws its Gaussians."""
+    head = data[:_MAX_HEADER].partition(b"\nend_header")[0]
+    mode = re.search(rb"^comment " + RENDER_MODE.encode() + rb": *(\w+)", head, re.MULTILINE)
+    return mode is not None and mode[1].lower() in (b"mip", b"antialiased")
 
 
 def read_transform(path: Path | str) -> SceneTransform:
@@ -172,7 +186,7 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
-    return SplatFile(dict(rescaled(arrays, transform.scale)), transform)
+    return SplatFile(dict(rescaled(arrays, transform.scale)), transform, header_antialias(data))
 
 
 def _floats(table: np.ndarray, names: Sequence[str], path: Path | str) -> np.ndarray:

@@ -43,7 +43,7 @@ _LOSSLESS = 101  # WebP quality above 100
 def encode_sog(
     gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
 ) -> list[bytes]:
-    """Return the file; the transform stands in meta.json. The format cannot say `antialias`.
+    """Return the file; transform and `antialias` stand in meta.json.
 
     Raises:
         AwError: more Gaussians than a texture holds.
@@ -69,6 +69,7 @@ def encode_sog(
         "version": 2,
         "asset": {"generator": "ambiguous_wild", **transform_record(transform)},
         "count": n,
+        "antialias": antialias,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
@@ -107,7 +108,8 @@ def decode_sog(data: bytes, path: Path | str) -> SplatFile:
             meta = json.loads(_member(archive, "meta.json"))
             if meta["version"] != 2:
                 raise AwError(f"{path} is SOG of version {meta['version']!r}; this reads version 2")
-            return SplatFile(_decode(archive, meta), transform_from(meta.get("asset")))
+            flag = meta.get("antialias") is True
+            return SplatFile(_decode(archive, meta), transform_from(meta.get("asset")), flag)
     except (
         zipfile.BadZipFile,
         zlib.error,

@@ -34,6 +34,7 @@ class SplatFormat:
     ordered: bool = True  # Gaussians are written in the order of a Morton curve
     # whether it holds the sizes of a scene whose unit is 1/x of the unit of training
     holds_units: Callable[[float], bool] = lambda scale: True
+    antialias: bool = False  # whether viewers find in it that Mip-Splatting's 2D filter draws the Gaussians
     y_up: bool = False  # y points up in every file, and a node of it states the transform
 
 
@@ -53,10 +54,19 @@ _ALL = (
         decode_spz,
         encode_spz,
         holds_units=lambda scale: False,
+        antialias=True,
     ),
-    SplatFormat("sog", ".sog", _magic(b"PK"), decode_sog, encode_sog, holds_units=lambda scale: scale >= 1),
+    SplatFormat(
+        "sog",
+        ".sog",
+        _magic(b"PK"),
+        decode_sog,
+        encode_sog,
+        holds_units=lambda scale: scale >= 1,
+        antialias=True,
+    ),
     SplatFormat("gltf", ".glb", _magic(b"glTF"), decode_gltf, encode_gltf, ordered=False, y_up=True),
-    SplatFormat("ply", ".ply", _magic(b"ply"), decode_ply, encode_ply, ordered=False),
+    SplatFormat("ply", ".ply", _magic(b"ply"), decode_ply, encode_ply, ordered=False, antialias=True),
 )
 FORMATS = {form.name: form for form in _ALL}
 

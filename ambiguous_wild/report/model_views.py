@@ -19,7 +19,8 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import ExportedModel, export, space_of
+from ambiguous_wild.viewing.model import space_of
+from ambiguous_wild.viewing.model_export import ExportedModel, ExportParts, export
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -49,6 +50,9 @@ def export_runs(
     threads: int | None = None,
     overwrite: bool = False,
     up: str | None = None,
+    clean: bool = False,
+    skybox: bool = True,
+    pad_harmonics: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[tuple[str, list[ExportedModel]]]:
     """Write the models of runs, and splat files, in other formats.
@@ -63,7 +67,10 @@ def export_runs(
         threads: threads of the kernels; None = all cores.
         overwrite: replace files of these names in `output`; those in RUN/export are always replaced.
         up: axis of the files that points up, see `viewing.model.export`; None = the scene's coordinates.
-        say: gets a line about each run that is left out.
+        clean: leave out Gaussians that no training photo needs, see `viewing.export_parts`.
+        skybox: write the skybox.
+        pad_harmonics: write harmonics of degree 3, padded with zeros.
+        say: gets a line about each run that is left out, and about parts of models that are.
 
     Returns:
         (label of the model, its files), in the order of the runs' paths.
@@ -98,19 +105,24 @@ def export_runs(
         run = homes[number] if number < len(trained) else None
         scene: Scene | None = None
         try:
-            if run is not None and (loss or up is not None):
+            if run is not None:
                 scene = open_scene(run, scene_folder)
             elif run is None and scene_folder is not None:
                 scene = load_scene(scene_folder)
                 model = model.within(scene.transform)
         except AwError as error:
-            if up is not None or run is None:
+            if up is not None or run is None or clean or not skybox:
                 raise
             say(f"{model.label}: the loss is not measured: {error}")
         space = None if up is None or scene is None else space_of(scene)
         views = scene.test if scene is not None and loss else ()
         stem = "point_cloud" if output is None and run is not None else name
-        done = export(model, folder, formats, views, name=stem, space=space, up=up)
+        parts = ExportParts(clean, skybox, pad_harmonics)
+        done, more = export(
+            model, folder, formats, views, name=stem, space=space, up=up, scene=scene, parts=parts
+        )
+        for note in more:
+            say(f"{model.label}: {note}")
         reports.append((model.label, done))
     return reports
 

@@ -1,25 +1,20 @@
-"""A trained model for viewing: how it is drawn, its scene's axes, its export in other formats."""
+"""A trained model for viewing: how it is drawn, its scene's axes."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, SceneTransform, View
-from ambiguous_wild.core.errors import unknown
+from ambiguous_wild.core import AwError, Camera, Scene, SceneTransform
 from ambiguous_wild.core.scene import together
-from ambiguous_wild.io.files import sweep_killed
-from ambiguous_wild.io.images import read_png_rgb, to_uint8
-from ambiguous_wild.io.ply import read_splat_ply, read_transform, rescaled, splat_count
-from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite
-from ambiguous_wild.io.splat_files import FORMATS, read_splats, write_splats
-from ambiguous_wild.io.untrusted import read_bytes
-from ambiguous_wild.metrics.image import psnr
+from ambiguous_wild.io.images import to_uint8
+from ambiguous_wild.io.ply import read_splat_ply, read_transform, splat_count
+from ambiguous_wild.io.splat_arrays import Arrays, SplatFile
+from ambiguous_wild.io.splat_files import read_splats
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.gaussians import Gaussians
@@ -232,109 +227,3 @@ def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:
     turn, _ = Rotation.align_vectors([AXES[axis]], [transform.rotation.T @ space.up])
     a, b, c, d = turn.as_quat().tolist()
     return SceneTransform((x, y, z), transform.scale, (d, a, b, c))
-
-
-@dataclass(frozen=True)
-class ExportedModel:
-    """An exported file. dB are means over the views; None = there was no view to measure on."""
-
-    format: str
-    path: Path
-    bytes: int
-    share: float  # of the size of `source`
-    gaussians: int  # number of finite Gaussians, which are written
-    psnr_to_model: float | None  # of its renders against the model's, dB; inf = equal pictures
-    psnr: float | None  # of its renders against the photos, dB
-    lost_db: float | None  # PSNR of the model minus `psnr`
-    transform: SceneTransform = (
-        UNMOVED  # of the file's coordinates; glTF that is not turned has the user's coordinates
-    )
-    source: str = "the PLY"  # file with whose size `share` compares
-
-
-def export(
-    model: ViewedModel,
-    folder: Path,
-    formats: Sequence[str],
-    views: Sequence[View] = (),
-    *,
-    name: str = "point_cloud",
-    space: Space | None = None,
-    up: str | None = None,
-) -> list[ExportedModel]:
-    """Write the formats into a folder, each atomically, read them back and measure them.
-
-    Files have the units of the scene's files if the format can hold them: SPZ's sizes and, for large units,
-    SOG's positions cannot. Each file records its `ExportedModel.transform`.
-
-    Args:
-        model: the model; its PLY is not changed.
-        folder: created if it does not exist.
-        formats: names of `io.splat_files.FORMATS`.
-        views: views to measure the loss on, usually the test views; none = only sizes.
-        name: name of the files, without extension.
-        space: of the scene, needed with `up`.
-        up: axis of `AXES` that points up in the files (always y in glTF), with the floor at zero; None =
-            the scene's coordinates.
-
-    Raises:
-        AwError: unknown format, a model that cannot be read, or nothing in it that is finite.
-    """
-    for wanted in formats:
-        if wanted not in FORMATS:
-            raise unknown("format", wanted, FORMATS)
-    gaussians: Arrays = model.read()
-    transform = model.transform
-    if not len(finite(gaussians)["means"]):
-        raise AwError(f"{model.ply} holds no Gaussian that is finite: there is nothing to export")
-    plain = model.ply.stat().st_size
-    photos = [read_png_rgb(view.image_path) for view in views]
-    before = _renders(gaussians, model.render_settings, views)
-    exported = []
-    for form in (FORMATS[wanted] for wanted in dict.fromkeys(formats)):
-        if up is not None and space is not None:
-            transform = upright(model, space, "y" if form.y_up else up)
-            gaussians = moved(model.read(), model.transform, transform)
-        path = folder / f"{name}{form.suffix}"
-        sweep_killed(path)
-        units = transform.scale if form.holds_units(transform.scale) else 1.0
-        left = replace(transform, scale=transform.scale / units)
-        count = write_splats(
-            form, path, rescaled(gaussians, 1 / units), left, model.render_settings.antialias
-        )
-        read_back = form.decode(read_bytes(path), path).gaussians
-        there = moved(rescaled(read_back, units), transform, model.transform)
-        after = _renders(there, model.render_settings, views)
-        old, new = _mean(before, photos), _mean(after, photos)
-        size = path.stat().st_size
-        exported.append(
-            ExportedModel(
-                format=form.name,
-                path=path,
-                bytes=size,
-                share=size / plain,
-                gaussians=count,
-                psnr_to_model=_mean(after, before),
-                psnr=new,
-                lost_db=None if old is None or new is None else old - new,
-                transform=UNMOVED if form.y_up and up is None else left,
-                source="the PLY" if model.ply.suffix == ".ply" else model.ply.name,
-            )
-        )
-    return exported
-
-
-def _renders(
-    gaussians: Mapping[str, np.ndarray], render_settings: RenderSettings, views: Sequence[View]
-) -> list[np.ndarray]:
-    if not views:
-        return []
-    renderer = Renderer(gaussians, render_settings)
-    return [renderer(view.camera) for view in views]
-
-
-def _mean(renders: Sequence[np.ndarray], photos: Sequence[np.ndarray]) -> float | None:
-    values = [psnr(render, photo) for render, photo in zip(renders, photos)]
-    if not values:
-        return None
-    return math.inf if math.inf in values else sum(values) / len(values)

@@ -18,7 +18,8 @@ from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.ply import read_point_ply, read_splat_ply, read_transform, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
-from ambiguous_wild.viewing.model import Renderer, ViewedModel, export, space_of
+from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
+from ambiguous_wild.viewing.model_export import export
 from ambiguous_wild.viewing.page_file import page_text
 from ambiguous_wild.viewing.video import from_file, orbit, through_views
 from tests.tiny_scene import write_tiny_scene
@@ -82,7 +83,7 @@ def test_a_scene_shows_and_exports_the_same_wherever_it_lies(
 
     # files and their metadata give the positions of the user's coordinates back
     true = wall["means"].astype(np.float64) * scale + shift
-    for made in export(model, tmp_path / "out", list(FORMATS), scene.test):
+    for made in export(model, tmp_path / "out", list(FORMATS), scene.test)[0]:
         assert made.psnr_to_model is not None and made.psnr_to_model > 35, made
         place = made.transform
         if made.format == "gltf":

@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ambiguous_wild.core import AwError
 from ambiguous_wild.io.ply import read_splat_ply, write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS, read_splats
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.viewing.model import Renderer, RenderSettings, ViewedModel, export
+from ambiguous_wild.viewing.model import Renderer, RenderSettings, ViewedModel, file_model
+from ambiguous_wild.viewing.model_export import ExportParts, export
 from tests.command_line import aw
 from tests.tiny_scene import write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run
@@ -46,7 +48,7 @@ def test_every_format_is_written_with_size_and_loss(run: Path, tmp_path: Path) -
 def test_the_loss_is_what_the_renders_say(run: Path, tmp_path: Path) -> None:
     scene = load_scene(run.parents[3] / "porch")
     model = ViewedModel("m", run / "point_cloud.ply", RenderSettings())
-    (found,) = export(model, tmp_path, ["spz"], scene.test)
+    ((found,), _) = export(model, tmp_path, ["spz"], scene.test)
     before, after = (
         Renderer(model.read(), RenderSettings()),
         Renderer(read_splats(found.path).gaussians, RenderSettings()),
@@ -93,8 +95,48 @@ def test_a_model_of_nothing_is_refused(tmp_path: Path) -> None:
 
 def test_models_with_a_filter_of_their_own_say_so(tmp_path: Path) -> None:
     write_splat_ply(tmp_path / "m.ply", wall_model(50))
-    (found,) = export(ViewedModel("m", tmp_path / "m.ply", RenderSettings(antialias=True)), tmp_path, ["spz"])
+    ((found,), _) = export(
+        ViewedModel("m", tmp_path / "m.ply", RenderSettings(antialias=True)), tmp_path, ["spz"]
+    )
     import gzip
 
     assert gzip.decompress(found.path.read_bytes())[14] == 1 and found.lost_db is None
     assert len(read_splat_ply(tmp_path / "m.ply")["means"]) == 50
+
+
+def test_the_filter_is_said_where_the_format_can_and_the_loss_is_a_strangers(
+    run: Path, tmp_path: Path
+) -> None:
+    scene = load_scene(run.parents[3] / "porch")
+    small = wall_model(2500)
+    small["log_scales"] -= 3.0  # below a pixel, where the filter shows
+    write_splat_ply(tmp_path / "m.ply", small, antialias=True)
+    model, _ = file_model(tmp_path / "m.ply")
+    assert model.render_settings.antialias
+    files, notes = export(model.within(scene.transform), tmp_path, list(FORMATS), scene.test)
+    for file in files:
+        held = FORMATS[file.format].antialias
+        assert read_splats(file.path).antialias == (file.format != "gltf")
+        assert (file.psnr_to_model > 35) == held
+        assert any(note.startswith(f"{file.format} cannot say") for note in notes) == (not held)
+
+
+def test_what_no_photo_needs_and_the_skybox_are_left_out(run: Path, tmp_path: Path) -> None:
+    scene = load_scene(run.parents[3] / "porch")
+    wall, far, hidden = wall_model(2500), wall_model(200, 1), wall_model(50, 2)
+    far["means"] = far["means"] / np.linalg.norm(far["means"], axis=1, keepdims=True) * 500
+    hidden["opacity_logits"][:] = -12.0
+    names = wall.keys()
+    both = {name: np.concatenate([part[name] for part in (wall, far, hidden)]) for name in names}
+    write_splat_ply(tmp_path / "m.ply", both)
+    model, _ = file_model(tmp_path / "m.ply")
+    counts = {}
+    for parts in (ExportParts(), ExportParts(skybox=False), ExportParts(clean=True, pad_harmonics=True)):
+        (file,), notes = export(model, tmp_path / "out", ["ply"], scene=scene, parts=parts)
+        counts[parts] = file.gaussians, "skybox" in " ".join(notes)
+    whole, inner, clean = counts.values()
+    assert whole == (2750, True) and inner == (2550, True)
+    assert 1000 < clean[0] <= 2700  # the transparent ones are looked at, and none needs them
+    assert read_splat_ply(tmp_path / "out" / "point_cloud.ply")["sh_rest"].shape[1:] == (15, 3)
+    with pytest.raises(AwError, match="need the scene"):
+        export(model, tmp_path / "out", ["ply"], parts=ExportParts(clean=True))

@@ -21,10 +21,10 @@ from ambiguous_wild.viewing.model import (
     Renderer,
     RenderSettings,
     ViewedModel,
-    export,
     moved,
     space_of,
 )
+from ambiguous_wild.viewing.model_export import export
 from tests.command_line import aw
 from tests.io.test_scene_transform import UTM
 from tests.io.test_scene_transform import moved as moved_scene
@@ -52,7 +52,7 @@ def test_our_exports_show_what_the_run_shows(
     inner["log_scales"] = wall["log_scales"] + np.float32(np.log(times))
     write_splat_ply(tmp_path / "m.ply", inner, scene.transform)
     model = ViewedModel("m", tmp_path / "m.ply")
-    (made,) = export(model, tmp_path / "out", [form], scene.test, name="x")
+    ((made,), _) = export(model, tmp_path / "out", [form], scene.test, name="x")
     shown = read_models([made.path], scene_folder=tmp_path / "scene")
     assert shown.scene.transform == scene.transform and [m.label for m in shown.models] == [made.path.name]
     camera = scene.test[0].camera
@@ -69,7 +69,7 @@ def test_an_upright_export_renders_the_same_from_turned_cameras(tmp_path: Path, 
     scene, wall = load_scene(write_tiny_scene(tmp_path / "scene")), lively(rest)
     write_splat_ply(tmp_path / "m.ply", wall)
     model, space = ViewedModel("m", tmp_path / "m.ply"), space_of(scene)
-    made = export(model, tmp_path, ["ply", "gltf", "spz"], scene.test, name="up", space=space, up=axis)
+    made, _ = export(model, tmp_path, ["ply", "gltf", "spz"], scene.test, name="up", space=space, up=axis)
     for file in made:
         assert file.psnr_to_model is not None and file.psnr_to_model > (35 if file.format == "spz" else 50)
         up = AXES["y" if file.format == "gltf" else axis]

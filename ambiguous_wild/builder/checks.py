@@ -32,6 +32,7 @@ from ambiguous_wild.builder.screen import (
     exposure_stops,
     near_duplicate_pairs,
     panorama_warnings,
+    photo_warnings,
     read_capture,
     zoomed_cameras,
 )
@@ -339,6 +340,8 @@ def check_capture(
         jobs=jobs,
         bar=bar,
     )
+    for line in photo_warnings(read.photos):
+        bar.say(line)
     photos, noises = read.photos, [level for level, _ in read.more]
     features = [found for _, found in read.more]
     compared = compare_photos(features, bar, jobs)

@@ -51,6 +51,7 @@ class ScreenedPhoto:
     mean_luma: float = 0.0  # of 255
     notes: Sequence[str] = ()  # what reading converted
     copies: Sequence[str] = ()  # files of the capture with the same bytes, left out
+    borders: Sequence[int] = (0, 0, 0, 0)  # px of one colour at the top, bottom, left and right
 
     @property
     def stem(self) -> str:

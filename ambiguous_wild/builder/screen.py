@@ -26,12 +26,16 @@ from ambiguous_wild.builder.records import (
     SkippedPhoto,
 )
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
-from ambiguous_wild.io.photos import Photo, UnreadablePhoto, read_photo
+from ambiguous_wild.io.photos import GREY, Photo, UnreadablePhoto, read_photo
 from ambiguous_wild.io.scene_checks import SHARED
 
 BLUR_SIDE = 1024  # px, longer side: the Laplacian grows with resolution, so blur is compared at one size
 BLUR_RATIO = 0.2  # of the capture's median; a photo below it counts as blurred
+ONE_COLOUR = 8  # largest difference of codes within a border
+MIN_BORDER, MAX_BORDER = 4, 0.4  # px; share of a photo's side that is looked at
+MOST_HAVE = 0.8  # share of the photos that have a border of one width, where it is not the sky
 NEAR_DUPLICATE = 0.995  # correlation of 32 x 32 thumbnails
 EXPOSURE_STOPS = 1.0
 FOCAL_RATIO = 1.01  # longest over shortest focal length of a camera that counts as zoomed
@@ -77,7 +81,7 @@ def screen(capture: Capture, folder: Path, *, strict: bool, jobs: int, bar: Bar)
     ]
     warnings = [
         *_skipped_warning(read.skipped, len(capture.sources)),
-        *(f"{photo.source}: {note}" for photo in screened for note in photo.notes),
+        *photo_warnings(screened),
         *_near_duplicates(screened, read.thumbnails),
         *_burst_warnings(screened, read.thumbnails),
         *_live_photo_warnings(capture),
@@ -153,7 +157,49 @@ def photo_record(listed: PhotoSource, photo: Photo, pixels: np.ndarray) -> Scree
         sharpness=round(sharpness(pixels), 3),
         mean_luma=round(float(pixels.mean()), 2),
         notes=list(photo.notes),
+        borders=[_border(side) for side in _from_each_side(pixels)],
     )
+
+
+def _from_each_side(pixels: np.ndarray) -> list[np.ndarray]:
+    """Return views [N, M, 3] of a photo whose first line is its top, its bottom, its left, its right."""
+    turned = pixels.transpose(1, 0, 2)
+    return [pixels, pixels[::-1], turned, turned[::-1]]
+
+
+def _border(lines: np.ndarray) -> int:
+    """Return how many first lines [N, M, 3] are of one colour; at most a part of them is looked at."""
+    for count, line in enumerate(lines[: int(MAX_BORDER * len(lines))]):
+        if np.abs(line.astype(np.int16) - lines[0, 0]).max() > ONE_COLOUR:
+            return count
+    return int(MAX_BORDER * len(lines))
+
+
+def photo_warnings(photos: Sequence[ScreenedPhoto]) -> list[str]:
+    """Return what reading converted, borders of one colour, and grey photos among colour ones."""
+    sources = grouped(((note, photo.source) for photo in photos for note in photo.notes), lambda row: row[0])
+    lines = [
+        f"{rows[0][1]}: {note}"
+        if len(rows) == 1
+        else f"{len(rows)} photos: {note}: " + shortlist([source for _, source in rows], 3)
+        for note, rows in sources.items()
+    ]
+    grey = [photo.source for photo in photos if GREY in photo.notes]
+    if 0 < len(grey) < len(photos):
+        lines.append(
+            f"{len(grey)} of {len(photos)} photos are grey: if they show another channel (thermal, depth), "
+            f"move them away: {shortlist(grey, 3)}"
+        )
+    for side, name in enumerate(("top", "bottom", "left", "right")):
+        widths = [photo.borders[side] for photo in photos]
+        width = round(float(np.median(widths or [0])))
+        count = sum(abs(each - width) <= MIN_BORDER for each in widths)  # JPEG blurs its edge
+        if width >= MIN_BORDER and count >= MOST_HAVE * len(photos):
+            lines.append(
+                f"{count} photos have {width} px of one colour at the {name}, which would be learnt as part "
+                "of the scene: crop them, or give --keep-masks"
+            )
+    return lines
 
 
 def without_copies(capture: Capture) -> tuple[list[PhotoSource], dict[str, str]]:

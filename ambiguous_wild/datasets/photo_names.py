@@ -27,16 +27,15 @@ class LocatedPhotos:
     """Where a model's photos are."""
 
     folder: Path
-    names: dict[str, str]  # name in the model -> path below the folder
+    names: dict[str, str]  # name in the model -> path below the folder, which `find_photo` finds
     found: int  # photos that are there
 
 
 def locate(root: Path, names: Sequence[str]) -> LocatedPhotos:
     """Find the folder below `root` that holds most of the photos, and their paths in it.
 
-    A prefix that all names share may be missing there, as in /home/me/scan/images/a.jpg. The suffix, upper
-    and lower case and composed letters may differ. Of folders that hold as many the first of `PREFERRED` is
-    taken; a photo that is in none keeps its name without the prefix.
+    A prefix that all names share may be missing there, as in /home/me/scan/images/a.jpg. Of folders that hold
+    as many the first of `PREFERRED` is taken; a photo that is in none keeps its name without the prefix.
     """
     parts = [_parts(name) for name in names]
     shared = min(len(path) for path in parts) - 1
@@ -46,21 +45,22 @@ def locate(root: Path, names: Sequence[str]) -> LocatedPhotos:
     for folder in (*folders, *reduced):
         for drop in range(shared + 1):
             tails = ["/".join(path[drop:]) for path in parts]
-            photos = [find_photo(folder, tail) for tail in tails]
-            found = sum(photo is not None for photo in photos)
+            found = sum(find_photo(folder, tail) is not None for tail in tails)
             if found <= best.found or (folder in reduced and best.folder != root / "images"):
                 continue
-            paths = (t if p is None else p.relative_to(folder).as_posix() for t, p in zip(tails, photos))
             # A dataset may have reduced photos only; its folder of full ones keeps its usual name.
             full = root / "images" if folder in reduced else folder
-            best = LocatedPhotos(full, dict(zip(names, paths)), found)
+            best = LocatedPhotos(full, dict(zip(names, tails)), found)
             if found == len(names):
                 return best
     return best
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
-    """Find the photo's file below `folder`, if need be with another extension or spelling; None if absent."""
+    """Find the photo's file below `folder`; None if it is absent.
+
+    Its suffix, upper and lower case, and whether letters are composed may differ.
+    """
     exact = folder / name
     if exact.is_file():
         return exact
@@ -93,7 +93,7 @@ def _folders(root: Path) -> tuple[list[Path], list[Path]]:
 
 def _parts(name: str) -> tuple[str, ...]:
     """Split a path of any system, without its drive, its root and what leads upwards."""
-    parts = PurePosixPath(name.replace("\\", "/")).parts
+    parts = PurePosixPath(unicodedata.normalize("NFC", name).replace("\\", "/")).parts
     after = 1 + max((k for k, part in enumerate(parts) if part in ("..", "/") or part[1:] == ":"), default=-1)
     return parts[after:] or parts[-1:]
 

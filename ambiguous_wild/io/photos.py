@@ -31,6 +31,7 @@ UNREAD_SUFFIXES = (  # of pictures that are not read, most of them raw
     ".raw", ".rw2", ".srw", ".x3f",
 )  # fmt: skip
 TRANSPARENT = "transparency composited over black"  # its alpha may be a keep mask, see `images.read_alpha`
+GREY = "grey repeated as RGB"
 FROM_PROFILE = "colours converted to sRGB from"
 Named = Callable[[str], Any]  # OpenImageIO's name of a value -> the value; None if it is absent
 MIN_SIDE = 16  # px; smaller photos have no features
@@ -352,7 +353,7 @@ def _three_channels(
     """Convert [H, W, C] without alpha to [H, W, 3], by the file's channel names and colour space."""
     channels = pixels.shape[2]
     if channels == 1:
-        return np.repeat(pixels, 3, axis=2), ["grey repeated as RGB"]
+        return np.repeat(pixels, 3, axis=2), [GREY]
     if channels == 4 and names[:4] in (("C", "M", "Y", "K"), ("CYAN", "MAGENTA", "YELLOW", "BLACK")):
         ink = pixels.astype(np.uint16)
         rgb = ((255 - ink[..., :3]) * (255 - ink[..., 3:]) // 255).astype(np.uint8)

@@ -123,3 +123,20 @@ def test_one_side_alone_and_no_folder(tmp_path):
         collect(tmp_path)
     with pytest.raises(AwError, match="does not exist"):
         collect(tmp_path / "nowhere")
+
+
+def test_jpegs_under_any_name_are_photos_and_what_is_not_read_is_counted(tmp_path):
+    put(tmp_path, "a.jpg", "b.jfif", "c.jpe", "d.avif", "e.cr2", "f.cr2", "notes.txt")
+    (tmp_path / "saved").write_bytes(b"\xff\xd8\xff rest")
+    capture = collect(tmp_path)
+    assert [s.source for s in capture.sources] == ["a.jpg", "b.jfif", "c.jpe", "d.avif", "saved"]
+    assert any("2 pictures of formats that are not read, left out: .cr2 (2)" in n for n in capture.notes)
+
+
+@pytest.mark.parametrize("mask", ["a.jpg.mask.png", "a.mask.png", "a_mask.png", "mask_a.png"])
+def test_masks_among_the_photos_are_no_photos(tmp_path, mask):
+    put(tmp_path, "a.jpg", "b.jpg", "c.jpg", mask)
+    capture = collect(tmp_path)
+    assert stems(capture) == ["a", "b", "c"]
+    assert any(f"1 mask beside photos, as {mask}" in n and "--keep-masks" in n for n in capture.notes)
+    assert collect(tmp_path, masks=tmp_path).notes == ()

@@ -8,7 +8,14 @@ from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto
-from ambiguous_wild.builder.screen import drift_warnings, exposure_stops, screen, sharpness, thumbnail
+from ambiguous_wild.builder.screen import (
+    drift_warnings,
+    exposure_stops,
+    photo_warnings,
+    screen,
+    sharpness,
+    thumbnail,
+)
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_png_rgb
 from tests.builder.capture_maker import texture, write_capture
@@ -146,3 +153,21 @@ def test_exposure_is_in_stops():
     assert exposure_stops({**base, "iso": 200.0}) - exposure_stops(base) == pytest.approx(1.0)
     assert exposure_stops({**base, "f_number": 8.0}) - exposure_stops(base) == pytest.approx(-2.0)
     assert exposure_stops({"iso": 100.0}) is None
+
+
+def test_what_most_photos_share_is_said_once(tmp_path):
+    write_capture(tmp_path / "raw", 5)
+    for index, path in enumerate(sorted((tmp_path / "raw").iterdir())):
+        pixels = read_png_rgb(path)
+        pixels[-20:] = 0
+        cv2.imwrite(str(path), pixels[..., ::-1] if index else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+    facts, _ = run(tmp_path)
+    told = "\n".join(photo_warnings([ScreenedPhoto(**photo) for photo in facts["photos"]]))
+    assert "px of one colour at the bottom" in told and "at the top" not in told
+    assert "1 of 5 photos are grey" in told
+
+
+def test_a_note_of_many_photos_is_one_line():
+    photos = [ScreenedPhoto(f"{k}.jpg", f"{k}.png", notes=["turned"]) for k in range(5)]
+    (line,) = photo_warnings(photos)
+    assert line.startswith("5 photos: turned: 0.jpg, 1.jpg, 2.jpg")

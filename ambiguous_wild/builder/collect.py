@@ -21,7 +21,10 @@ from ambiguous_wild.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, is_photo
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
 Side = Literal["train", "test"] | None
-NO_PHOTOS = ("masks", "truth")  # folders whose images are no photos, in upper or lower case
+NO_PHOTOS = (  # folders whose images are no photos, in upper or lower case
+    "masks", "mask", "truth", "depth", "depths", "confidence", "normals", "segmentation", "dynamic_masks",
+    "@eadir", "#recycle", "__macosx",
+)  # fmt: skip
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp")
 _MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the usual 255
 

@@ -28,7 +28,7 @@ from ambiguous_wild.builder.records import (
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
-from ambiguous_wild.io.photos import GREY, Photo, UnreadablePhoto, read_photo
+from ambiguous_wild.io.photos import GREY, TRANSPARENT, Photo, UnreadablePhoto, read_photo
 from ambiguous_wild.io.scene_checks import SHARED
 
 BLUR_SIDE = 1024  # px, longer side: the Laplacian grows with resolution, so blur is compared at one size
@@ -190,8 +190,14 @@ def photo_warnings(photos: Sequence[ScreenedPhoto]) -> list[str]:
             f"{len(grey)} of {len(photos)} photos are grey: if they show another channel (thermal, depth), "
             f"move them away: {shortlist(grey, 3)}"
         )
+    thermal = [photo.source for photo in photos if PurePosixPath(photo.source).stem.upper().endswith("_T")]
+    if 0 < len(thermal) < len(photos):
+        lines.append(
+            f"the names of {len(thermal)} of {len(photos)} photos end in _T: if they are thermal, move them "
+            f"away: {shortlist(thermal, 3)}"
+        )
     for side, name in enumerate(("top", "bottom", "left", "right")):
-        widths = [photo.borders[side] for photo in photos]
+        widths = [photo.borders[side] for photo in photos if TRANSPARENT not in photo.notes]
         width = round(float(np.median(widths or [0])))
         count = sum(abs(each - width) <= MIN_BORDER for each in widths)  # JPEG blurs its edge
         if width >= MIN_BORDER and count >= MOST_HAVE * len(photos):

@@ -76,10 +76,11 @@ def split_by_lists(
         AwError: a photo is on both sides, a spelling fits two photos, or a side has no photo in the model.
     """
     in_model = list(names)
-    exact, by_key, by_base = (
+    exact, by_key, by_base, by_any_case = (
         set(in_model),
         _index(in_model, key),
         _index(in_model, lambda n: key(PurePosixPath(n).name)),
+        _index(in_model, lambda n: key(PurePosixPath(n).name).casefold()),
     )
     split: dict[str, Split] = {}
     missing: dict[Split, list[str]] = {}
@@ -87,6 +88,7 @@ def split_by_lists(
         missing[side] = []
         for name in listed[side]:
             fits = [name] if name in exact else by_key.get(key(name)) or by_base.get(key(name), [])
+            fits = fits or by_any_case.get(key(PurePosixPath(name).name).casefold(), [])
             if len(fits) > 1:
                 raise AwError(
                     f"{where}: {name!r} fits {shortlist(fits, 3)}; write the extension or the folder"
@@ -97,6 +99,8 @@ def split_by_lists(
                 raise AwError(f"{where}: {name!r} is in the training and in the test list; keep it in one")
     for side in SIDES:
         if side not in split.values():
+            if not listed[side]:
+                raise AwError(f"{where} lists no {side} photos: add them, or leave the lists out")
             raise AwError(
                 f"{where}: none of the {len(listed[side])} {side} photos is in the model "
                 f"({shortlist(listed[side], 3)}; the model has {shortlist(sorted(in_model), 3)}): the list "

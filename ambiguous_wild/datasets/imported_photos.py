@@ -26,9 +26,9 @@ from ambiguous_wild.datasets.photo_names import find_photo
 from ambiguous_wild.io.colmap_records import ONE_FOCAL, ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import (
     MAX_PIXELS,
+    file_colours,
     header_size,
     orientation,
-    photo_profile,
     read_alpha,
     read_mask,
     read_png_rgb,
@@ -38,7 +38,7 @@ from ambiguous_wild.io.images import (
 from ambiguous_wild.io.photos import FROM_PROFILE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_checks import other_pictures
-from ambiguous_wild.io.scene_folder import refuse_same_stems, without_suffix
+from ambiguous_wild.io.scene_folder import refuse_same_stems, shipped_factors, without_suffix
 
 ENOUGH_POINTS = 20  # points in a photo whose colours show which way it was turned
 TURNED = 0.7  # a photo was turned if that reduces the difference of colours below this share
@@ -135,10 +135,14 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     total = len(scene.split)
     if absent:
         there = shortlist(sorted(p.name for p in scene.root.iterdir() if p.is_dir()))
-        where = f"{folder}" if folder.is_dir() else f"{folder}, which is absent; {scene.root} holds {there}"
+        factors = shipped_factors(scene.root)
+        where, cure = f"{folder}", "copy all of the dataset"
+        if not folder.is_dir():
+            where = f"{scene.photos}, which is absent; {scene.root} holds {there}"
+            cure += f", or read a reduced copy by --factor {factors[0]}" if factors else ""
         raise AwError(
             f"{len(absent)} of {total} photos that the model registers are not in {where}: "
-            f"{shortlist(absent, 3)}; copy all of the dataset, or correct the lists"
+            f"{shortlist(absent, 3)}; {cure}, or list those that are there: train_list.txt, test_list.txt"
         )
     if wrong:
         raise AwError(
@@ -196,7 +200,7 @@ def _plan(
         or wide
         or scene.background is not None
         or turn > 1
-        or bool(photo_profile(source))
+        or bool(file_colours(source).name)
     )
     small = None
     if scene.factor > 1 and not convert and not only_small:
@@ -278,7 +282,7 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
         notes.insert(0, f"undistorted{lost}")
     if plan.turn > 1:
         notes.insert(0, f"turned upright (EXIF orientation {plan.turn})")
-    if profile := photo_profile(plan.source):
+    if profile := file_colours(plan.source).name:
         notes.insert(0, f"{FROM_PROFILE} {profile}")
     if scene.background is not None:
         notes.insert(0, "composited over a background of {}, {}, {}".format(*scene.background))

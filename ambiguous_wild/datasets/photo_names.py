@@ -11,14 +11,7 @@ from pathlib import Path, PurePosixPath
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
-PREFERRED = (
-    "images",
-    "dense/images",
-    "input",
-    "rgb",
-    "photos",
-    "",
-)  # folders of photos, "" is the scene's own
+PREFERRED = ("images", "dense/images", "dense/0/images", "input", "rgb", "photos", "")  # "": the scene's own
 NO_PHOTOS = ("masks", "mask", "segmentation", "dynamic_masks", "depths", "depth", "normals", "truth")
 
 

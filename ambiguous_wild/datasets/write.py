@@ -137,7 +137,6 @@ def import_scene(
         )
     foreign, why = read_foreign(root, settings.kind, settings.model)
     foreign = with_masks(foreign) if settings.masks else dataclasses.replace(foreign, masks={})
-    foreign = dataclasses.replace(foreign, notes=(*foreign.notes, *what_is_left_out(foreign)))
     for side in SIDES:
         if side not in foreign.split.values():
             raise AwError(
@@ -145,6 +144,7 @@ def import_scene(
                 "photos, or write train_list.txt and test_list.txt"
             )
     foreign = _at_photo_size(foreign, settings)
+    foreign = dataclasses.replace(foreign, notes=(*foreign.notes, *what_is_left_out(foreign)))
     plans = plan_photos(foreign)
     key = _key(foreign, plans, settings, name)
     target = check_output(target)

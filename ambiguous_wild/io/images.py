@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.io.colour_profile import profile_name, to_srgb
+from ambiguous_wild.io.colour_profile import Colours, colours_of
 from ambiguous_wild.io.files import write_bytes
 
 # Above the largest sensors in use (108 Mpx phones, 102 Mpx cameras).
@@ -122,6 +122,8 @@ def read_mask(
     alike = bool((np.ptp(colour, axis=2) <= _SLACK["JPEG"]).all())
     shown = _black_and_white(grey, _SLACK.get(_form(path), 2)) if alike else None
     alpha = _varying_alpha(image)
+    if alpha is not None and not alpha.any() and shown is not None and shown.any() and not shown.all():
+        alpha = None  # written by tools that leave alpha at 0
     if alpha is not None:
         if shown is None or shown.min() == shown.max() or np.array_equal(shown, alpha):
             return alpha
@@ -165,13 +167,13 @@ def _varying_alpha(image: np.ndarray) -> np.ndarray | None:
     if image.ndim != 3 or image.shape[2] != 4:
         return None
     kept = np.where(image[..., 3] >= 128, 255, 0).astype(np.uint8)
-    return None if kept.min() == kept.max() else kept
+    return None if kept.all() else kept
 
 
 def read_alpha(
     path: Path | str,
 ) -> np.ndarray | None:  # [H, W] uint8 in {0, 255}
-    """Read a photo's alpha as a keep mask; None without alpha, or where it is the same everywhere.
+    """Read a photo's alpha as a keep mask; None without alpha, or where it is opaque everywhere.
 
     Raises:
         AwError: the file is missing or does not decode.
@@ -352,25 +354,25 @@ def _decode(
             f"cannot read image {path}: it is empty, cut short or no PNG, JPEG, "
             "TIFF, BMP or WebP; restore it and try again"
         )
-    if (
-        kind in ("rgb", "deep")
-        and image.dtype != np.float32
-        and profile_name(profile := _profile(data.tobytes()))
-    ):
-        image = to_srgb(image if image.dtype == np.uint8 else (image // 257).astype(np.uint8), profile)
+    if kind in ("rgb", "deep") and image.dtype in (np.uint8, np.uint16):
+        colours = file_colours(data.tobytes())
+        if colours.name and kind == "rgb" and _is_deep(data):
+            deep = decode(data, flags["deep"] | cv2.IMREAD_IGNORE_ORIENTATION, str(path))
+            image = image if deep is None else deep
+        image = colours.to_srgb(image) if colours.name else image
     return image
 
 
-def photo_profile(path: Path | str) -> str:
-    """Return the name of a file's ICC profile if its colours are not those of sRGB, else ""."""
-    return profile_name(_profile(path))
-
-
-def _profile(source: Path | str | bytes) -> bytes | None:
+def file_colours(source: Path | str | bytes) -> Colours:
+    """Return in which colours the codes of an image file are; those of sRGB where it cannot be opened."""
     opened = BytesIO(source) if isinstance(source, bytes) else source
     try:
         with pillow().open(opened, formats=_FORMATS) as image:
-            profile = image.info.get("icc_profile")
+            return colours_of(image)
     except Exception:  # as in `header_size`
-        return None
-    return profile if isinstance(profile, bytes) and profile else None
+        return Colours()
+
+
+def _is_deep(data: np.ndarray) -> bool:
+    """Whether a PNG has 16 bits, whose dark codes a conversion needs."""
+    return bytes(data[:4]) == b"\x89PNG" and len(data) > 24 and int(data[24]) == 16

@@ -19,16 +19,16 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, install_command
 from ambiguous_wild.io.colmap_records import SPLIT_PANORAMAS
-from ambiguous_wild.io.colour_profile import profile_name, to_srgb
-from ambiguous_wild.io.images import MAX_PIXELS, pillow, upright
+from ambiguous_wild.io.colour_profile import Colours, colours_of
+from ambiguous_wild.io.images import MAX_PIXELS, file_colours, pillow, upright
 
 PHOTO_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".heic", ".heif",
     ".hif", ".avif", ".dng",
 )  # fmt: skip
 UNREAD_SUFFIXES = (  # of pictures that are not read, most of them raw
-    ".3fr", ".arw", ".cr2", ".cr3", ".erf", ".gif", ".jxl", ".mef", ".nef", ".nrw", ".orf", ".pef", ".raf",
-    ".raw", ".rw2", ".srw", ".x3f",
+    ".3fr", ".arw", ".cr2", ".cr3", ".erf", ".exr", ".gif", ".hdr", ".insp", ".jxl", ".mef", ".nef", ".nrw",
+    ".orf", ".pef", ".pgm", ".ppm", ".psd", ".raf", ".raw", ".rw2", ".srw", ".tga", ".x3f",
 )  # fmt: skip
 TRANSPARENT = "transparency composited over black"  # its alpha may be a keep mask, see `images.read_alpha`
 GREY = "grey repeated as RGB"
@@ -132,7 +132,7 @@ def read_photo(
     if pixels is None or error:
         raise UnreadablePhoto(source, f"damaged or cut {form} ({_one_line(error) or _NO_REASON})")
     rgb, notes = _to_rgb(source, np.asarray(pixels), spec)
-    rgb = _in_srgb(rgb, _bytes(spec.getattribute("ICCProfile")), notes)
+    rgb = _in_srgb(rgb, file_colours(source), notes)
     exif = read_exif(spec.getattribute)
     if exif.orientation != 1:
         notes.append(f"turned upright (EXIF orientation {exif.orientation})")
@@ -172,7 +172,7 @@ def _read_by_pillow(source: Path, form: str) -> tuple[Photo, np.ndarray]:
             notes += [f"{others} more pictures in the file are left out"] if others else []
             names = tuple(picture.getbands())
             pixels = np.array(picture).reshape(height, width, len(names))
-            raw, profile = picture.info.get("exif"), picture.info.get("icc_profile")
+            raw, colours = picture.info.get("exif"), colours_of(picture)
     except UnreadablePhoto:
         raise
     except Exception as error:  # libheif's errors come as several classes
@@ -183,7 +183,7 @@ def _read_by_pillow(source: Path, form: str) -> tuple[Photo, np.ndarray]:
         notes.append(_alpha_note(pixels[..., -1]))
         pixels = (pixels[..., :-1] * alpha // 255).astype(np.uint8)
     rgb, more = _three_channels(source, pixels, names, "")
-    rgb = _in_srgb(rgb, _bytes(profile), notes)
+    rgb = _in_srgb(rgb, colours, notes)
     exif = _block_exif(raw)
     if form == "avif" and exif.orientation != 1:
         more.append(f"turned upright (EXIF orientation {exif.orientation})")
@@ -249,6 +249,8 @@ def _sniff(path: Path) -> str:
         b"\x89PNG\r\n\x1a\n": "png",
         b"II*\0": "tiff",
         b"MM\0*": "tiff",
+        b"II+\0": "tiff",  # BigTIFF
+        b"MM\0+": "tiff",
         b"BM": "bmp",
         b"\0\0\0\x0cjP  ": "jpeg2000",
     }
@@ -332,15 +334,10 @@ def _to_rgb(path: Path, pixels: np.ndarray, spec: Any) -> tuple[np.ndarray, list
     return rgb, notes + more
 
 
-def _in_srgb(rgb: np.ndarray, profile: bytes | None, notes: list[str]) -> np.ndarray:
-    if name := profile_name(profile):
-        notes.append(f"{FROM_PROFILE} {name}")
-    return to_srgb(rgb, profile)
-
-
-def _bytes(value: object) -> bytes | None:
-    """Return an attribute of bytes, which OpenImageIO gives as an array."""
-    return None if value is None else bytes(value)  # type: ignore[call-overload]
+def _in_srgb(rgb: np.ndarray, colours: Colours, notes: list[str]) -> np.ndarray:
+    if colours.name:
+        notes.append(f"{FROM_PROFILE} {colours.name}")
+    return colours.to_srgb(rgb)
 
 
 def _alpha_note(alpha: np.ndarray) -> str:

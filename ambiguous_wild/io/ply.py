@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,9 +14,10 @@ import numpy as np
 from ambiguous_wild.core import UNMOVED, AwError, SceneTransform
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE
 from ambiguous_wild.io.files import write_bytes
-from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, checked_transform
+from ambiguous_wild.io.splat_arrays import SH_C0, Arrays, SplatFile, checked_transform, logit, sigmoid
 from ambiguous_wild.io.untrusted import read_bytes
 
+_SPLAT_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 RENDER_MODE = "SplatRenderMode"  # a comment of splat PLYs
 _MAX_HEADER = 64 * 1024  # bytes; a splat header has under 2 kB
 _TYPES = {
@@ -186,7 +188,21 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
+    if "filter_3D" in present:
+        arrays |= _fused(arrays, columns(["filter_3D"]))
     return SplatFile(dict(rescaled(arrays, transform.scale)), transform, header_antialias(data))
+
+
+def _fused(arrays: Arrays, size: np.ndarray) -> dict[str, np.ndarray]:
+    """Return log_scales and opacity_logits after the 3D filter [N, 1] of Mip-Splatting's own files."""
+    squares = np.exp(2 * arrays["log_scales"].astype(np.float64))
+    filtered = squares + size.astype(np.float64) ** 2
+    share = np.sqrt(np.prod(squares / filtered, axis=1))
+    logits = logit(sigmoid(arrays["opacity_logits"]) * share)
+    return {
+        "log_scales": (0.5 * np.log(filtered)).astype(np.float32),
+        "opacity_logits": logits.astype(np.float32),
+    }
 
 
 def _floats(table: np.ndarray, names: Sequence[str], path: Path | str) -> np.ndarray:
@@ -228,7 +244,11 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not (np.abs(xyz) < LARGEST_COORDINATE).all():
         raise AwError(f"{path} holds positions that are not finite or above {LARGEST_COORDINATE:g}")
     spelt = [of for of in _SPELLINGS if all(c in names for c in of)]
+    if not spelt and all(name in names for name in _SPLAT_COLOUR):
+        tint = np.stack([table[name].astype(np.float64) for name in _SPLAT_COLOUR], axis=1)
+        return xyz, np.rint(np.clip(255 * (SH_C0 * tint + 0.5), 0, 255)).astype(np.uint8)
     if not spelt:
+        warnings.warn(f"{path} has no colours: its points are grey", stacklevel=2)
         return xyz, np.full(xyz.shape, 128, np.uint8)
     rgb = np.nan_to_num(np.stack([table[c] for c in spelt[0]], axis=1))
     most = rgb.max(initial=0)  # 16 bits, 8 bits (some write them as floats), or shares

@@ -100,6 +100,7 @@ def load_scene(
         for image in sorted(model.images.values(), key=lambda i: i.name)
         if image.name in split
     )
+    _check_reduced(model, views, chosen)
     for side in SIDES:
         refuse_same_stems(root, [v.name for v in views if v.split == side])
     if not any(v.split == "train" for v in views):
@@ -201,9 +202,11 @@ def without_suffix(name: str) -> str:
 
 def read_list(path: Path) -> list[str]:
     """Read the names of a split list, one a line; empty lines are skipped."""
-    # Some editors write a byte order mark, which utf-8-sig keeps out of the first name.
-    lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
-    return [line.strip() for line in lines if line.strip()]
+    data = path.read_bytes()
+    # Editors write a byte order mark, and PowerShell's > writes UTF-16.
+    utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    text = data.decode("utf-16" if utf16 else "utf-8-sig", errors="replace" if utf16 else "surrogateescape")
+    return [line.strip() for line in text.splitlines() if line.strip()]
 
 
 def _inside(name: str, root: Path) -> str:
@@ -307,15 +310,23 @@ def default_split(root: Path, names: Iterable[str]) -> tuple[dict[str, Split], s
     By test.txt beside the model, where 3DGS reads it and hierarchical 3DGS writes it; else every 8th, sorted
     by name, is a test photo.
     """
-    ordered = sorted(names)
+    ordered, unused = sorted(names), ""
     for path in (root / place / TESTS_OF_3DGS for place in ("sparse/0", "sparse", ".")):
         listed = read_list(path) if path.is_file() else []
         known = {key for name in listed for key in (name, without_suffix(name), PurePosixPath(name).name)}
         tests = {n for n in ordered if known & {n, without_suffix(n), PurePosixPath(n).name}}
+        where = path.relative_to(root)
         if 0 < len(tests) < len(ordered):
-            note = f"{path.relative_to(root)} names {len(tests)} of {len(ordered)} photos: the test photos"
+            found = {key for n in tests for key in (n, without_suffix(n), PurePosixPath(n).name)}
+            absent = [n for n in listed if not {n, without_suffix(n), PurePosixPath(n).name} & found]
+            lacking = f"; not in the model: {shortlist(absent, 3)}" if absent else ""
+            note = f"{where} names {len(tests)} of {len(ordered)} photos: the test photos{lacking}"
             return {n: "test" if n in tests else "train" for n in ordered}, note
-    note = f"no test set given: every {TEST_EVERY}th is a test photo; distractors in it count as truth"
+        if listed and path.parent != root:
+            unused += f"{where} names none or all of the photos and is not used; "
+    note = (
+        f"{unused}no test set given: every {TEST_EVERY}th is a test photo; distractors in it count as truth"
+    )
     return {n: "train" if i % TEST_EVERY else "test" for i, n in enumerate(ordered)}, note
 
 
@@ -356,6 +367,18 @@ def refuse_same_stems(root: Path, names: Iterable[str]) -> None:
                 f"{root}: photos {other!r} and {name!r} differ in their extension only, so their renders "
                 "would be one file; rename one and build the model again"
             )
+
+
+def _check_reduced(model: ColmapModel, views: Iterable[View], factor: int) -> None:
+    """Raise AwError where some photos of images_N are reduced otherwise than most."""
+    cameras = {image.image_id: model.cameras[image.camera_id] for image in model.images.values()}
+    ratios = {view.image_path: cameras[view.image_id].width / view.camera.width for view in views}
+    usual = float(np.median(list(ratios.values()))) if factor > 1 and ratios else 0.0
+    if odd := [path for path, ratio in ratios.items() if usual and not 0.8 < ratio / usual < 1.25]:
+        raise AwError(
+            f"{len(odd)} photos of {odd[0].parent} are reduced otherwise than most, which are {usual:.3g} "
+            f"times smaller than their cameras: {shortlist([path.name for path in odd], 3)}; reduce all alike"
+        )
 
 
 def _view(

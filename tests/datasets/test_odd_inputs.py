@@ -2,6 +2,7 @@
 
 import json
 import unicodedata
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -10,11 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, ImageCms
+from PIL import ExifTags, Image, ImageCms
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.srgb import srgb_to_linear
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.io.colmap_model import read_model, write_model
+from ambiguous_wild.io.colour_profile import ADOBE, ADOBE_GAMMA
 from ambiguous_wild.io.images import load_image_float, read_png_rgb, write_png
 from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene
@@ -116,7 +119,56 @@ def wide_profile() -> ImageCms.ImageCmsProfile:
     return ImageCms.getOpenProfile(BytesIO(bytes(data)))
 
 
+def gamma(root: Path) -> None:
+    """Photos whose codes are linear light, as PNG's gAMA says, without a profile."""
+    plain(root)
+    for name in TRAIN[:2]:
+        path = root / "images" / name
+        codes = (srgb_to_linear(read_png_rgb(path) / 255.0) * 65535 + 0.5).astype(np.uint16)
+        data = cv2.imencode(".png", codes[..., ::-1])[1].tobytes()
+        chunk = b"gAMA" + (100_000).to_bytes(4)
+        path.write_bytes(data[:33] + (4).to_bytes(4) + chunk + zlib.crc32(chunk).to_bytes(4) + data[33:])
+
+
+def adobe(root: Path) -> None:
+    """Photos in Adobe RGB, as EXIF alone says it."""
+    plain(root)
+    for name in TRAIN[:2]:
+        path = root / "images" / name
+        light = srgb_to_linear(read_png_rgb(path) / 255.0) @ np.linalg.inv(ADOBE).T
+        codes = (np.clip(light, 0, 1) ** (1 / ADOBE_GAMMA) * 255 + 0.5).astype(np.uint8)
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.IFD.Interop] = {1: "R03"}
+        Image.fromarray(codes).save(path, exif=exif.tobytes())
+
+
+def other_case_in_lists(root: Path) -> None:
+    plain(root)
+    layouts.write_lists(root, [n.upper() for n in TRAIN], [n.upper() for n in layouts.TEST])
+
+
+def wholly_transparent(root: Path) -> None:
+    plain(root)
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    rgba = np.dstack([layouts.photo(0)[..., ::-1], 0 * alpha])
+    cv2.imwrite(str(root / "images" / TRAIN[0]), rgba)
+
+
+def foreign_test_list(root: Path) -> None:
+    (plain(root, lists=False) / "sparse/0/test.txt").write_text("nobody.png\n")
+
+
 ODD = {
+    "linear light by gAMA": Odd(gamma, ("2 photos: colours converted to sRGB from gamma 1",)),
+    "Adobe RGB by EXIF": Odd(adobe, ("2 photos: colours converted to sRGB from Adobe RGB (EXIF)",)),
+    "lists in capitals": Odd(other_case_in_lists),
+    "masks in the photos' folder": Odd(masked("{stem}.png", "images/Masks"), ("keep masks of 5 of 5",), 7),
+    "a list of other photos": Odd(
+        foreign_test_list,
+        ("test.txt names none or all", "no test set"),
+        kind="colmap",
+        tests=["clutter000.png"],
+    ),
     "photos in input/": Odd(lambda root: plain(root, "input"), ("photos are read from input/",)),
     "names with a folder": Odd(lambda root: plain(root, name=lambda n: f"images/{n}")),
     "absolute names": Odd(lambda root: plain(root, name=lambda n: f"/home/me/scan/images/{n}")),
@@ -183,3 +235,21 @@ def test_reduced_photos_that_show_something_else_are_refused(tmp_path: Path) -> 
         small = cv2.resize(layouts.photo(index), (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA)
         write_png(root / "images_2" / name, small)
     assert load_scene(root, factor=2).train[0].camera.width == WIDTH // 2
+
+
+def test_a_photo_that_is_wholly_transparent_is_not_learnt(tmp_path: Path) -> None:
+    wholly_transparent(tmp_path / "raw")
+    scene = load_scene(import_scene(tmp_path / "raw", tmp_path / "scene").scene)
+    keep = load_keep(scene.train[0])
+    assert keep is not None and not keep.any()
+
+
+def test_reduced_photos_of_several_sizes_are_refused(tmp_path: Path) -> None:
+    root = plain(tmp_path / "raw")
+    for index, name in enumerate(NAMES):
+        size = (WIDTH, HEIGHT) if index == 3 else (WIDTH // 2, HEIGHT // 2)
+        write_png(
+            root / "images_2" / name, cv2.resize(layouts.photo(index), size, interpolation=cv2.INTER_AREA)
+        )
+    with pytest.raises(AwError, match=r"1 photos of .* are reduced otherwise"):
+        load_scene(root, factor=2)

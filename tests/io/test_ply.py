@@ -158,3 +158,31 @@ def test_positions_that_float32_cannot_square_or_that_are_no_floats_are_refused(
     (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
     with pytest.raises(AwError, match=message):
         read_point_ply(tmp_path / "a.ply")
+
+
+def test_the_filter_of_mip_splattings_own_files_is_fused(tmp_path):
+    """Their scale is sqrt(s^2 + f^2), their opacity times sqrt(prod s^2 / prod (s^2 + f^2))."""
+    zero = np.zeros((3, 3), np.float32)
+    arrays = dict.fromkeys(("means", "sh0"), zero) | {
+        "quats": np.tile(np.float32([1, 0, 0, 0]), (3, 1)), "log_scales": zero + np.float32(np.log(0.1)),
+        "opacity_logits": zero[:, 0], "sh_rest": np.zeros((3, 0, 3), np.float32),
+    }  # fmt: skip
+    write_splat_ply(tmp_path / "m.ply", arrays)
+    head, _, body = (tmp_path / "m.ply").read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(3, -1)
+    sizes = np.array([0.0, 0.1, 0.2], "<f4")
+    data = np.column_stack([rows, sizes]).astype("<f4").tobytes()
+    (tmp_path / "m.ply").write_bytes(head + b"property float filter_3D\nend_header\n" + data)
+    found = read_splat_ply(tmp_path / "m.ply")
+    assert np.exp(found["log_scales"][:, 0]) == pytest.approx(np.hypot(0.1, sizes))
+    opacity = 1 / (1 + np.exp(-found["opacity_logits"]))
+    assert opacity == pytest.approx(0.5 * (0.1 / np.hypot(0.1, sizes)) ** 3, rel=1e-5)
+
+
+def test_a_cloud_without_colours_says_so_and_splats_give_theirs(tmp_path):
+    (tmp_path / "c.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "end_header\n1 2 3\n"
+    )
+    with pytest.warns(UserWarning, match="has no colours: its points are grey"):
+        assert read_point_ply(tmp_path / "c.ply")[1].tolist() == [[128] * 3]

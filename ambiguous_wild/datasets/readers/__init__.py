@@ -63,7 +63,11 @@ def recognise(root: Path) -> tuple[str, str]:
         AwError: no layout, two that contradict each other, or a scene of ours.
     """
     if not root.is_dir():
-        what = "is a file; unpack archives first" if root.exists() else "does not exist"
+        what = (
+            "is a file; give the dataset's folder (unpack archives first)"
+            if root.exists()
+            else "does not exist"
+        )
         raise AwError(f"dataset {root} {what}")
     if (root / "scene.json").is_file():
         raise AwError(f"{root} is a scene already (it holds scene.json): run 'aw bench' on it")
@@ -163,7 +167,10 @@ def with_masks(scene: ForeignScene) -> ForeignScene:
     train, test = ([name for name, of in scene.split.items() if of == side] for side in SIDES)
     by_side, files = scene.masks, set(scene.masks.values())
     base = scene.photos.parent if scene.photos != scene.root else scene.root
-    folder = next((base / name for name in MASK_FOLDERS if (base / name).is_dir()), scene.photos)
+    there = (
+        p for place in (base, scene.photos) if place.is_dir() for p in sorted(place.iterdir()) if p.is_dir()
+    )
+    folder = next((p for p in there if p.name.lower() in MASK_FOLDERS), scene.photos)
     if by_side:
         folder = Path(os.path.commonpath({mask.parent for mask in files}))
     elif scene.kind not in ("drone", "dualsplat", "blender") and not (folder / OWN_MASKS).is_file():

@@ -24,7 +24,12 @@ from ambiguous_wild.io.scene_folder import (
 
 LISTS: dict[Split, str] = {"train": "train_list.txt", "test": "test_list.txt"}
 KEYWORDS: dict[str, Split | None] = {"clutter": "train", "extra": "test", "clean": None}
-MODEL_FOLDERS = ("sparse", "dense/sparse", "colmap/sparse")  # each may hold numbered models instead
+MODEL_FOLDERS = (
+    "sparse",
+    "dense/sparse",
+    "dense/0/sparse",
+    "colmap/sparse",
+)  # each may hold numbered models instead
 DRONE_WIDTH = 1920  # px to which DroneSplat's loader reduces wider photos
 
 

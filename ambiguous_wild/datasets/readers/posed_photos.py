@@ -40,7 +40,11 @@ def only_file(root: Path, suffix: str, fits: Callable[[Path], bool] = lambda _: 
     Raises:
         AwError: there are several files.
     """
-    files = (path for path in sorted(root.iterdir()) if path.suffix.lower() == suffix and path.is_file())
+    files = (
+        path
+        for path in sorted(root.iterdir())
+        if path.suffix.lower() == suffix and path.name[0] != "." and path.is_file()
+    )
     fitting = [path for path in files if fits(path)]
     if len(fitting) > 1:
         names = shortlist([path.name for path in fitting])

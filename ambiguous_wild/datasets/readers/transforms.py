@@ -176,7 +176,15 @@ def read_transforms(root: Path) -> ForeignScene:
         notes.append(f"points from {points}, without the photos that see them")
     where: Literal["model", "triangulate"] = "model" if len(model.points.ids) else "triangulate"
     return ForeignScene(
-        kind, root, model, folder, split, missing=missing, masks=masks, notes=tuple(notes), points=where
+        kind,
+        root,
+        model,
+        folder,
+        split,
+        missing=missing,
+        masks=masks,
+        notes=tuple(notes),
+        points=where,
     )
 
 
@@ -212,6 +220,8 @@ def read_blender(root: Path) -> ForeignScene:
     rows, split = [], dict[str, Split]()
     for side in SIDES:
         path = root / f"transforms_{side}.json"
+        if side == "test" and not path.is_file() and (root / "transforms_val.json").is_file():
+            path = root / "transforms_val.json"
         data = read_object(path)
         for frame in frames_of(data, path):
             name = frame_name(frame, root)

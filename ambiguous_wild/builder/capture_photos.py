@@ -30,10 +30,11 @@ from ambiguous_wild.builder.collect import (
     collect,
     videos_in,
 )
+from ambiguous_wild.builder.panorama import YAWS_DEG, is_panorama, pinhole_views
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import CapturedPhoto, CaptureRecord, FrameCounts, Kind, LeftOut
 from ambiguous_wild.builder.screen import sharpness, without_copies
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import atomic_dir, check_output, write_json
 from ambiguous_wild.io.photos import UnreadablePhoto, read_photo
 
@@ -133,7 +134,7 @@ def _copy(
     for listed in sources:
         bar.step()
         try:
-            _, pixels = read_photo(listed.path)
+            photo, pixels = read_photo(listed.path, panoramas=True)
         except UnreadablePhoto as error:
             left.append({"source": listed.source, "why": error.reason})
             continue
@@ -145,11 +146,31 @@ def _copy(
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():  # `train_a.jpg` beside train/a.jpg, for example
             target = target.with_name(full_name)
-        shutil.copyfile(listed.path, target)
-        relative = target.relative_to(folder).as_posix()
-        photos.append({"photo": relative, "source": listed.source, "sharpness": round(sharpness(pixels), 1)})
+        written = {target: pixels}
+        if is_panorama(photo.width, photo.height, photo.sphere):
+            views = pinhole_views(pixels)
+            written = {target.with_name(f"{target.stem}_yaw{yaw:03}.jpg"): view for yaw, view in views}
+            for path, view in written.items():
+                _write_jpeg(path, view)
+        else:
+            shutil.copyfile(listed.path, target)
+        for path, shown in written.items():
+            relative = path.relative_to(folder).as_posix()
+            photos.append(
+                {"photo": relative, "source": listed.source, "sharpness": round(sharpness(shown), 1)}
+            )
     bar.finish()
+    spheres = {photo["source"] for photo in photos if "_yaw" in photo["photo"]}
+    if spheres:
+        bar.say(f"{counted(len(spheres), '360 degree photo')} split into {len(YAWS_DEG)} pinhole views each")
     return photos, left
+
+
+def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
+    done, data = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+    if not done:
+        raise AwError(f"{path}: OpenCV could not encode it as JPEG")
+    path.write_bytes(data.tobytes())
 
 
 def _frames_of(video: Path, folder: Path, frames: int, bar: Bar) -> tuple[list[CapturedPhoto], FrameCounts]:

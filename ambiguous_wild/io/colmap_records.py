@@ -36,7 +36,7 @@ LARGEST_SIDE = 1_000_000  # px
 LARGEST_COORDINATE = 1e18  # world units; its square is finite in float32
 FOCAL_RANGE = (1e-3, 1e6)  # focal length over the longer side
 ONE_FOCAL = {name for name in MODELS if name.startswith(("SIMPLE_", "RADIAL"))}
-SPLIT_PANORAMAS = "split 360 degree photos into pinhole views first, as COLMAP's panorama_sfm.py does"
+SPLIT_PANORAMAS = "'aw capture PHOTOS -o SPLIT' splits 360 degree photos into pinhole views"
 _BY_ID = {number: (name, count) for name, (number, count) in MODELS.items()}
 
 

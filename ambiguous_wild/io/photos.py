@@ -96,10 +96,13 @@ class Photo:
     exif: Exif
     plain: bool  # 8-bit upright RGB with the right suffix: other tools read the same pixels
     notes: tuple[str, ...]  # what was converted, e.g. "16 bits reduced to 8"
+    sphere: bool = False  # a 360 degree photo, as its metadata say
 
 
 def read_photo(
     path: Path | str,
+    *,
+    panoramas: bool = False,  # also read 360 degree photos
 ) -> tuple[Photo, np.ndarray]:  # pixels [H, W, 3] uint8, sRGB, upright
     """Read a photo as upright 8-bit RGB; converts 16 bits, grey, CMYK and alpha.
 
@@ -119,7 +122,8 @@ def read_photo(
     try:
         spec = reader.spec()
         _check_size(source, spec.width, spec.height)
-        if spec.getattribute("GPano:ProjectionType") == "equirectangular":
+        sphere = spec.getattribute("GPano:ProjectionType") == "equirectangular"
+        if sphere and not panoramas:
             raise UnreadablePhoto(source, f"a 360 degree photo; {SPLIT_PANORAMAS}")
         if str(spec.format) not in ("uint8", "uint16"):
             raise UnreadablePhoto(
@@ -140,7 +144,7 @@ def read_photo(
     notes += _misnamed(source, form)
     height, width = rgb.shape[:2]
     plain = not notes and form in ("jpeg", "png")
-    return Photo(source, form, width, height, exif, plain, tuple(notes)), np.ascontiguousarray(rgb)
+    return Photo(source, form, width, height, exif, plain, tuple(notes), sphere), np.ascontiguousarray(rgb)
 
 
 def is_photo(path: Path) -> bool:

@@ -145,7 +145,7 @@ def test_drift_is_reported_with_its_number():
 def test_photos_of_the_shape_of_panoramas_are_named():
     wide = [photo(0, width=16), photo(1, width=16), photo(2)]
     for found in (drift_warnings(wide)[-1], focal_length(wide).finding):
-        assert "2 photos are 2:1, as 360 degree photos are (0.jpg, 1.jpg): split" in found
+        assert "2 photos are 2:1, as 360 degree photos are (0.jpg, 1.jpg): 'aw capture" in found
 
 
 def test_exposure_is_in_stops():

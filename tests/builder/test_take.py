@@ -201,7 +201,7 @@ def test_frames_of_a_variable_rate_are_picked_by_their_time(tmp_path: Path) -> N
     delta = int.from_bytes(data[stts + 8 : stts + 12], "big")
     runs = b"".join(v.to_bytes(4, "big") for v in (0, 2, 24, delta, 24, 6 * delta))
     (tmp_path / "v.mp4").write_bytes(patched(data, b"stts", runs).replace(b"edts", b"free"))
-    facts = capture_photos.photos_from([tmp_path / "v.mp4"], tmp_path / "raw", frames=7)
+    facts = capture_photos.capture_photos.photos_from([tmp_path / "v.mp4"], tmp_path / "raw", frames=7)
     times = [p["time_s"] for p in facts["photos"]]
     assert sum(p["frame"] < 24 for p in facts["photos"]) == 1  # one second of seven; by their count, 3.5
     assert max(np.diff(times)) < 1.51 and times[-1] > 6
@@ -252,3 +252,34 @@ def test_several_folders_and_videos_go_to_a_folder_each(tmp_path: Path) -> None:
     )
     assert len(collect(tmp_path / "raw").sources) == 7  # names that mean something are not given to sources
     assert "holds 2 photos" in error(tmp_path / "cat", "-o", tmp_path / "none")
+
+
+def test_360_degree_photos_become_pinhole_views(tmp_path):
+    """A sphere whose colour is the direction, so that every pixel of a view says where it looks."""
+    width, height = 2048, 1024
+    longitude = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
+    latitude = ((np.arange(height) + 0.5) / height - 0.5) * np.pi
+    direction = np.stack(
+        [
+            np.sin(longitude)[None] * np.cos(latitude)[:, None],
+            np.broadcast_to(np.sin(latitude)[:, None], (height, width)),
+            np.cos(longitude)[None] * np.cos(latitude)[:, None],
+        ],
+        axis=-1,
+    )
+    sphere = np.round(127.5 + 127 * direction).astype(np.uint8)
+    (tmp_path / "raw").mkdir()
+    for name, pixels in (("a.png", sphere), ("b.png", 255 - sphere), ("c.png", sphere[:, ::-1])):
+        cv2.imwrite(str(tmp_path / "raw" / name), pixels[..., ::-1])
+    record = photos_from([tmp_path / "raw"], tmp_path / "out")
+    assert len(record["photos"]) == 24 and all("_yaw" in photo["photo"] for photo in record["photos"])
+    for yaw in (0, 90, 225):
+        view = cv2.imread(str(tmp_path / "out" / f"a_yaw{yaw:03}.jpg"))[..., ::-1]
+        side = len(view)
+        assert view.shape == (512, 512, 3)
+        x, y = np.meshgrid(*2 * [(np.arange(side) + 0.5) / side * 2 - 1])
+        ray = np.stack([x, y, np.ones_like(x)], axis=-1)
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+        turned = ray @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
+        assert np.abs(view - (127.5 + 127 * turned)).mean() < 2

@@ -201,7 +201,7 @@ def test_frames_of_a_variable_rate_are_picked_by_their_time(tmp_path: Path) -> N
     delta = int.from_bytes(data[stts + 8 : stts + 12], "big")
     runs = b"".join(v.to_bytes(4, "big") for v in (0, 2, 24, delta, 24, 6 * delta))
     (tmp_path / "v.mp4").write_bytes(patched(data, b"stts", runs).replace(b"edts", b"free"))
-    facts = capture_photos.capture_photos.photos_from([tmp_path / "v.mp4"], tmp_path / "raw", frames=7)
+    facts = capture_photos.photos_from([tmp_path / "v.mp4"], tmp_path / "raw", frames=7)
     times = [p["time_s"] for p in facts["photos"]]
     assert sum(p["frame"] < 24 for p in facts["photos"]) == 1  # one second of seven; by their count, 3.5
     assert max(np.diff(times)) < 1.51 and times[-1] > 6
@@ -271,7 +271,7 @@ def test_360_degree_photos_become_pinhole_views(tmp_path):
     (tmp_path / "raw").mkdir()
     for name, pixels in (("a.png", sphere), ("b.png", 255 - sphere), ("c.png", sphere[:, ::-1])):
         cv2.imwrite(str(tmp_path / "raw" / name), pixels[..., ::-1])
-    record = photos_from([tmp_path / "raw"], tmp_path / "out")
+    record = capture_photos.photos_from([tmp_path / "raw"], tmp_path / "out")
     assert len(record["photos"]) == 24 and all("_yaw" in photo["photo"] for photo in record["photos"])
     for yaw in (0, 90, 225):
         view = cv2.imread(str(tmp_path / "out" / f"a_yaw{yaw:03}.jpg"))[..., ::-1]

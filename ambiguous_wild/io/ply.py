@@ -146,6 +146,12 @@ def header_transform(data: bytes, path: Path | str) -> SceneTransform:
         raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
 
 
+def stated_up(path: Path) -> str:
+    """Return the axis that nerfstudio's header calls vertical; "" where it states none, or y."""
+    found = re.search(rb"^comment Vertical Axis: *([xz])\b", _head(path), re.MULTILINE | re.IGNORECASE)
+    return found[1].decode().lower() if found else ""
+
+
 def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
 

@@ -12,7 +12,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Scene, SceneTransform
 from ambiguous_wild.core.scene import together
 from ambiguous_wild.io.images import to_uint8
-from ambiguous_wild.io.ply import read_splat_ply, read_transform, splat_count
+from ambiguous_wild.io.ply import read_splat_ply, read_transform, splat_count, stated_up
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile
 from ambiguous_wild.io.splat_files import read_splats
 
@@ -117,9 +117,13 @@ def file_model(path: Path) -> tuple[ViewedModel, str]:
         AwError: see `read_splats`.
     """
     splats = read_splats(path)
-    left = f"{path}: {splats.left_out:,} Gaussians with values that are not finite left out"
+    notes = [f"{splats.left_out:,} Gaussians with values that are not finite left out"] * bool(
+        splats.left_out
+    )
+    if path.suffix.lower() == ".ply" and (axis := stated_up(path)):
+        notes.append(f"its header says that {axis} is up; here -y is: --up and --scene turn it")
     model = ViewedModel(path.name, path, RenderSettings(antialias=splats.antialias), splats=splats)
-    return model, left if splats.left_out else ""
+    return model, f"{path}: {'; '.join(notes)}" if notes else ""
 
 
 def moved(gaussians: Arrays, of: SceneTransform, to: SceneTransform) -> Arrays:

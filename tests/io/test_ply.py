@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.ply import has_splats, read_point_ply, read_splat_ply, write_splat_ply
+from ambiguous_wild.io.ply import has_splats, read_point_ply, read_splat_ply, stated_up, write_splat_ply
 
 
 def model(n=5, rest=15, seed=0):
@@ -186,3 +186,10 @@ def test_a_cloud_without_colours_says_so_and_splats_give_theirs(tmp_path):
     )
     with pytest.warns(UserWarning, match="has no colours: its points are grey"):
         assert read_point_ply(tmp_path / "c.ply")[1].tolist() == [[128] * 3]
+
+
+def test_the_vertical_axis_of_a_header_is_told(tmp_path):
+    head = "ply\nformat ascii 1.0\ncomment Vertical Axis: {}\nelement vertex 0\nend_header\n"
+    for axis, told in (("z", "z"), ("y", ""), ("X", "x")):
+        (tmp_path / "m.ply").write_text(head.format(axis))
+        assert stated_up(tmp_path / "m.ply") == told

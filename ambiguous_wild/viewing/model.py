@@ -117,9 +117,9 @@ def file_model(path: Path) -> tuple[ViewedModel, str]:
         AwError: see `read_splats`.
     """
     splats = read_splats(path)
-    notes = [f"{splats.left_out:,} Gaussians with values that are not finite left out"] * bool(
-        splats.left_out
-    )
+    notes = []
+    if splats.left_out:
+        notes.append(f"{splats.left_out:,} Gaussians with values that are not finite left out")
     if path.suffix.lower() == ".ply" and (axis := stated_up(path)):
         notes.append(f"its header says that {axis} is up; here -y is: --up and --scene turn it")
     model = ViewedModel(path.name, path, RenderSettings(antialias=splats.antialias), splats=splats)

@@ -27,7 +27,7 @@ from ambiguous_wild.harness.start import recorded_start
 from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.entry import trained_once
-from ambiguous_wild.methods.graft import split_graft
+from ambiguous_wild.methods.graft import graft_pairs, split_graft
 from ambiguous_wild.methods.references import reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
 from ambiguous_wild.splat.pace import TrainConfig
@@ -69,13 +69,14 @@ def read_sources(
     sources = [_source(str(path), "plugin", Path(path)) for path in plugins]
     sources += [_source(str(path), "metric", Path(path)) for path in metrics]
     for name in methods:
-        # the host of a graft may be a reference
+        # the host of a graft may be a reference, and so may its donors
         host, _ = split_graft(trained_once(name))
-        file = reference_file(host)
-        if file is not None:
-            sources.append(_source(host, "method", file))
-        elif host.startswith("nerfbaselines:"):
-            sources.append(CodeSource(host, "method"))
+        for member in (host, *(donor for _, donor in graft_pairs(trained_once(name)))):
+            file = reference_file(member)
+            if file is not None:
+                sources.append(_source(member, "method", file))
+            elif member.startswith("nerfbaselines:"):
+                sources.append(CodeSource(member, "method"))
     return tuple(sources)
 
 

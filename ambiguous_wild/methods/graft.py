@@ -38,7 +38,7 @@ def graft_name(host: str, donors: Mapping[str, str | None]) -> str:
     Donors replace those in the host's name.
     """
     base, rest = split_graft(host)
-    filled = dict(_pairs(host)) if rest else {}
+    filled = dict(graft_pairs(host)) if rest else {}
     filled |= {slot: donor for slot, donor in donors.items() if donor}
     text = ",".join(f"{slot}={filled[slot]}" for slot in SLOTS if slot in filled)
     return f"{base}@{text}" if text else base
@@ -106,7 +106,7 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
     """
     if host.passes > 1:
         raise AwError(f"{name}: the end of the name says that it trains twice: {host.base}@...+2passes")
-    pairs = _pairs(name)
+    pairs = graft_pairs(name)
     if host.program is not None:
         raise _program_takes_no_parts(host.name, split_graft(name)[1])
     donors = {slot: _donor(slot, donor, methods) for slot, donor in pairs}
@@ -116,6 +116,8 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
         for slot, entry in entries.items()
     ]
     hashes = [entry.source_hash for entry in entries.values()]
+    in_files = any(entry.given_as for entry in entries.values())
+    typed = {slot: donors[slot].given_as or donor for slot, donor in pairs}
     ordered = graft_name(host.name, dict(pairs))  # in the order of the slots, so that one graft has one name
     return MethodEntry(
         name=ordered,
@@ -126,7 +128,9 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
         source_hash=hashlib.sha256("".join(hashes).encode()).hexdigest() if any(hashes) else "",
         slots=tuple((slot, entry.name) for slot, entry in entries.items())
         + tuple((slot, donor) for slot, donor in pairs if donor in ALIASES),
-        given_as=graft_name(host.given_as, dict(pairs)) if host.given_as else "",
+        given_as=graft_name(host.given_as or host.name, typed)
+        if any(e.given_as for e in entries.values())
+        else "",
     )
 
 
@@ -182,7 +186,7 @@ def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tup
     """Build the host and the donors by slot; a method with equal options is built once."""
     from ambiguous_wild.methods.graft_checks import Member
 
-    typed, members = dict(_pairs(name)), {}
+    typed, members = dict(graft_pairs(name)), {}
     built: list[tuple[str, Any, MethodHooks]] = []  # method, options, hooks
     for slot, entry in entries.items():
         own = getattr(options, slot)
@@ -231,7 +235,7 @@ def check_graft(method: MethodEntry, options: Any) -> list[str]:
     return warnings
 
 
-def _pairs(name: str) -> list[tuple[str, str]]:
+def graft_pairs(name: str) -> list[tuple[str, str]]:
     """Return (slot, donor) for every slot that the name of a graft fills.
 
     Raises:

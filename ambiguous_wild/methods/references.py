@@ -29,6 +29,7 @@ _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
 _helpers: dict[str, Path] = {}  # files of modules that loaded files imported from beside them, by name
 _NO_HELPERS = (Path(os.__file__).resolve().parent, Path(__file__).resolve().parents[1])  # Python's and ours
 EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
+_GRAFTED = re.compile(r"@(?:mask|density|regulariser|effects)=[^@]*$")
 _RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
 
@@ -125,7 +126,12 @@ def error_location(error: BaseException) -> str:
 
 def is_reference(name: str) -> bool:
     """Whether the name is a reference."""
-    return is_program(name) or _RECIPE.fullmatch(name) is not None
+    return is_program(name) or _recipe_match(name) is not None
+
+
+def _recipe_match(name: str) -> re.Match[str] | None:
+    """Match FILE.py:RECIPE, but not a graft whose last donor is one: 3dgs@mask=FILE.py:RECIPE."""
+    return None if _GRAFTED.search(name) else _RECIPE.fullmatch(name)
 
 
 def is_program(name: str) -> bool:
@@ -137,7 +143,7 @@ def reference_file(name: str) -> Path | None:
     """Return the file that a reference names; None if it names no file."""
     if name.startswith(EXTERNAL):
         return Path(name.removeprefix(EXTERNAL))
-    match = None if name.startswith(NERFBASELINES) else _RECIPE.fullmatch(name)
+    match = None if name.startswith(NERFBASELINES) else _recipe_match(name)
     return Path(match["path"]) if match else None
 
 

@@ -16,7 +16,14 @@ from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.methods.builtin import BUILTIN
 from ambiguous_wild.methods.entry import MethodEntry, second_pass, trained_once
-from ambiguous_wild.methods.graft import grafted, knows_truth, refuse_parts_of_program, split_graft
+from ambiguous_wild.methods.graft import (
+    graft_name,
+    graft_pairs,
+    grafted,
+    knows_truth,
+    refuse_parts_of_program,
+    split_graft,
+)
 from ambiguous_wild.methods.references import (
     hash_of_package,
     import_file,
@@ -85,8 +92,10 @@ def get_method(name: str) -> MethodEntry:
         return load_reference(name)
     methods = all_methods()
     if name not in methods and "@" in name:
-        host = get_method(split_graft(name)[0])
-        return grafted(name, host, all_methods())
+        host_name, _ = split_graft(name)
+        host, donors = get_method(host_name), dict(graft_pairs(name))
+        donors |= {slot: load_reference(donor).name for slot, donor in donors.items() if is_reference(donor)}
+        return grafted(graft_name(host_name, donors), host, all_methods())
     if name not in methods and name.endswith(".py"):
         raise without_recipe(Path(name))
     module, _, recipe = name.partition(":")

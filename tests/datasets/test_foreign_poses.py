@@ -365,7 +365,7 @@ LENS = ",-0.2,0.12,-0.05,0.02,0.003,-0.002"
 REFUSED = {
     "entities": ("metashape", edit(XML, ("<document", BOMB)), "DOCTYPE"),
     "cut": ("metashape", edit(XML, ("</chunk>", "")), "not as Metashape writes it"),
-    "panorama": ("metashape", edit(XML, ('type="frame"', 'type="spherical"')), "split 360"),
+    "panorama": ("metashape", edit(XML, ('type="frame"', 'type="spherical"')), "splits 360"),
     "equisolid": ("metashape", edit(XML, ('type="frame"', 'type="equisolid_fisheye"')), "equidistant"),
     "p3": ("metashape", edit(XML, ("</p2>", "</p2><p3>1e-4</p3>")), "p3 or p4"),
     "rig": ("metashape", edit(XML, ('<camera id="99"', '<camera id="99" master_id="1"')), "multi-camera"),

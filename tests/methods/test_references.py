@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.job import read_sources
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.graft import graft_name
 from ambiguous_wild.methods.references import import_file
@@ -184,3 +185,14 @@ def test_a_file_that_is_not_there_or_is_broken(recipe, tmp_path):
     recipe.write_text("x = (")
     with pytest.raises(AwError, match=r"recipe.py, line 1"):
         registry.get_method(f"{recipe}:plain")
+
+
+def test_a_donor_may_be_a_recipe_in_a_file(recipe):
+    entry = registry.get_method(f"refinesplat@mask={recipe}:plain")
+    assert entry.name == "refinesplat@mask=plain"
+    assert entry.given_as == f"refinesplat@mask={recipe.resolve()}:plain"
+    assert registry.get_method(entry.given_as).source_hash == entry.source_hash != ""
+    ((text, kind),) = [(source.text, source.kind) for source in read_sources([], [entry.given_as])]
+    assert (text, kind) == (f"{recipe.resolve()}:plain", "method")
+    with pytest.raises(AwError, match="no plugin file"):
+        registry.get_method("3dgs@mask=nowhere.py:mine")

@@ -128,9 +128,7 @@ def grafted(name: str, host: MethodEntry, methods: Mapping[str, MethodEntry]) ->
         source_hash=hashlib.sha256("".join(hashes).encode()).hexdigest() if any(hashes) else "",
         slots=tuple((slot, entry.name) for slot, entry in entries.items())
         + tuple((slot, donor) for slot, donor in pairs if donor in ALIASES),
-        given_as=graft_name(host.given_as or host.name, typed)
-        if any(e.given_as for e in entries.values())
-        else "",
+        given_as=graft_name(host.given_as or host.name, typed) if in_files else "",
     )
 
 

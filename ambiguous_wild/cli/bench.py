@@ -34,7 +34,7 @@ RARE: dict[str, dict[str, Any]] = {
     "engine": {"retries": (0, 1000), "memory_per_cell": (0, math.inf), "transfer_limit": (0.001, math.inf)},
 }
 LONGEST_S = 366 * 24 * 3600.0
-_UNITS = {"s": 1, "m": 60, "min": 60, "h": 3600}
+_UNITS = {"s": 1, "sec": 1, "second": 1, "m": 60, "min": 60, "minute": 60, "h": 3600, "hour": 3600}
 
 
 def parse_budget(text: str) -> float:
@@ -43,7 +43,7 @@ def parse_budget(text: str) -> float:
     Raises:
         AwError: it is no duration of this form.
     """
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|m|min|h)\s*", text)
+    match = re.fullmatch(rf"\s*(\d+(?:\.\d+)?)\s*({'|'.join(_UNITS)})s?\s*", text)
     if not match or float(match[1]) <= 0:
         raise AwError(f"budget {text!r} is no duration above zero: write 90s, 10m or 1.5h")
     seconds = float(match[1]) * _UNITS[match[2]]

@@ -43,6 +43,9 @@ class FiniteFloat(click.FloatRange):
             self.fail(f"{value} is no finite number.", param, ctx)
         return number
 
+    def _describe_range(self) -> str:
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
 
 def _load_plugins(_: click.Context, __: click.Parameter, paths: tuple[Path, ...]) -> None:
     """Register the methods of the files, before the command runs."""

@@ -104,6 +104,12 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         f"{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
         f"{output / 'comparison.png'}. To train longer: {longer} -o longer"
     )
+    for run in sorted(runs.glob(f"*/{METHODS[-1]}/seed0")):
+        say(
+            f"the splat without distractors: {run / 'point_cloud.ply'}; as SPZ, SOG and glTF: aw export {run}"
+        )
+        if (run / "masks").is_dir():
+            say(f"its masks, white = static: {run / 'masks'}")
 
 
 def _announced(source: Path, seconds: float) -> str:

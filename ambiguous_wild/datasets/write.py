@@ -254,6 +254,8 @@ def _write_scene(
     notes += mask_warnings({"kept_share": shares, "alpha": hidden})
     if lost := [note for p in placed for note in p.notes if note.startswith("undistorted without")]:
         notes.append(f"{counted(len(lost), 'photo')} {max(lost)}: the lens sees more than a pinhole camera")
+    if any(note.startswith("downsampled by") for p in placed for note in p.notes):
+        notes.append("photos are reduced in linear light, papers' loaders do it in sRGB: 40 to 44 dB apart")
     if profiles := [note for p in placed for note in p.notes if note.startswith(FROM_PROFILE)]:
         notes.append(f"{counted(len(profiles), 'photo')}: {shortlist(sorted(set(profiles)))}")
     sides = {p.image.name: foreign.split[plan.image.name] for plan, p in zip(plans, placed)}

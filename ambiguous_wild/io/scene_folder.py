@@ -272,6 +272,8 @@ def model_folder(root: Path, listed: Collection[str] = ()) -> Path:
         known = {PurePosixPath(name).parent.as_posix() for name in listed}
         ours = (folder for folder, _ in models if folder.relative_to(root).as_posix() in known)
         return next(ours, models[0][0])
+    if inner := [str(child) for child in sorted(root.glob("*/")) if models_in(child)]:
+        raise AwError(f"{root} is no scene; did you mean {shortlist(inner, 3)}?")
     raise AwError(
         f"{root} is no scene: neither sparse/0 nor sparse holds a COLMAP model; "
         f"if it holds photos, build one with 'aw build-scene {root} -o SCENE'"

@@ -18,7 +18,13 @@ from tests.tiny_scene import write_tiny_scene
 
 
 def test_budgets():
-    assert [parse_budget(text) for text in ("90s", "10m", "1.5h", " 2 min ")] == [90, 600, 5400, 120]
+    assert [parse_budget(text) for text in ("90s", "10m", "1.5h", " 2 min ", "10minutes")] == [
+        90,
+        600,
+        5400,
+        120,
+        600,
+    ]
     for text in ("", "10", "m", "-3m", "0s", "10m30", "1e3s"):
         with pytest.raises(AwError, match="no duration"):
             parse_budget(text)

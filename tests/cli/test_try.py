@@ -28,6 +28,8 @@ def test_photos_become_a_table_and_a_page(tmp_path: Path) -> None:
     assert _commands(done.stderr) == wanted
     assert (out / "view/index.html").is_file() and (out / "comparison.png").is_file()
     assert "3dgs" in done.stdout and "refinesplat" in done.stdout
+    splat = out / "runs/walls/refinesplat/seed0/point_cloud.ply"
+    assert splat.is_file() and f"the splat without distractors: {splat}" in done.stderr
     assert known_iterations(out / "runs") == 300 and "takes longer" in done.stderr
     again = aw(*words)
     assert again.returncode == 0 and again.stderr.count("finished before, kept") == 2

@@ -1,8 +1,16 @@
-"""What a container may use."""
+"""Machines as people have them: containers, no home, another code page, another OpenCV."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
 import pytest
 
-from ambiguous_wild.core import machine
+from ambiguous_wild.core import AwError, machine
+from ambiguous_wild.core.weight_files import expanded
+from ambiguous_wild.io.images import ximgproc
 
 
 @pytest.fixture
@@ -39,3 +47,28 @@ def test_memory_limits_how_many_large_photos_are_read_at_once(cgroup):
     assert machine.photo_threads(4_000_000) == 3
     (cgroup / "memory.max").write_text("max")
     assert machine.usable_memory() != 10**9
+
+
+def test_a_user_without_a_home_has_a_cache(monkeypatch):
+    def unknown(path):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", unknown)
+    assert expanded("~/.cache/ambiguous_wild/weights", "AW_WEIGHTS").is_absolute()
+    with pytest.raises(AwError, match="no home folder is known"):
+        expanded("~/mine", "AW_WEIGHTS")
+
+
+def test_signs_that_a_code_page_lacks_are_replaced():
+    done = subprocess.run(
+        [sys.executable, "-m", "ambiguous_wild.cli.main", "methods"],
+        env=os.environ | {"PYTHONIOENCODING": "ascii"}, capture_output=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and b"refinesplat" in done.stdout and b"Traceback" not in done.stderr
+
+
+def test_an_opencv_without_contrib_names_the_package(monkeypatch):
+    assert ximgproc().guidedFilter
+    monkeypatch.delattr(cv2, "ximgproc")
+    with pytest.raises(AwError, match="--force-reinstall --no-deps opencv-contrib-python-headless"):
+        ximgproc()

@@ -131,12 +131,16 @@ def _copy(
     left: list[LeftOut] = [{"source": c, "why": f"the same file as {kept}"} for c, kept in copies.items()]
     photos: list[CapturedPhoto] = []
     bar.start("photos", len(sources))
+    spheres = 0
     for listed in sources:
         bar.step()
         try:
             photo, pixels = read_photo(listed.path, panoramas=True)
         except UnreadablePhoto as error:
             left.append({"source": listed.source, "why": error.reason})
+            continue
+        if photo.sphere and photo.width != 2 * photo.height:
+            left.append({"source": listed.source, "why": "a part of a 360 degree photo, not all of it"})
             continue
         side = listed.side or ("train" if capture.has_sides else "")
         # The stem need not start with the folder's name, as the copy lies in a folder of that name.
@@ -147,7 +151,10 @@ def _copy(
         if target.exists():  # `train_a.jpg` beside train/a.jpg, for example
             target = target.with_name(full_name)
         written = {target: pixels}
-        if is_panorama(photo.width, photo.height, photo.sphere):
+        exif = photo.exif
+        focal = exif.focal_mm is not None or exif.focal_35mm is not None
+        if is_panorama(photo.width, photo.height, photo.sphere, focal):
+            spheres += 1
             views = pinhole_views(pixels)
             written = {target.with_name(f"{target.stem}_yaw{yaw:03}.jpg"): view for yaw, view in views}
             for path, view in written.items():
@@ -160,9 +167,8 @@ def _copy(
                 {"photo": relative, "source": listed.source, "sharpness": round(sharpness(shown), 1)}
             )
     bar.finish()
-    spheres = {photo["source"] for photo in photos if "_yaw" in photo["photo"]}
     if spheres:
-        bar.say(f"{counted(len(spheres), '360 degree photo')} split into {len(YAWS_DEG)} pinhole views each")
+        bar.say(f"{counted(spheres, '360 degree photo')} split into {len(YAWS_DEG)} pinhole views each")
     return photos, left
 
 

@@ -43,10 +43,11 @@ def parse_budget(text: str) -> float:
     Raises:
         AwError: it is no duration of this form.
     """
-    match = re.fullmatch(rf"\s*(\d+(?:\.\d+)?)\s*({'|'.join(_UNITS)})s?\s*", text)
+    units = "|".join(unit if len(unit) == 1 else f"{unit}s?" for unit in _UNITS)
+    match = re.fullmatch(rf"\s*(\d+(?:\.\d+)?)\s*({units})\s*", text)
     if not match or float(match[1]) <= 0:
         raise AwError(f"budget {text!r} is no duration above zero: write 90s, 10m or 1.5h")
-    seconds = float(match[1]) * _UNITS[match[2]]
+    seconds = float(match[1]) * _UNITS[match[2] if len(match[2]) == 1 else match[2].removesuffix("s")]
     if seconds > LONGEST_S:
         raise AwError(f"budget {text[:40]!r} is above a year: write 90s, 10m or 1.5h")
     return seconds

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 MEMORY_SHARE = 0.5  # of the usable memory, for photos that threads hold at a time
 BYTES_A_PIXEL = 40  # of a photo that is read, turned and searched for features
 
 CGROUP = Path("/sys/fs/cgroup")
+OWN_GROUPS = Path("/proc/self/cgroup")
 CPU_LIMITS = ("cpu.max", "cpu/cpu.cfs_quota_us")  # cgroup 2: quota and period; cgroup 1
 MEMORY_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")
 V1_PERIOD_US = 100_000
@@ -53,12 +54,19 @@ def photo_threads(largest_px: int) -> int:
 def _limits(names: tuple[str, ...]) -> list[list[int]]:
     """Return the whole numbers of these files, of the process's group and of the root of its container."""
     try:
-        own = [line.rpartition(":")[2] for line in Path("/proc/self/cgroup").read_text().splitlines()]
+        own = [line.rpartition(":")[2] for line in OWN_GROUPS.read_text().splitlines()]
     except OSError:
         own = []
-    folders = dict.fromkeys([CGROUP, *(CGROUP / path.strip().lstrip("/") for path in own)])
+    groups = [PurePosixPath(path.strip().lstrip("/")) for path in own]
+    within = dict.fromkeys([".", *(str(p) for group in groups for p in (group, *group.parents))])
+    # cgroup 2: GROUP/cpu.max; cgroup 1: the controller's folder comes first, cpu/GROUP/cpu.cfs_quota_us
+    paths = [
+        CGROUP / PurePosixPath(name).parent / group / PurePosixPath(name).name
+        for group in within
+        for name in names
+    ]
     limits = []
-    for path in (folder / name for folder in folders for name in names):
+    for path in dict.fromkeys(paths):
         try:
             numbers = [int(word) for word in path.read_text().split() if word.lstrip("-").isdigit()]
         except OSError:

@@ -80,7 +80,7 @@ def split_by_lists(
         set(in_model),
         _index(in_model, key),
         _index(in_model, lambda n: key(PurePosixPath(n).name)),
-        _index(in_model, lambda n: key(PurePosixPath(n).name).casefold()),
+        _index(in_model, lambda n: key(n).casefold()),
     )
     split: dict[str, Split] = {}
     missing: dict[Split, list[str]] = {}
@@ -88,7 +88,7 @@ def split_by_lists(
         missing[side] = []
         for name in listed[side]:
             fits = [name] if name in exact else by_key.get(key(name)) or by_base.get(key(name), [])
-            fits = fits or by_any_case.get(key(PurePosixPath(name).name).casefold(), [])
+            fits = fits or by_any_case.get(key(name).casefold(), [])
             if len(fits) > 1:
                 raise AwError(
                     f"{where}: {name!r} fits {shortlist(fits, 3)}; write the extension or the folder"

@@ -27,15 +27,18 @@ class LocatedPhotos:
 def locate(root: Path, names: Sequence[str]) -> LocatedPhotos:
     """Find the folder below `root` that holds most of the photos, and their paths in it.
 
-    A prefix that all names share may be missing there, as in /home/me/scan/images/a.jpg. Of folders that hold
-    as many the first of `PREFERRED` is taken; a photo that is in none keeps its name without the prefix.
+    A prefix that all names share may be missing there, as in /home/me/scan/images/a.jpg. Folders of other
+    names than `PREFERRED` are looked into where these hold none. A photo that is in none keeps its name
+    without the prefix.
     """
     parts = [_parts(name) for name in names]
-    shared = min(len(path) for path in parts) - 1
+    shared = min((len(path) for path in parts), default=1) - 1
     shared = next((k for k in range(shared) if len({path[k] for path in parts}) > 1), shared)
     folders, reduced = _folders(root)
     best = LocatedPhotos(root / "images", dict(zip(names, map("/".join, parts))), 0)
     for folder in (*folders, *reduced):
+        if best.found and not _is_preferred(folder, root):
+            break  # other folders may hold pictures of the same names: masks, depth
         for drop in range(shared + 1):
             tails = ["/".join(path[drop:]) for path in parts]
             found = sum(find_photo(folder, tail) is not None for tail in tails)
@@ -47,6 +50,10 @@ def locate(root: Path, names: Sequence[str]) -> LocatedPhotos:
             if found == len(names):
                 return best
     return best
+
+
+def _is_preferred(folder: Path, root: Path) -> bool:
+    return folder in {root / name if name else root for name in PREFERRED}
 
 
 def find_photo(folder: Path, name: str) -> Path | None:

@@ -169,9 +169,6 @@ def register(metric: Metric) -> Metric:
         raise AwError(f"{metric.key[:60]!a} cannot name a metric: lower case, digits, '_' and '.'")
     if metric.key in MEASURES:
         raise AwError(f"metric {metric.key!r} is built in: give yours another key")
-    other = own_metrics.get(metric.key)
-    if other is not None and other.function and other.source != metric.source and metric.source:
-        raise AwError(f"two files hold a metric {metric.key!r}: give one of them another key")
     for field, value, right, form in (
         ("better", metric.better, metric.better in get_args(Better), "'higher', 'lower' or None"),
         ("digits", metric.digits, type(metric.digits) is int and metric.digits >= 0, "a whole number"),
@@ -188,6 +185,9 @@ def register(metric: Metric) -> Metric:
     return metric
 
 
+_files: dict[str, Path] = {}  # key of a user's metric -> the file that it was loaded from
+
+
 def load_metrics(path: Path) -> None:
     """Register every `Metric` of a Python file; raise AwError if it has none, or a wrong one."""
     module, digest = import_file(path)
@@ -195,6 +195,10 @@ def load_metrics(path: Path) -> None:
     if not in_file:
         raise AwError(f"{path} holds no Metric: see 'Your own metric' in docs/metrics.md")
     for metric in in_file:
+        known, other = own_metrics.get(metric.key), _files.get(metric.key)
+        if known is not None and known.function and other not in (None, path.resolve()):
+            raise AwError(f"{other} and {path} both hold a metric {metric.key!r}: give one another key")
+        _files[metric.key] = path.resolve()
         register(replace(metric, source=digest))
 
 

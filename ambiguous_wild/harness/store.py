@@ -175,7 +175,7 @@ def contradictions(config: ReadConfig, result: RunResult) -> Iterator[str]:
         "hash of the settings": (config.get("config_hash"), result["config_hash"]),
         "start": (str(section(config, "start").get("sha256", ""))[:8] or None, start_hash(facts)),
     }
-    if config.get("effects"):
+    if config.get("effects") and result["status"] == "ok":  # a failure states none
         pairs["effects"] = config["effects"], facts.get("effects")
     for what, (asked, got) in pairs.items():
         if asked is not None and asked != got:

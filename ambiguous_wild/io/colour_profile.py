@@ -13,7 +13,6 @@ from ambiguous_wild.core.srgb import linear_to_srgb
 
 LATTICE = np.arange(0, 256, 51).astype(np.uint8)  # codes at which a profile is compared with sRGB
 SAME_CODES = 3  # largest difference of a profile that is sRGB under another name
-DAMAGED = "a profile that cannot be read"
 INTEROP, R03 = 0xA005, "R03"  # EXIF's tag of interoperability, and its index for Adobe RGB (DCF 2.0)
 ADOBE_GAMMA = 563 / 256
 # Linear sRGB from linear Adobe RGB (1998), both with white D65.
@@ -31,7 +30,7 @@ class Colours:
 
     @property
     def name(self) -> str:
-        """Name of the colours; "" for those of sRGB."""
+        """Name of the colours; "" for those of sRGB, and for a damaged profile."""
         if self.icc is not None:
             return _transform(self.icc)[0]
         if self.adobe:
@@ -48,10 +47,18 @@ class Colours:
         if self.icc is not None:
             _, transform, mode = _transform(self.icc)
             small = pixels if pixels.dtype == np.uint8 else (pixels // 257).astype(np.uint8)
-            return small if transform is None else _applied(transform, small, mode)
-        light = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
-        light = (light**ADOBE_GAMMA) @ ADOBE.T.astype(np.float32) if self.adobe else light ** (1 / self.gamma)
-        return (linear_to_srgb(light) * 255 + 0.5).astype(np.uint8)
+            if transform is None or (mode == "L" and np.ptp(small, axis=2).any()):
+                return pixels  # a damaged profile, or one of grey in a photo of colours
+            return _applied(transform, small, mode)
+        top = np.iinfo(pixels.dtype).max
+        power = ADOBE_GAMMA if self.adobe else 1 / self.gamma
+        light = (np.arange(top + 1) / top) ** power  # of every code
+        if not self.adobe:
+            return (linear_to_srgb(light) * 255 + 0.5).astype(np.uint8)[pixels]
+        result = np.empty(pixels.shape, np.uint8)
+        for row, codes in enumerate(pixels):  # row by row, because floats of a whole photo are large
+            result[row] = (linear_to_srgb(light[codes] @ ADOBE.T) * 255 + 0.5).astype(np.uint8)
+        return result
 
 
 def colours_of(image: Any) -> Colours:
@@ -59,8 +66,10 @@ def colours_of(image: Any) -> Colours:
     profile = image.info.get("icc_profile")
     if isinstance(profile, bytes) and profile:
         return Colours(profile)
+    # Pillow would decode all of a PNG to look for EXIF at its end.
+    stated = image.format != "PNG" or "exif" in image.info
     try:
-        adobe = image.getexif().get_ifd(INTEROP).get(1) == R03
+        adobe = stated and image.getexif().get_ifd(INTEROP).get(1) == R03
     except Exception:  # damaged EXIF raises many kinds
         adobe = False
     gamma = image.info.get("gamma")
@@ -83,7 +92,7 @@ def _transform(profile: bytes) -> tuple[str, Any, str]:
         transform = ImageCms.buildTransform(source, srgb, mode, "RGB", renderingIntent=intent)
         name = ImageCms.getProfileDescription(source).strip() or "an unnamed profile"
     except (ImageCms.PyCMSError, OSError, ValueError, AttributeError):
-        return DAMAGED, None, ""
+        return "", None, ""
     codes = np.stack(np.meshgrid(LATTICE, LATTICE, LATTICE), axis=-1).reshape(-1, len(LATTICE), 3)
     codes = codes if mode == "RGB" else np.repeat(codes[..., :1], 3, axis=2)
     change = np.abs(_applied(transform, codes, mode).astype(int) - codes).max()

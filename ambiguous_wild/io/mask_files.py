@@ -17,14 +17,21 @@ MARKS = (".mask", "_mask", "-mask")
 SPELLINGS = "a mask of a.jpg is called a.png, a.jpg.png, a.mask.png, a.jpg.mask.png, a_mask.png or mask_a.png"
 
 
-def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+def find_masks(folder: Path, names: Iterable[str], files: set[Path] | None = None) -> dict[str, Path]:
     """Find mask files by the name of the photo; photos without one are absent.
 
     A mask is called as in `SPELLINGS`, in any format and case, and lies under the photo's path or, if no
     other photo has this base name, directly in `folder`. In a folder that holds the photos too, only files
     that are marked as masks are.
+
+    Args:
+        folder: of the masks.
+        names: of the photos.
+        files: what may be a mask, of this folder and others; None: all of it, or what is marked.
     """
-    files = masks_beside_photos(folder) or mask_files(folder)
+    if files is None:
+        files = masks_beside_photos(folder) or mask_files(folder)
+    files = {path for path in files if path.is_relative_to(folder)}
     there: dict[str, Path] = {}
     for path in sorted(files):
         there.setdefault(_key(path.relative_to(folder).as_posix()), path)
@@ -42,8 +49,8 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
 
 def side_masks(folder: Path, names: Iterable[str], side: Split) -> dict[str, Path]:
     """Find the masks of one side's photos in `folder`, or in its folder of that side."""
-    listed = list(names)
-    return find_masks(folder, listed) | find_masks(folder / side, listed)
+    listed, files = list(names), masks_beside_photos(folder) or mask_files(folder)
+    return find_masks(folder, listed, files) | find_masks(folder / side, listed, files)
 
 
 def mask_files(folder: Path) -> set[Path]:

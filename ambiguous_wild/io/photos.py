@@ -148,9 +148,9 @@ def read_photo(
 
 
 def is_photo(path: Path) -> bool:
-    """Whether a file is taken for a photo: by its suffix, or as a JPEG under any name."""
+    """Whether a file is taken for a photo: by its suffix, or without one as a JPEG."""
     suffix = path.suffix.lower()
-    if suffix in PHOTO_SUFFIXES or suffix in UNREAD_SUFFIXES:
+    if suffix:
         return suffix in PHOTO_SUFFIXES
     try:
         with open(path, "rb") as f:

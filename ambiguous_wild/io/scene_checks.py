@@ -183,7 +183,8 @@ def _correlation(small: Path, photo: Path) -> float:
     """Correlation of two pictures at the size of the smaller; 1 where one of them shows no contrast."""
     import cv2
 
-    read = (decode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE, str(path)) for path in (small, photo))
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    read = (decode(np.fromfile(path, np.uint8), flags, str(path)) for path in (small, photo))
     grey = [pixels for pixels in read if pixels is not None]
     if len(grey) < 2:
         return 1.0  # reading the photo reports it

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeGuard, cast
 
@@ -306,6 +306,17 @@ def _image_folder(root: Path, factor: int) -> Path:
     return folder
 
 
+def _unique_keys(names: Sequence[str]) -> dict[str, str]:
+    """Return photos by their names, with and without suffix, and by base names that no other photo has."""
+    by_key = {key: name for name in names for key in (without_suffix(name), name)}
+    bases = Counter(PurePosixPath(name).name for name in names)
+    for name in names:
+        base = PurePosixPath(name).name
+        if bases[base] == 1:
+            by_key |= {key: name for key in (without_suffix(base), base) if key not in by_key}
+    return by_key
+
+
 def default_split(root: Path, names: Iterable[str]) -> tuple[dict[str, Split], str]:
     """Split photos without train_list.txt and test_list.txt, and say how.
 
@@ -315,12 +326,11 @@ def default_split(root: Path, names: Iterable[str]) -> tuple[dict[str, Split], s
     ordered, unused = sorted(names), ""
     for path in (root / place / TESTS_OF_3DGS for place in ("sparse/0", "sparse", ".")):
         listed = read_list(path) if path.is_file() else []
-        known = {key for name in listed for key in (name, without_suffix(name), PurePosixPath(name).name)}
-        tests = {n for n in ordered if known & {n, without_suffix(n), PurePosixPath(n).name}}
+        by_key = _unique_keys(ordered)
+        tests = {by_key[key] for name in listed for key in (name, without_suffix(name)) if key in by_key}
         where = path.relative_to(root)
         if 0 < len(tests) < len(ordered):
-            found = {key for n in tests for key in (n, without_suffix(n), PurePosixPath(n).name)}
-            absent = [n for n in listed if not {n, without_suffix(n), PurePosixPath(n).name} & found]
+            absent = [n for n in listed if not {n, without_suffix(n)} & by_key.keys()]
             lacking = f"; not in the model: {shortlist(absent, 3)}" if absent else ""
             note = f"{where} names {len(tests)} of {len(ordered)} photos: the test photos{lacking}"
             return {n: "test" if n in tests else "train" for n in ordered}, note

@@ -51,7 +51,8 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
     if not path.is_file():
         raise AwError(f"no plugin file {path}: give the path of a .py file")
     name = f"aw_plugin_{path.stem}"
-    if name in sys.modules and getattr(sys.modules[name], "__file__", None) != str(path):
+    loaded = getattr(sys.modules.get(name), "__file__", None)
+    if loaded is not None and Path(loaded).resolve() != path.resolve():
         name += f"_{config_hash(str(path.resolve()))[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -62,7 +63,7 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
     folder = path.resolve().parent
     # helpers are imported anew: they may have been edited, another file's may have the same name, and the
     # hash needs those of this file
-    for helper in list(_helpers):
+    for helper in [n for n, file in _helpers.items() if file.is_relative_to(folder) or _has(folder, n)]:
         del _helpers[helper]
         sys.modules.pop(helper, None)
     before = set(sys.modules)
@@ -87,6 +88,11 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
     return module, config_hash({**each, "": digest}) if each else digest
 
 
+def _has(folder: Path, module: str) -> bool:
+    place = folder.joinpath(*module.split("."))
+    return place.with_suffix(".py").is_file() or (place / "__init__.py").is_file()
+
+
 def _imported_later(path: Path, folder: Path) -> set[Path]:
     """Return the files below a folder that a file, or one of these, names in an import, also in functions."""
     found: set[Path] = set()
@@ -99,7 +105,9 @@ def _imported_later(path: Path, folder: Path) -> set[Path]:
         names = {
             alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names
         }
-        names |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
+        froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
+        names |= {str(node.module) for node in froms}
+        names |= {f"{node.module}.{alias.name}" for node in froms for alias in node.names}
         for place in (folder.joinpath(*name.split(".")) for name in names):
             for file in (place.with_suffix(".py"), place / "__init__.py"):
                 if file.is_file() and file != path and file not in found:

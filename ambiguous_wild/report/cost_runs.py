@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -172,21 +173,19 @@ def _differ(runs: Sequence[CostRun]) -> list[str]:
 
 
 def _unequal_methods(scene: str, runs: Sequence[CostRun]) -> list[str]:
-    """Return a note where no two methods have runs with the same effects, or the same limit of Gaussians."""
+    """Return a note where no effects, or no limit of Gaussians, are common to all methods."""
     notes = []
     for what, value in (
         ("effects", lambda run: ", ".join(sorted(run.effects)) or "none"),
         ("limits of Gaussians", lambda run: str(dict(run.options).get("max_gaussians", "auto"))),
     ):
-        by_method = {method: {value(run) for run in of} for method, of in grouped(runs, _base).items()}
+        by_method = {
+            method: {value(run) for run in of} for method, of in grouped(runs, attrgetter("base")).items()
+        }
         if len(by_method) > 1 and not set.intersection(*by_method.values()):
             each = "; ".join(f"{method}: {', '.join(sorted(of))}" for method, of in by_method.items())
             notes.append(f"methods on {scene} differ in their {what} ({each})")
     return notes
-
-
-def _base(run: CostRun) -> str:
-    return run.base
 
 
 def _with_effects_of_plans(runs: list[CostRun]) -> list[CostRun]:

@@ -66,8 +66,8 @@ def export_runs(
         scene_folder: where the scene lies; None = where the runs say.
         threads: threads of the kernels; None = all cores.
         overwrite: replace files of these names in `output`; those in RUN/export are always replaced.
-        up: axis of the files that points up, see `viewing.model.export`; None = the scene's coordinates.
-        clean: leave out Gaussians that no training photo needs, see `viewing.export_parts`.
+        up: axis of the files that points up, see `model_export.export`; None = the scene's coordinates.
+        clean: leave out Gaussians that no training photo needs, see `viewing.model_export`.
         skybox: write the skybox.
         pad_harmonics: write harmonics of degree 3, padded with zeros.
         say: gets a line about each run that is left out, and about parts of models that are.
@@ -113,7 +113,8 @@ def export_runs(
         except AwError as error:
             if up is not None or run is None or clean or not skybox:
                 raise
-            say(f"{model.label}: the loss is not measured: {error}")
+            what = "the loss is not measured" if loss else "a skybox is not looked for"
+            say(f"{model.label}: {what}: {error}")
         space = None if up is None or scene is None else space_of(scene)
         views = scene.test if scene is not None and loss else ()
         stem = "point_cloud" if output is None and run is not None else name

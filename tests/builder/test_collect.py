@@ -127,7 +127,8 @@ def test_one_side_alone_and_no_folder(tmp_path):
 
 def test_jpegs_under_any_name_are_photos_and_what_is_not_read_is_counted(tmp_path):
     put(tmp_path, "a.jpg", "b.jfif", "c.jpe", "d.avif", "e.cr2", "f.cr2", "notes.txt")
-    (tmp_path / "saved").write_bytes(b"\xff\xd8\xff rest")
+    for name in ("saved", "a.jpg_original", "GX01.THM"):
+        (tmp_path / name).write_bytes(b"\xff\xd8\xff rest")
     capture = collect(tmp_path)
     assert [s.source for s in capture.sources] == ["a.jpg", "b.jfif", "c.jpe", "d.avif", "saved"]
     assert any("2 pictures of formats that are not read, left out: .cr2 (2)" in n for n in capture.notes)

@@ -25,7 +25,7 @@ def test_budgets():
         120,
         600,
     ]
-    for text in ("", "10", "m", "-3m", "0s", "10m30", "1e3s"):
+    for text in ("", "10", "m", "-3m", "0s", "10m30", "1e3s", "500ms", "5ss"):
         with pytest.raises(AwError, match="no duration"):
             parse_budget(text)
 

@@ -17,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.srgb import srgb_to_linear
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
 from ambiguous_wild.io.colmap_model import read_model, write_model
-from ambiguous_wild.io.colour_profile import ADOBE, ADOBE_GAMMA
+from ambiguous_wild.io.colour_profile import ADOBE, ADOBE_GAMMA, Colours
 from ambiguous_wild.io.images import load_image_float, read_png_rgb, write_png
 from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene
@@ -262,3 +262,44 @@ def test_reduced_photos_of_several_sizes_are_refused(tmp_path: Path) -> None:
         )
     with pytest.raises(AwError, match=r"1 photos of .* are reduced otherwise"):
         load_scene(root, factor=2)
+
+
+def test_adobe_rgb_is_converted_as_computed_by_hand() -> None:
+    """Pure green and mid red: linear by the gamma 563/256, then the published matrices through XYZ (D65)."""
+    codes = np.uint8([[[0, 255, 0], [128, 64, 32]]])
+    adobe_xyz = np.array(
+        [[0.57667, 0.18556, 0.18823], [0.29734, 0.62736, 0.07529], [0.02703, 0.07069, 0.99134]]
+    )
+    xyz_srgb = np.array(
+        [[3.24045, -1.53714, -0.49853], [-0.96927, 1.87601, 0.04156], [0.05564, -0.20403, 1.05723]]
+    )
+    light = np.clip((codes / 255.0) ** (563 / 256) @ adobe_xyz.T @ xyz_srgb.T, 0, 1)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    assert np.abs(Colours(adobe=True).to_srgb(codes) - 255 * srgb).max() < 1
+
+
+def test_other_folders_and_other_cameras_do_not_stand_in(tmp_path: Path) -> None:
+    """A folder of masks with the photos' names, and equal names in the folders of a rig."""
+    root = plain(tmp_path / "raw")
+    (root / "images" / NAMES[0]).unlink()
+    layouts.write_photos(root / "sam_masks")
+    with pytest.raises(AwError, match=r"1 of 7 photos that the model registers are not in .*images"):
+        import_scene(root, tmp_path / "scene", ImportSettings(kind="colmap"))
+    rig = [f"cam{k}/{n}" for k in (0, 1) for n in ("a.png", "b.png")]
+    model = layouts.make_model(rig)
+    write_model(tmp_path / "rig/sparse/0", model)
+    layouts.write_photos(tmp_path / "rig/images", rig)
+    (tmp_path / "rig/sparse/0/test.txt").write_text("cam0/a.png\n")
+    assert [view.name for view in load_scene(tmp_path / "rig").test] == ["cam0/a.png"]
+
+
+def test_marked_masks_of_one_side_leave_the_photos_of_the_other_alone(tmp_path: Path) -> None:
+    names = [f"{'train' if n in TRAIN else 'test'}/{n}" for n in NAMES]
+    root = tmp_path / "raw"
+    layouts.write_photos(root / "images", names)
+    write_model(root / "sparse/0", layouts.make_model(names))
+    layouts.write_lists(root, names[:5], names[5:])
+    for name in names[:5]:
+        write_png(root / "images" / f"{name[:-4]}_mask.png", KEEP)
+    scene = load_scene(import_scene(root, tmp_path / "scene", ImportSettings(kind="colmap")).scene)
+    assert sum(view.keep_path is not None for view in scene.views) == 5

@@ -110,10 +110,11 @@ def test_what_is_wrong_with_it_is_said_before_anything_is_trained(
 
 def test_two_files_with_one_key_are_refused(own: Path, tmp_path: Path) -> None:
     load_metrics(own)
+    own.write_text(own.read_text() + "# edited\n")
     load_metrics(own)  # again, as in a notebook
     other = tmp_path / "other.py"
     other.write_text(own.read_text() + "# another one\n")
-    with pytest.raises(AwError, match="two files hold a metric"):
+    with pytest.raises(AwError, match="both hold a metric"):
         load_metrics(other)
 
 

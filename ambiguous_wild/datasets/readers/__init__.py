@@ -167,10 +167,9 @@ def with_masks(scene: ForeignScene) -> ForeignScene:
     train, test = ([name for name, of in scene.split.items() if of == side] for side in SIDES)
     by_side, files = scene.masks, set(scene.masks.values())
     base = scene.photos.parent if scene.photos != scene.root else scene.root
-    there = (
-        p for place in (base, scene.photos) if place.is_dir() for p in sorted(place.iterdir()) if p.is_dir()
-    )
-    folder = next((p for p in there if p.name.lower() in MASK_FOLDERS), scene.photos)
+    there = [p for place in (base, scene.photos) if place.is_dir() for p in sorted(place.iterdir())]
+    named = [p for p in there if p.is_dir() and p.name.lower() in MASK_FOLDERS]
+    folder = min(named, key=lambda p: MASK_FOLDERS.index(p.name.lower()), default=scene.photos)
     if by_side:
         folder = Path(os.path.commonpath({mask.parent for mask in files}))
     elif scene.kind not in ("drone", "dualsplat", "blender") and not (folder / OWN_MASKS).is_file():

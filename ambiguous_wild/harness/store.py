@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -212,8 +213,12 @@ def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
         if not 0.0 <= score <= 1.0 + ROUNDING:
             yield f"masks.{name}", score, "is a share, from 0 to 1"
     for name, amount in result["cost"].items():
-        if isinstance(amount, (int, float)) and not (math.isfinite(amount) and amount >= 0):
-            yield f"cost.{name}", amount, "is finite and not below 0"
+        if not isinstance(amount, (int, float)):
+            continue
+        # integers in JSON have any size
+        number = float(amount) if abs(amount) <= sys.float_info.max else math.inf
+        if not (math.isfinite(number) and number >= 0):
+            yield f"cost.{name}", number, "is finite and not below 0"
 
 
 def _no_run(root: Path) -> AwError:

@@ -167,7 +167,13 @@ def test_unfinished_and_damaged_runs_are_listed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "odd", [{"ssim": 2.5}, {"psnr": -1.0}, {"cost": {"train_s": -5.0}}, {"masks": {"iou": 1.2}}]
+    "odd",
+    [
+        {"ssim": 2.5},
+        {"psnr": -1.0},
+        {"cost": {"train_s": -5.0}},
+        {"masks": {"iou": 1.2}},
+    ],
 )
 def test_numbers_that_no_measurement_gives_are_left_out_and_named(
     odd: dict[str, Any], tmp_path: Path

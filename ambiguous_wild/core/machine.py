@@ -68,9 +68,10 @@ def _limits(names: tuple[str, ...]) -> list[list[int]]:
     limits = []
     for path in dict.fromkeys(paths):
         try:
-            numbers = [int(word) for word in path.read_text().split() if word.lstrip("-").isdigit()]
+            words = path.read_text().split()
         except OSError:
             continue
-        if numbers and not path.read_text().startswith("max"):
+        numbers = [int(word) for word in words if word.lstrip("-").isdigit()]
+        if numbers and words[0] != "max":
             limits.append(numbers)
     return limits

@@ -37,6 +37,11 @@ def check_name(kind: str, name: str) -> str:
     return stripped
 
 
+def spelling_key(name: str) -> str:
+    """Return what is equal for names that differ in case and in whether letters are composed only."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
 def is_text(value: str) -> bool:
     """Whether the text can be written as UTF-8: JSON and command lines may hold lone surrogates."""
     return not any("\ud800" <= c <= "\udfff" for c in value)

@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from ambiguous_wild.core.names import spelling_key
 from ambiguous_wild.io.images import header_size
+from ambiguous_wild.io.mask_files import MASK_FOLDERS
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
 PREFERRED = ("images", "dense/images", "dense/0/images", "input", "rgb", "photos", "")  # "": the scene's own
-NO_PHOTOS = ("masks", "mask", "segmentation", "dynamic_masks", "depths", "depth", "normals", "truth")
+NO_PHOTOS = (*MASK_FOLDERS, "depths", "depth", "normals", "truth")
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def find_photo(folder: Path, name: str) -> Path | None:
     # A copy may be saved in another format; of a name with several dots only the last part is replaced.
     stem = exact.stem if exact.suffix.lower() in PHOTO_SUFFIXES else exact.name
     listed = _photos_by_stem(exact.parent, exact.parent.stat().st_mtime_ns)
-    return listed.get(_key(stem))
+    return listed.get(spelling_key(stem))
 
 
 @functools.lru_cache(maxsize=256)
@@ -78,7 +80,7 @@ def _photos_by_stem(folder: Path, _mtime_ns: int) -> dict[str, Path]:
     files = sorted(p for p in folder.iterdir() if p.name[0] != "." and p.is_file())
     for path in sorted(files, key=lambda p: p.suffix.lower() not in (".png", ".jpg", ".jpeg")):
         if path.suffix.lower() in PHOTO_SUFFIXES or header_size(path) is not None:
-            photos.setdefault(_key(path.stem), path)
+            photos.setdefault(spelling_key(path.stem), path)
     return photos
 
 
@@ -96,7 +98,3 @@ def _parts(name: str) -> tuple[str, ...]:
     parts = PurePosixPath(unicodedata.normalize("NFC", name).replace("\\", "/")).parts
     after = 1 + max((k for k, part in enumerate(parts) if part in ("..", "/") or part[1:] == ":"), default=-1)
     return parts[after:] or parts[-1:]
-
-
-def _key(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
+from ambiguous_wild.core.names import spelling_key
 from ambiguous_wild.core.scene import Split
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
@@ -30,18 +30,18 @@ def find_masks(folder: Path, names: Iterable[str], files: set[Path] | None = Non
         files: what may be a mask, of this folder and others; None: all of it, or what is marked.
     """
     if files is None:
-        files = masks_beside_photos(folder) or mask_files(folder)
+        files = _candidates(folder)
     files = {path for path in files if path.is_relative_to(folder)}
     there: dict[str, Path] = {}
     for path in sorted(files):
-        there.setdefault(_key(path.relative_to(folder).as_posix()), path)
+        there.setdefault(spelling_key(path.relative_to(folder).as_posix()), path)
     photos = [PurePosixPath(name) for name in names]
     bases = Counter(pure.name for pure in photos)
     masks: dict[str, Path] = {}
     for pure in photos if there else ():
         paths = [pure, PurePosixPath(pure.name)] if bases[pure.name] == 1 else [pure]
         for spelling in (s for path in paths for s in _spellings(path)):
-            if (key := _key(spelling)) in there:
+            if (key := spelling_key(spelling)) in there:
                 masks[str(pure)] = there[key]
                 break
     return masks
@@ -49,7 +49,7 @@ def find_masks(folder: Path, names: Iterable[str], files: set[Path] | None = Non
 
 def side_masks(folder: Path, names: Iterable[str], side: Split) -> dict[str, Path]:
     """Find the masks of one side's photos in `folder`, or in its folder of that side."""
-    listed, files = list(names), masks_beside_photos(folder) or mask_files(folder)
+    listed, files = list(names), _candidates(folder)
     return find_masks(folder, listed, files) | find_masks(folder / side, listed, files)
 
 
@@ -61,9 +61,17 @@ def mask_files(folder: Path) -> set[Path]:
 
 def masks_beside_photos(folder: Path) -> set[Path]:
     """Return the files that are marked as masks of photos in the same folder, in it or below."""
+    return _marked(mask_files(folder))
+
+
+def _candidates(folder: Path) -> set[Path]:
     files = mask_files(folder)
-    names = {(p.parent, _key(part)) for p in files for part in (p.name, p.stem)}
-    return {p for p in files if any((p.parent, _key(name)) in names for name in _masked(p))}
+    return _marked(files) or files
+
+
+def _marked(files: set[Path]) -> set[Path]:
+    names = {(p.parent, spelling_key(part)) for p in files for part in (p.name, p.stem)}
+    return {p for p in files if any((p.parent, spelling_key(name)) in names for name in _masked(p))}
 
 
 def _masked(path: Path) -> Iterator[str]:
@@ -79,7 +87,3 @@ def _spellings(photo: PurePosixPath) -> Iterator[str]:
     for name in (photo.name, photo.stem):
         for spelling in (name, *(name + mark for mark in MARKS), f"mask_{name}"):
             yield from (str(photo.with_name(f"{spelling}{suffix}")) for suffix in MASK_SUFFIXES)
-
-
-def _key(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()

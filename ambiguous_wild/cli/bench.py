@@ -123,6 +123,12 @@ def parse_budget(text: str) -> float:
     help="Start from this splat file (PLY, compressed PLY, SPZ, SOG, glTF) or point cloud (PLY) in the scene's "
     "coordinates.  [default: the scene's points]",
 )
+@click.option(
+    "--corrections",
+    type=PathName(dir_okay=False),
+    help="Masks corrected by hand, as the page of 'aw view' saves them; --overwrite longer continues a run with "
+    "them.",
+)
 @metric_file_option
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
 @click.option(

@@ -146,13 +146,13 @@ training_options = _all(
     _plugins(),  # a run in another process needs the files too
     click.option(
         "--overwrite",
-        type=click.Choice(["never", "missing", "changed", "always"]),
+        type=click.Choice(["never", "missing", "longer", "changed", "always"]),
         is_flag=False,
         flag_value="always",
         default="missing",
         show_default=True,
-        help="missing: train unfinished runs; changed: also runs whose method's file has changed; never: skip "
-        "existing folders; always, or no word: train all again.",
+        help="missing: train unfinished runs; longer: also continue shorter ones; changed: also train again where "
+        "the method's file has changed; never: skip existing folders; always, or no word: train all again.",
     ),
     click.option(
         "--cache",

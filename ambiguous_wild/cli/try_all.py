@@ -1,64 +1,70 @@
-"""`aw try`: from photos or a video to a table and a page, each step an ordinary command."""
+"""`aw try`: from photos or a video to a splat, its masks and a page, each step an ordinary command."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
 from ambiguous_wild.cli.options import PathName, prepare_cpu, say, threads_option
+from ambiguous_wild.cli.run_progress import ProgressBar
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import own_json
 
-METHODS = ("3dgs", "refinesplat")
-IN_3DGS = 1 + 1.2  # an iteration of 3dgs and one of refinesplat, in iterations of 3dgs (docs/refinesplat.md)
-# Share of the time after the scene is built; the plan, measuring and the page take the rest.
-TRAINING = 0.7
-SHORTEST, LONGEST = 300, 30_000  # iterations; shorter runs show no difference of methods
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
 FRAMES = 60  # taken from a video
-# 'aw build-scene' on two idle cores with photos of about 1 MP: 11 take 9 to 11 s, 23 take 15 s, 40 take 43 s.
-SCENE_S = (3.0, 1.0)  # for any scene; for each photo
+# 'aw screen' and 'aw build-scene' on two idle cores: seconds for any scene, and for each photo
+SCENE_S = (3.0, 1.2)
+AFTER_S = (6.0, 0.3)  # measuring, masks and the page, for each method; and for each photo
+SHORTEST_S = 30.0  # of training, for each method
+# A run is continued if the new budget is at least this much larger, else it is finished or kept.
+LARGER = 1.3
 
 
 @click.command("try")
 @click.argument("source", type=PathName(exists=True), metavar="PHOTOS|VIDEO")
 @click.option("-o", "--output", type=PathName(file_okay=False), required=True, help="Folder for everything.")
 @click.option("--budget", default="5m", show_default=True, help="Time for everything: 90s, 10m, 1.5h.")
+@click.option(
+    "--method", "methods", default="refinesplat", show_default=True,
+    help="Method to train; 3dgs,refinesplat trains both in the same time and compares them.",
+)  # fmt: skip
 @threads_option
 @click.pass_context
-def command(ctx: click.Context, source: Path, output: Path, budget: str, threads: int | None) -> None:
-    """Try it on your photos: check, scene, plan, 3dgs and refinesplat, page, table.
+def command(
+    ctx: click.Context, source: Path, output: Path, budget: str, methods: str, threads: int | None
+) -> None:
+    """Try it on your photos: check, scene, training, a page that grows while it trains.
 
-    Each step is a command that is printed first and can be run alone. The time decides how many iterations each
-    method trains, at least 300. After an interruption the same command continues.
+    Each step is a command that is printed first and can be run alone. The page is written soon after the training
+    begins, and again as the model gets better. Ctrl-C ends the training; the same command continues it, also
+    with a larger --budget.
 
     \b
     aw try photos/ -o out
     aw try walk.mp4 -o out --budget 15m
     """
     from ambiguous_wild.cli.bench import parse_budget
-    from ambiguous_wild.harness.store import known_iterations
 
     begin, seconds = time.monotonic(), parse_budget(budget)
     photos, scene, runs, plan = (output / name for name in ("photos", "scene", "runs", "plan.json"))
     video = source.is_file()
     if not video:
         photos = source
-    say(_announced(source, seconds))
+    say(_announced(source, scene, seconds))
     cores = ["--threads", str(threads)] if threads else []
 
     def step(*words: str | Path, done: Path | None = None) -> None:
-        line = [str(word) for word in words]
-        click.echo(f"\n$ aw {shlex.join(line)}", err=True)
+        _print_command(words)
         if done is not None and done.exists():
             say(f"done before: {done}")
             return
         try:
-            ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
+            ctx.find_root().command.main([str(word) for word in words], prog_name="aw", standalone_mode=False)
         except AwError as error:
             if "--overwrite" not in str(error):
                 raise
@@ -77,42 +83,79 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
         named = named.parent
     step("build-scene", photos, "-o", scene, "--name", named.stem, *cores)
-    iterations = known_iterations(runs) or _iterations(scene, seconds - (time.monotonic() - begin), threads)
-    length = ["--iterations", str(iterations)]
     step("plan", scene, "--no-probe", "-o", plan, done=plan)
-    say(f"renders of your photos appear while it trains: {runs / '*' / '*' / 'seed0' / 'pictures'}")
-    step(
-        "bench",
-        "--method",
-        ",".join(METHODS),
-        "--scene",
-        scene,
-        *length,
-        "--effects",
-        plan,
-        "-o",
-        runs,
-        *cores,
-    )
-    page = output / "view"
-    step("view", runs, "-o", page)
-    step("table", runs, "--sheet", output / "comparison.png")
-    longer = shlex.join(
-        ["aw", "bench", "--method", ",".join(METHODS), "--scene", str(scene), "--budget", "30m"]
-    )
-    say(
-        f"{_minutes(time.monotonic() - begin)}. Look at {page / 'index.html'} and "
-        f"{output / 'comparison.png'}. To train longer: {longer} -o longer"
-    )
-    for run in sorted(runs.glob(f"*/{METHODS[-1]}/seed0")):
-        say(
-            f"the splat without distractors: {run / 'point_cloud.ply'}; as SPZ, SOG and glTF: aw export {run}"
-        )
+    _train(methods, scene, runs, plan, output / "view", seconds - (time.monotonic() - begin), threads)
+    step("view", runs, "-o", output / "view")
+    if "," in methods:
+        step("table", runs, "--sheet", output / "comparison.png")
+    say("")
+    say(f"{_minutes(time.monotonic() - begin)}. What you have now, and what you can do with it:")
+    for line in next_steps(source, output, seconds, runs):
+        say(f"  {line}")
+
+
+def next_steps(source: Path, output: Path, seconds: float, runs: Path) -> list[str]:
+    """Return lines on what lies where, and the commands that go on from there."""
+    lines = [f"page, opens in any browser: {output / 'view' / 'index.html'}"]
+    for run in sorted(runs.glob("*/*/seed0")):
+        if (run / "point_cloud.ply").is_file():
+            lines.append(f"splat of {run.parent.name}: {run / 'point_cloud.ply'}")
+            lines.append(f"  as SPZ, SOG and glTF, for other viewers: aw export {shlex.quote(str(run))}")
         if (run / "masks").is_dir():
-            say(f"its masks, white = static: {run / 'masks'}")
+            lines.append(f"masks of {run.parent.name}, white = static: {run / 'masks'}")
+    words = ["aw", "try", str(source), "-o", str(output), "--budget", f"{3 * seconds / 60:.0f}m"]
+    lines.append(f"sharper, the same model trained on: {shlex.join(words)}")
+    lines.append(f"PSNR, time and size: aw table {shlex.quote(str(runs))}")
+    return lines
 
 
-def _announced(source: Path, seconds: float) -> str:
+def _train(
+    methods: str,
+    scene: Path,
+    runs: Path,
+    plan: Path,
+    page: Path,
+    left_s: float,
+    threads: int | None,
+) -> None:
+    """Train the methods in equal shares of the time that is left, and write the page on the way."""
+    from ambiguous_wild.harness.benchmark import bench
+    from ambiguous_wild.harness.store import known_budget_s
+    from ambiguous_wild.io.scene_folder import load_scene
+
+    prepare_cpu(threads)
+    opened = load_scene(scene, verify=False, check=False)
+    names = methods.split(",")
+    budget_s = left_s / len(names) - AFTER_S[0] - AFTER_S[1] * len(opened.views) / len(names)
+    budget_s = float(round(max(budget_s, SHORTEST_S)))
+    before = known_budget_s(runs) if runs.is_dir() else None
+    if before is not None and budget_s < LARGER * before:
+        budget_s = before
+    camera = opened.train[0].camera
+    say(_bought(budget_s, len(opened.train), camera.width * camera.height))
+    _print_command(
+        ["bench", "--method", methods, "--scene", scene, "--budget", f"{budget_s:g}s", "--effects", plan]
+        + ["--overwrite", "longer", "-o", runs]
+    )
+    report = bench(
+        names,
+        scene,
+        output=runs,
+        budgets_s=[budget_s],
+        plan=plan,
+        overwrite="longer",
+        threads=threads,
+        callbacks=ProgressBar(),
+    )
+    if report.failed:
+        raise AwError(report.failed[0].error)
+
+
+def _print_command(words: Sequence[str | Path]) -> None:
+    click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)
+
+
+def _announced(source: Path, scene: Path, seconds: float) -> str:
     """Return how long it will take; refuse a source that is neither photos nor a video."""
     from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
@@ -122,30 +165,18 @@ def _announced(source: Path, seconds: float) -> str:
         count = sum(Path(name).suffix.lower() in PHOTO_SUFFIXES for name in names)
         if not count:
             raise AwError(f"{source} holds no photos: give a folder of photos, or a video")
-    scene_s = SCENE_S[0] + SCENE_S[1] * count
-    total = max(seconds, scene_s + seconds * (1 - TRAINING))
-    return (
-        f"{counted(count, 'photo')}: about {_minutes(total)}, of which {_minutes(scene_s)} for the scene, "
-        f"unless it was built before"
-    )
+    scene_s = 0.0 if (scene / "scene.json").exists() else SCENE_S[0] + SCENE_S[1] * count
+    total = max(seconds, scene_s + SHORTEST_S + AFTER_S[0] + AFTER_S[1] * count)
+    built = f", of which {_minutes(scene_s)} for the scene" if scene_s else ""
+    return f"{counted(count, 'photo')}: about {_minutes(total)}{built}"
 
 
 def _minutes(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
-def _iterations(scene: Path, seconds: float, threads: int | None) -> int:
-    """Print and return how many iterations each method can train in this time on this machine."""
+def _bought(budget_s: float, photos: int, pixels: int) -> str:
+    """Return what a budget buys on this machine."""
     from ambiguous_wild.harness.timing import expected_s, slowness
-    from ambiguous_wild.io.scene_folder import load_scene
 
-    prepare_cpu(threads)
-    camera = load_scene(scene, verify=False, check=False).train[0].camera
-    pixels = camera.width * camera.height
-    one = IN_3DGS * expected_s(1, pixels, pixels) * slowness()
-    most = round(TRAINING * seconds / one, -2)
-    iterations = int(min(max(most, SHORTEST), LONGEST))
-    more = "; that is too few to compare methods: give more --budget" if most < SHORTEST else ""
-    say("")
-    say(f"{iterations} iterations a method: about {_minutes(iterations * one)} of training here{more}")
-    return iterations
+    return f"{budget_s:.0f} s {photos} {pixels} {expected_s(1, pixels, pixels) * slowness()}"

@@ -24,6 +24,7 @@ from ambiguous_wild.harness.chosen_effects import Chosen
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
 from ambiguous_wild.harness.start import recorded_start
+from ambiguous_wild.io.corrections import recorded_corrections
 from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.entry import trained_once
@@ -144,6 +145,8 @@ def make_cell(job: Job) -> Cell:
         chosen=job.chosen,
         protocol="half" if config.get("protocol") == "half" else "full",
         start=recorded_start(config.get("start")),
+        corrections=recorded_corrections(config.get("corrections")),
+        continued=tuple(config.get("continued", ())),
     )
     if cell.identity != job.identity:
         raise AwError(

@@ -38,6 +38,7 @@ IGNORED: dict[str, tuple[str, ...]] = {
     "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
     "scene": ("path",),
     "start": ("path",),
+    "corrections": ("path",),
 }
 SCHEMA = 1
 RESULT = "metrics.json"
@@ -198,12 +199,21 @@ class TrainRecord(TypedDict):
     on_nonfinite: str
 
 
+class Continued(TypedDict):
+    """Where a run went on from an earlier one that was shorter, or without corrections."""
+
+    iteration: int  # that the earlier run had reached
+    config_hash: str  # of the earlier run
+
+
 class UnusualConfig(TypedDict, total=False):
     """Settings of a run that config.yaml holds only where they differ from the usual ones."""
 
     effects: list[str]
     protocol: str
     start: dict[str, str]  # sha256 and path of the file of --start
+    corrections: dict[str, str]  # sha256 and path of the file of --corrections
+    continued: list[Continued]  # in the order of training
 
 
 class RunConfig(UnusualConfig):

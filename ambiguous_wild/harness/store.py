@@ -284,13 +284,10 @@ def section(config: ReadConfig, name: str) -> ReadConfig:
     return part if isinstance(part, dict) else {}
 
 
-def known_iterations(root: Path) -> int | None:
-    """Return the iterations of the first run below a folder; None without a run that says them."""
-    for run in run_folders(root):
-        iterations = section(read_config(run), "train").get("iterations")
-        if isinstance(iterations, int):
-            return iterations
-    return None
+def known_budget_s(root: Path) -> float | None:
+    """Return the largest training budget of the runs below a folder; None without a run that has one."""
+    budgets = [section(read_config(run), "train").get("budget_s") for run in run_folders(root)]
+    return max((float(b) for b in budgets if isinstance(b, int | float)), default=None)
 
 
 def _method_and_scene(run: Path) -> tuple[str, str]:

@@ -111,7 +111,13 @@ def _make_trainer(
     """Return a trainer whose time is measured; without `truth` the test PSNR is not probed on the way."""
     folder.mkdir(parents=True, exist_ok=True)
     device = torch.device(cell.device)
-    data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
+    data = load_train_data(
+        cell.scene,
+        device=device,
+        seed=cell.train.seed,
+        cache_dir=cache_dir,
+        corrections=None if cell.corrections is None else cell.corrections.masks(cell.scene),
+    )
     hooks = started(
         with_effects(cell.method.build(cell.options), cell.chosen.effects), cell.start, cell.scene
     )
@@ -132,6 +138,7 @@ def _make_trainer(
         "about": f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}, "
         + length_text(cell.train.iterations, cell.train.budget_s),
     }
+    trainer.continues = frozenset(earlier["config_hash"] for earlier in cell.continued)
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer

@@ -31,6 +31,8 @@ class TrainData:
     device: torch.device
     seed: int
     cache_dir: Path  # features and instance masks that survive the run; shared between runs
+    # [H, W] float32, 1 = a person marked it as static, whatever a mask says; empty = no photo was corrected
+    marked_static: Sequence[Tensor | None] = ()
 
     @property
     def backend(self) -> Backend:

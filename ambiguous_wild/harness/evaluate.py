@@ -138,15 +138,16 @@ def drawn_by(trainer: Trainer, half: bool) -> Draw:
 
 def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
     """Write the keep map of every train view and score it, see `write_keeps`."""
+    return write_keeps(trainer.data.scene, keep_maps(trainer), folder)
 
-    def keeps() -> Iterator[tuple[View, np.ndarray]]:
-        for index, view in enumerate(trainer.data.scene.train):
-            step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
-            keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
-            if keep is not None:
-                yield view, (keep > 0.5).cpu().numpy()
 
-    return write_keeps(trainer.data.scene, keeps(), folder)
+def keep_maps(trainer: Trainer) -> Iterator[tuple[View, np.ndarray]]:
+    """Compute the keep map [H, W] bool of each train view that has one; each is rendered for it."""
+    for index, view in enumerate(trainer.data.scene.train):
+        step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
+        keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
+        if keep is not None:
+            yield view, (keep > 0.5).cpu().numpy()
 
 
 def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path) -> MaskScores | None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import html
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
@@ -18,11 +21,15 @@ from ambiguous_wild.harness.store import ReadConfig, read_config, run_folders, s
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.splat_arrays import SplatFile
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import RenderSettings, ViewedModel, file_model
 from ambiguous_wild.viewing.page_file import MAX_GAUSSIANS, PAGE, Page, check_page_folder, page_text
 from ambiguous_wild.viewing.video import scene_around
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.trainer import Trainer
 
 MASKS = "masks"
 
@@ -275,6 +282,27 @@ def view_runs(
     )
     write_text(output / PAGE, text)
     return Page(output / PAGE, len(text.encode("utf-8")), models_bytes)
+
+
+def training_model(
+    trainer: Trainer, label: str, masks: Mapping[str, np.ndarray] | None = None
+) -> ViewedModel:
+    """Return the model of a run that is still trained, for a page that is written again and again.
+
+    Args:
+        trainer: its trainer; nothing in it is changed.
+        label: name of the model on the page, the same on each page of a training.
+        masks: keep maps by name of the train view, [H, W] bool; `evaluate.keep_maps` computes them.
+    """
+    arrays = {name: value.cpu().numpy() for name, value in trainer.neutral_model().items()}
+    hooks = trainer.hooks
+    return ViewedModel(
+        label=label,
+        ply=trainer.folder / MODEL,
+        render_settings=RenderSettings(hooks.sh_degree, hooks.antialias, hooks.blur, hooks.background),
+        masks=masks,
+        splats=SplatFile(arrays, trainer.data.scene.transform, hooks.antialias),
+    )
 
 
 class Viewer:

@@ -78,11 +78,12 @@ class ViewedModel:
     ply: Path
     render_settings: RenderSettings = field(default_factory=RenderSettings)
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
-    masks: Path | None = None  # folder of keep maps of train views, white = keep
+    # keep maps of train views: a folder of PNGs (white = keep), or [H, W] bool by name of the view (1 = keep)
+    masks: Path | Mapping[str, np.ndarray] | None = None
     reference: bool = False  # trained with exact masks or clean photos, so it does not compete
     splats: SplatFile | None = field(
         default=None, repr=False, compare=False
-    )  # content of `ply` if it is a splat file and not a run's model
+    )  # content of `ply` if it is a splat file, or a model that is still trained, and not a run's
 
     def read(self) -> dict[str, np.ndarray]:
         """Read the Gaussians, in the coordinates of `transform`.

@@ -6,7 +6,9 @@ import base64
 import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -38,6 +40,8 @@ _QUALITY = 78
 _MASK_WIDTH = 480  # px; largest width of masks
 _NEAR = 0.01  # nearest depth, as in training
 _MARGIN = 0.15  # share of the picture beyond each side that is still counted
+
+Source = TypeVar("Source")
 
 
 @dataclass(frozen=True)
@@ -71,9 +75,13 @@ def page_text(
     title: str,
     most_gaussians: int = MAX_GAUSSIANS,
     notes: Sequence[str] = (),
+    training: str = "",
+    reload_s: float = 0.0,
     say: Callable[[str], None] = lambda text: None,
 ) -> tuple[str, int]:
     """Return the page's text, and the bytes of models in it.
+
+    A page that is written again and again while a run trains costs little: photos are encoded once.
 
     Args:
         scene: scene of all the models.
@@ -81,6 +89,9 @@ def page_text(
         title: title of the page; any text.
         most_gaussians: a larger model is reduced to this number, with a note.
         notes: lines below the models.
+        training: how far the training is, if it goes on, as a sentence; "" = it has ended.
+        reload_s: seconds after which the page loads itself again, counted from when its models are drawn;
+            0 = never. It waits while somebody moves the camera or has something that is not saved.
         say: called with a line for each model.
 
     Raises:
@@ -120,7 +131,8 @@ def page_text(
         drawn = Renderer(models[0].read(), models[0].render_settings)
         uris = [data_uri("jpeg", jpeg_bytes(narrowed(drawn(v.camera), WIDTHS[1]), _QUALITY)) for v in views]
     else:
-        uris = photo_uris(views, MAX_PHOTO_BYTES - len(capture_map))
+        files = tuple((v.image_path, _changed_ns(v.image_path)) for v in views)
+        uris = _encoded_photos(files, MAX_PHOTO_BYTES - len(capture_map))
     data = {
         "up": space.up.tolist(),
         "middle": space.middle.tolist(),
@@ -132,6 +144,8 @@ def page_text(
         "map": capture_map,
         "models": facts,
         "notes": page_notes,
+        "training": training,
+        "reload_s": reload_s,
     }
     return _fill(title, data, "\n".join(elements)), sum(map(len, elements))
 
@@ -218,12 +232,22 @@ def _fill(title: str, data: Mapping[str, object], models: str) -> str:
     )
 
 
-def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
+def photo_uris(paths: Sequence[Path], most_bytes: int) -> list[str]:
     """Return a data: address of each photo as JPEG, at the largest width at which all fit `most_bytes`.
 
     1000 photos or more can exceed it at the smallest width. One photo is in memory at a time.
     """
-    return _as_wide_as_fits(_photo, [view.image_path for view in views], WIDTHS, most_bytes)
+    return _as_wide_as_fits(_photo, paths, WIDTHS, most_bytes)
+
+
+def _changed_ns(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.is_file() else 0
+
+
+@lru_cache(maxsize=1)
+def _encoded_photos(files: tuple[tuple[Path, int], ...], most_bytes: int) -> list[str]:
+    """Return `photo_uris` of files and their times of change, from memory for the last page's photos."""
+    return photo_uris([path for path, _ in files], most_bytes)
 
 
 def map_uri(path: Path) -> str:
@@ -231,26 +255,37 @@ def map_uri(path: Path) -> str:
     return _as_wide_as_fits(_photo, [path], MAP_WIDTHS, MAX_MAP_BYTES)[0] if path.is_file() else ""
 
 
-def mask_uris(folder: Path, views: Sequence[View], most_bytes: int) -> dict[str, str]:
-    """Return a data: address of each keep map in `folder` as black-and-white PNG, by view name.
+def mask_uris(
+    masks: Path | Mapping[str, np.ndarray], views: Sequence[View], most_bytes: int
+) -> dict[str, str]:
+    """Return a data: address of each keep map as black-and-white PNG, by view name.
 
     They have the largest width at which all fit `most_bytes` of text.
+
+    Args:
+        masks: folder of the maps, or the maps by name of the view; see `ViewedModel.masks`.
+        views: views whose maps are wanted, where there are any.
+        most_bytes: limit of all addresses together.
     """
-    paths = {view.name: folder / Path(view.name).with_suffix(".png") for view in views}
-    files = {name: path for name, path in paths.items() if path.is_file()}
+    files: dict[str, Path | np.ndarray]
+    if isinstance(masks, Path):
+        paths = {view.name: masks / Path(view.name).with_suffix(".png") for view in views}
+        files = {name: path for name, path in paths.items() if path.is_file()}
+    else:
+        files = {view.name: masks[view.name] for view in views if view.name in masks}
     widths = [width for width in WIDTHS if width <= _MASK_WIDTH]
     return dict(zip(files, _as_wide_as_fits(_mask, list(files.values()), widths, most_bytes)))
 
 
 def _as_wide_as_fits(
-    uri: Callable[[Path, int], str], paths: Sequence[Path], widths: Sequence[int], most_bytes: int
+    uri: Callable[[Source, int], str], sources: Sequence[Source], widths: Sequence[int], most_bytes: int
 ) -> list[str]:
     """Return the addresses at the first width at which they fit, else at the last one."""
     uris: list[str] = []
     for width in widths:
         uris, size = [], 0
-        for path in paths:
-            uris.append(uri(path, width))
+        for source in sources:
+            uris.append(uri(source, width))
             size += len(uris[-1])
             if size > most_bytes and width != widths[-1]:
                 break
@@ -263,10 +298,11 @@ def _photo(path: Path, width: int) -> str:
     return data_uri("jpeg", jpeg_bytes(narrowed(read_png_rgb(path), width), _QUALITY))
 
 
-def _mask(path: Path, width: int) -> str:
+def _mask(keep: Path | np.ndarray, width: int) -> str:
     import cv2
 
-    black_and_white = ((narrowed(read_gray(path), width) > 127) * 255).astype(np.uint8)
+    gray = read_gray(keep) if isinstance(keep, Path) else keep.astype(np.uint8) * 255
+    black_and_white = ((narrowed(gray, width) > 127) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_PNG_BILEVEL, 1]
     return data_uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
 

@@ -16,11 +16,14 @@ import pytest
 from ambiguous_wild.harness.trained_models import Viewer, view_runs
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.viewing.model import Renderer, RenderSettings
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.splat_arrays import SplatFile
+from ambiguous_wild.viewing.model import Renderer, RenderSettings, ViewedModel
+from ambiguous_wild.viewing.page_file import page_text
 from ambiguous_wild.viewing.video import fitted
 from tests.chromium import Browser, needs_chromium
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
-from tests.viewing.wall_runs import write_shown_run
+from tests.viewing.wall_runs import wall_model, write_shown_run
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -100,8 +103,6 @@ def box(page: Browser) -> tuple[int, int, int, int]:
 
 def ours(runs: Path, label: str, view: str, size: tuple[int, int]) -> np.ndarray:
     """Our own render of what the stage shows."""
-    from ambiguous_wild.io.scene_folder import load_scene
-
     scene = load_scene(runs / "porch")
     camera = next(v.camera for v in scene.views if v.name == view)
     seed = 0 if label == "3dgs" else 1
@@ -252,7 +253,6 @@ def test_a_camera_path_is_saved_for_the_video(page: Browser, runs: Path, tmp_pat
         page.key("p")
     assert page.run("$('path').textContent") == "Path (3)"
     (tmp_path / "path.json").write_text(page.run("JSON.stringify(pathFile())"))
-    from ambiguous_wild.io.scene_folder import load_scene
     from ambiguous_wild.viewing import video
 
     scene = load_scene(runs / "porch")
@@ -282,6 +282,44 @@ def test_the_address_opens_a_place(page: Browser, runs: Path) -> None:
     settle(page)
     assert page.run("DATA.models[state.left].label") == "3dgs" and page.run("state.right") == "photo"
     assert page.run("state.mode") == "cut" and page.run("DATA.views[state.view].name") == TRAIN[2]
+
+
+def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
+    runs: Path, browser: Browser, tmp_path: Path
+) -> None:
+    scene, path = load_scene(runs / "porch"), tmp_path / "index.html"
+    model = ViewedModel("3dgs", Path("3dgs"), splats=SplatFile(wall_model()))
+
+    def write(training: str, reload_s: float) -> None:
+        path.write_text(page_text(scene, [model], title="t", training=training, reload_s=reload_s)[0])
+
+    write("training: 1 iteration", 0.2)
+    browser.open(path.as_uri())
+    settle(browser)
+    # with unsaved work it stays
+    browser.key("p")
+    browser.until("$('training').textContent.includes('not refreshed')")
+    place = "camera.position.set(...[1, 2, 3].map((x, i) => x + DATA.middle[i] - 4 * (i === 2)))"
+    browser.run(f"home(), {place}, controls.update(), choose({{ mode: 'cut', right: PHOTO, masks: false }})")
+    eye = facts(browser, "camera.position.toArray()")
+    write("training: 2 iterations", 0.2)
+    browser.run("state.path = []")
+    browser.until("DATA.training === 'training: 2 iterations' && Boolean(controls)")
+    settle(browser)
+    assert facts(browser, "[state.mode, state.right, state.view, state.masks]") == [
+        "cut",
+        "photo",
+        None,
+        False,
+    ]
+    assert np.allclose(facts(browser, "camera.position.toArray()"), eye, atol=1e-3)
+    write("", 0)  # the last page
+    browser.until("DATA.training === '' && Boolean(controls)")
+    settle(browser)
+    assert browser.run("state.mode") == "cut" and browser.run("$('training').offsetHeight") == 0
+    browser.run("window.same = 1")
+    time.sleep(0.6)
+    assert browser.run("window.same") == 1 and browser.errors == []
 
 
 def test_a_notebook_s_frame_shows_it_too(runs: Path, browser: Browser, tmp_path: Path) -> None:

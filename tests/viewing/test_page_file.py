@@ -17,16 +17,17 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.trained_models import Viewer, read_render_settings, view_runs
 from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import MAP, load_scene
+from ambiguous_wild.io.splat_arrays import SplatFile
 from ambiguous_wild.io.spz import decode_spz
 from ambiguous_wild.viewing import page_file
-from ambiguous_wild.viewing.model import RenderSettings
-from ambiguous_wild.viewing.page_file import importance, reduced
+from ambiguous_wild.viewing.model import RenderSettings, ViewedModel
+from ambiguous_wild.viewing.page_file import importance, page_text, reduced
 from tests.command_line import aw
 from tests.report.board_runs import change_result
-from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
+from tests.tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, write_tiny_scene
 from tests.viewing.wall_runs import wall_model, write_shown_run
 
 HOSTILE = '</script><img src=x onerror="alert(1)">&-->'
@@ -226,15 +227,37 @@ def test_photos_and_masks_stay_below_their_share_of_the_page(runs: Path, tmp_pat
         mask.parent.mkdir(exist_ok=True)
         write_png(mask, rng.integers(0, 2, (270, 480), np.uint8) * 255)
         views.append(dataclasses.replace(view, image_path=photo))
-    pictures = page_file.photo_uris(views, 200_000)
+    paths = [view.image_path for view in views]
+    pictures = page_file.photo_uris(paths, 200_000)
     masks = page_file.mask_uris(tmp_path / "masks", views, 60_000)
     for uris, most in ((pictures, 200_000), (list(masks.values()), 60_000)):
         assert len(uris) == len(views) and most / 4 < sum(map(len, uris)) <= most
         assert len({image_of(uri).shape for uri in uris}) == 1  # all of one width
-    wide = page_file.photo_uris(views, 10**9)
+    wide = page_file.photo_uris(paths, 10**9)
     assert {image_of(uri).shape[:2] for uri in wide} == {(270, 480)}  # never enlarged
-    least = page_file.photo_uris(views, 1)  # too little for any: the smallest
+    least = page_file.photo_uris(paths, 1)  # too little for any: the smallest
     assert {image_of(uri).shape[1] for uri in least} == {page_file.WIDTHS[-1]}
+
+
+def test_a_page_of_a_training_holds_models_and_masks_from_memory(runs: Path) -> None:
+    scene = load_scene(runs.parent / "porch")
+    keep = np.ones((HEIGHT, WIDTH), bool)
+    keep[14:26, 14:26] = False
+    model = ViewedModel("3dgs", Path("3dgs"), splats=SplatFile(wall_model()), masks={TRAIN[1]: keep})
+    sentence = "training: 1200 iterations after 1:30 of 5:00"
+    page, _ = page_text(scene, [model], title="t", training=sentence, reload_s=2.5)
+    data = facts(page)
+    assert (data["training"], data["reload_s"], data["models"][0]["mean"]) == (sentence, 2.5, None)
+    ((name, uri),) = data["models"][0]["masks"].items()
+    assert name == TRAIN[1] and ((image_of(uri) > 127) == keep).all()
+    ended = facts(page_text(scene, [model], title="t")[0])
+    assert (ended["training"], ended["reload_s"]) == ("", 0)
+    # the photos of the second page come from memory, and one that has changed does not
+    photo = scene.test[0].image_path
+    write_png(photo, 255 - read_png_rgb(photo))
+    again = facts(page_text(scene, [model], title="t")[0])
+    assert again["views"][1:] == ended["views"][1:] and again["views"][0] != ended["views"][0]
+    write_png(photo, 255 - read_png_rgb(photo))
 
 
 def test_a_map_stays_below_its_share_of_the_page_and_may_be_missing(tmp_path: Path) -> None:

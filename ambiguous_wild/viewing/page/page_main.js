@@ -1,5 +1,7 @@
 // What is chosen, what moves the camera, and the way all of it comes together.
 let R, T, camera, controls, over, under, wanted = true, pressed = new Set();
+let drawnAt = 0; // when the page was drawn for the first time
+let touched = location.hash.length > 1; // whether somebody chose what is shown
 const isBeside = () => state.mode === "beside";
 const panes = () => (state.mode === "single" ? [over] : [over, under]);
 const dirty = () => { wanted = true; };
@@ -56,14 +58,20 @@ async function refresh() {
     if (state.mode !== "single") await under.show(state.right);
     await drawPhotos();
     if (state.frusta) paintAllFrusta();
-    busy("");
+    for (const pane of panes()) pane.drawn = false;
+    busy(DRAWING);
   } catch (error) {
     busy(`cannot show this model: ${error.message}`);
   }
   dirty();
 }
 
-const busy = (text) => { $("busy").textContent = text; };
+const DRAWING = "drawing …";
+/** An old picture must not stand under a new name: it is hidden until the new one is drawn. */
+function busy(text) {
+  $("busy").textContent = text;
+  $("stage").classList.toggle("drawing", text === DRAWING);
+}
 function busyFor(text) {
   busy(text);
   setTimeout(() => { if ($("busy").textContent === text) busy(""); }, 2500);
@@ -141,7 +149,13 @@ function loop(now) {
   requestAnimationFrame(loop);
   fly((now - last) / 1000);
   last = now;
-  if (!wanted) return;
+  if (!wanted) {
+    if ($("busy").textContent === DRAWING && panes().every((pane) => pane.settled)) {
+      busy("");
+      drawnAt ||= now;
+    }
+    return;
+  }
   wanted = false;
   const width = over.element.clientWidth, height = over.element.clientHeight;
   if (!width || !height) return;
@@ -219,10 +233,47 @@ function listen() {
   window.addEventListener("hashchange", recall);
 }
 
-/** `#left=NAME&right=NAME&mode=cut&view=NAME` opens the page there; what is not known is ignored. */
+/** While a run trains, its page is written again and again: load it anew, unless somebody is at work in this one. */
+function keepUp() {
+  let used = 0, down = false;
+  for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "keydown", "wheel", "input"]) {
+    window.addEventListener(kind, () => {
+      if (kind === "pointermove" && !down) return;
+      if (kind.startsWith("pointer")) down = kind === "pointerdown" || kind === "pointermove";
+      used = performance.now();
+      touched = true;
+    }, { capture: true, passive: true });
+  }
+  setInterval(() => {
+    const now = performance.now();
+    const works = down || pressed.size || (used && now - used < 5000);
+    $("training").textContent = DATA.training + (unsaved() ? "; this page is not refreshed before you save your work" : "");
+    if (!drawnAt || now - drawnAt < 1000 * DATA.reload_s || works || unsaved()) return;
+    if (touched) location.replace(place());
+    location.reload();
+  }, 250);
+}
+
+/** Whether something would be lost with the page. */
+const unsaved = () => state.path.length > 0;
+
+/** What `recall` reads: the place where the person is. */
+function place() {
+  const name = (choice) => (choice === PHOTO ? PHOTO : DATA.models[choice].label);
+  const words = new URLSearchParams({ left: name(state.left), right: name(state.right), mode: state.mode, cut: state.cut.toFixed(1) });
+  for (const key of ["masks", "frusta"]) words.set(key, state[key] ? "1" : "0");
+  if (state.view !== null) words.set("view", DATA.views[state.view].name);
+  else for (const [key, point] of [["eye", camera.position], ["to", controls.target]]) words.set(key, point.toArray().join());
+  if (state.view === null && state.lens !== undefined) words.set("lens", DATA.views[state.lens].name);
+  return `#${words}`;
+}
+
+/** `#left=NAME&right=NAME&mode=cut&view=NAME` opens the page there; what is not known is ignored.
+ * A free camera stands at `eye=X,Y,Z`, looks `to=X,Y,Z` and is as wide as the photo `lens=NAME`. */
 function recall() {
   const words = new URLSearchParams(location.hash.slice(1));
   const changes = {};
+  const numbers = (key) => (words.get(key) ?? "").split(",").map(Number).filter(Number.isFinite);
   for (const side of ["left", "right"]) {
     const index = DATA.models.findIndex((m) => m.label === words.get(side));
     if (index >= 0) changes[side] = index;
@@ -230,8 +281,18 @@ function recall() {
   }
   if (changes.left === state.right && changes.right === undefined) changes.right = state.left; // never one beside itself
   if (["single", "beside", "cut"].includes(words.get("mode"))) changes.mode = words.get("mode");
-  const view = DATA.views.findIndex((v) => v.name === words.get("view"));
+  for (const key of ["masks", "frusta"]) if (words.has(key)) changes[key] = words.get(key) === "1";
+  if (words.has("cut")) changes.cut = Math.min(Math.max(Number(words.get("cut")) || 0, 0), 100);
+  const [view, lens] = ["view", "lens"].map((key) => DATA.views.findIndex((v) => v.name === words.get(key)));
+  const [eye, to] = [numbers("eye"), numbers("to")];
   if (view >= 0) changes.view = view;
+  else if (eye.length === 3 && to.length === 3) {
+    camera.up.set(...DATA.up);
+    camera.position.set(...eye);
+    controls.target.set(...to);
+    changes.view = null;
+    if (lens >= 0) changes.lens = lens;
+  }
   return choose(changes);
 }
 
@@ -239,6 +300,7 @@ async function start() {
   const models = DATA.models.map((m, i) => [String(i), typeof m.mean === "number" ? `${m.label} (${shown(m.mean)} dB)` : m.label]);
   for (const side of ["left", "right"]) fill($(side), [...models, [PHOTO, "the photo"]]);
   fill($("view"), [["", "free"], ...DATA.views.map((v, i) => [String(i), `${v.split}: ${v.name}`])]);
+  $("training").textContent = DATA.training;
   $("notes").replaceChildren(...DATA.notes.map((note) => h("li", {}, note)));
   $("chart").hidden = !DATA.map;
   $("map").style.backgroundImage = `url(${DATA.map})`;
@@ -255,6 +317,7 @@ async function start() {
   listen();
   state.view = firstView();
   await recall();
+  if (DATA.reload_s) keepUp();
   requestAnimationFrame(loop);
 }
 

@@ -91,7 +91,20 @@ class Pane {
     this.frusta.visible = state.frusta;
     for (const [index, frustum] of this.frusta.children.entries()) frustum.visible = index !== state.view;
     this.renderer.render(this.scene, camera);
+    const gl = this.renderer.getContext();
+    gl.deleteSync(this.fence ?? null);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
     this.drawn = true;
+  }
+
+  /** Whether the chosen model is on the screen, its Gaussians sorted for this camera; without a GPU that takes seconds. */
+  get settled() {
+    if (this.choice === PHOTO) return true;
+    const { spark, mesh } = this, gl = this.renderer?.getContext();
+    if (this.showing !== this.choice || !this.drawn || (mesh.numSplats && !spark.activeSplats)) return false;
+    if (spark.updateTimeoutId !== -1 || spark.sorting || spark.sortDirty) return false;
+    return gl.getSyncParameter(this.fence, gl.SYNC_STATUS) === gl.SIGNALED;
   }
 
   /** The photo lies where the model's picture of it would. */

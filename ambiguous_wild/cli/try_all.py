@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shlex
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +16,11 @@ from ambiguous_wild.cli.options import PathName, prepare_cpu, say, threads_optio
 from ambiguous_wild.cli.run_progress import ProgressBar
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import own_json
+
+if TYPE_CHECKING:
+    from ambiguous_wild.harness.cell import Cell
+    from ambiguous_wild.report.model_views import GrowingPage
+    from ambiguous_wild.splat.trainer import Trainer
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
 FRAMES = 60  # taken from a video
@@ -122,6 +129,7 @@ def _train(
     from ambiguous_wild.harness.benchmark import bench
     from ambiguous_wild.harness.store import known_budget_s
     from ambiguous_wild.io.scene_folder import load_scene
+    from ambiguous_wild.report.model_views import GrowingPage
 
     prepare_cpu(threads)
     opened = load_scene(scene, verify=False, check=False)
@@ -133,22 +141,46 @@ def _train(
         budget_s = before
     camera = opened.train[0].camera
     say(_bought(budget_s, len(opened.train), camera.width * camera.height))
-    _print_command(
-        ["bench", "--method", methods, "--scene", scene, "--budget", f"{budget_s:g}s", "--effects", plan]
-        + ["--overwrite", "longer", "-o", runs]
-    )
-    report = bench(
-        names,
-        scene,
-        output=runs,
-        budgets_s=[budget_s],
-        plan=plan,
-        overwrite="longer",
-        threads=threads,
-        callbacks=ProgressBar(),
-    )
+    words: list[str | Path] = ["bench", "--method", methods, "--scene", scene, "--budget", f"{budget_s:g}s"]
+    _print_command([*words, "--effects", plan, "--overwrite", "longer", "-o", runs])
+    growing = GrowingPage(page, runs)
+    try:
+        report = bench(
+            names,
+            scene,
+            output=runs,
+            budgets_s=[budget_s],
+            plan=plan,
+            overwrite="longer",
+            threads=threads,
+            callbacks=_ProgressAndPage(growing),
+        )
+    except KeyboardInterrupt:
+        if growing.end():
+            say(f"the page shows the model as it is now: {page / 'index.html'}")
+        raise
     if report.failed:
         raise AwError(report.failed[0].error)
+
+
+class _ProgressAndPage(ProgressBar):
+    """A bar for each run, and the page that grows while it trains."""
+
+    def __init__(self, page: GrowingPage) -> None:
+        super().__init__()
+        self.page, self.written = page, False
+
+    def started(self, cell: Cell, folder: Path) -> None:
+        super().started(cell, folder)
+        self.page.begin(cell.method.name)
+
+    def tick(self, trainer: Trainer) -> None:
+        super().tick(trainer)
+        if self.page.tick(trainer) and not self.written:
+            self.written = True
+            self.bar.write(
+                f"    look at it while it trains: {self.page.folder / 'index.html'}", file=sys.stderr
+            )
 
 
 def _print_command(words: Sequence[str | Path]) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +14,15 @@ from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.harness.benchmark import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
-from ambiguous_wild.harness.trained_models import find_models, open_scene, read_files, read_models
-from ambiguous_wild.io.files import check_output, refuse_files_there
+from ambiguous_wild.harness.evaluate import keep_maps
+from ambiguous_wild.harness.trained_models import (
+    find_models,
+    open_scene,
+    read_files,
+    read_models,
+    training_model,
+)
+from ambiguous_wild.io.files import check_output, refuse_files_there, write_text
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
@@ -21,6 +30,7 @@ from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
 from ambiguous_wild.viewing.model import space_of
 from ambiguous_wild.viewing.model_export import ExportedModel, ExportParts, export
+from ambiguous_wild.viewing.page_file import PAGE, check_page_folder, page_text
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -38,6 +48,8 @@ if TYPE_CHECKING:
 
 
 FOLDER = "export"  # in a run folder
+FIRST_PAGE_S = 10.0  # of training until the first page of a run that is trained
+LONGEST_PAUSE_S = 60.0  # of training between two pages
 
 
 def export_runs(
@@ -257,6 +269,61 @@ class ShowInView(Callbacks):
         line = f"{run_name(cell)}: {outcome_line(report)}"
         self.view.end(line)
         self._say(line)
+
+
+class GrowingPage:
+    """Writes the page of `aw view` while runs are trained: soon after the first step, then more rarely."""
+
+    def __init__(self, folder: Path, runs: Path) -> None:
+        """
+        Args:
+            folder: where index.html is written.
+            runs: folder of the runs; finished ones are shown beside the one that is trained.
+        """
+        check_page_folder(folder)
+        self.folder, self.runs = folder, runs
+        self._trainer: Trainer | None = None
+        self._label = ""
+
+    def begin(self, label: str) -> None:
+        """Call it before each run; `label` is the run's name on the page."""
+        self._trainer, self._label, self._cost_s = None, label, 0.0
+
+    def tick(self, trainer: Trainer) -> bool:
+        """Write the page if one is due, after an iteration with the clock stopped; return whether it was."""
+        now = trainer.clock.now()
+        if self._trainer is None:
+            self._trainer, self._due = trainer, now + FIRST_PAGE_S
+        if now < self._due or trainer.done:
+            return False
+        pause_s = min(max(now, FIRST_PAGE_S), LONGEST_PAUSE_S)
+        self._due = now + pause_s
+        self._write(f"{_state(trainer)}; this page shows the next state by itself", pause_s + self._cost_s)
+        return True
+
+    def end(self) -> bool:
+        """Write the page of a run that was stopped; return whether there is one."""
+        if self._trainer is None:
+            return False
+        self._write(f"stopped: {_state(self._trainer)}; the same command continues")
+        return True
+
+    def _write(self, state: str, reload_s: float = 0.0) -> None:
+        assert self._trainer is not None
+        begin, scene = time.monotonic(), self._trainer.data.scene
+        masks = {view.name: keep for view, keep in keep_maps(self._trainer)}
+        models = [training_model(self._trainer, self._label, masks)]
+        with suppress(AwError):  # no run has ended yet
+            models = [t.model for t in find_models([self.runs])[0] if t.model.label != self._label] + models
+        text, _ = page_text(scene, models, title=scene.name, training=state, reload_s=reload_s)
+        write_text(self.folder / PAGE, text)
+        self._cost_s = time.monotonic() - begin
+
+
+def _state(trainer: Trainer) -> str:
+    seconds, budget = trainer.clock.now(), trainer.config.budget_s
+    of = f"{budget:.0f} s" if budget is not None else f"{trainer.config.iterations} iterations"
+    return f"{trainer.iteration:,} iterations in {seconds:.0f} s of training, of {of}"
 
 
 def watch(

@@ -53,7 +53,7 @@ def test_a_shorter_run_goes_on_and_says_so(scene, tmp_path):
     out = tmp_path / "runs"
     folder = run(scene, out, iterations=6).runs[0].folder
     (folder / "mine.txt").write_text("a note")
-    with pytest.raises(AwError, match=r"train\.iterations was 6, is 9\).*continue it with --overwrite longer"):
+    with pytest.raises(AwError, match=r"train\.iterations was 6, is 9\).*it with --overwrite longer"):
         run(scene, out, iterations=9)
     report = run(scene, out, iterations=9, overwrite="longer")
     assert report.outcomes == {"trained": 1}

@@ -27,11 +27,11 @@ from tests.tiny_scene import HEIGHT, TRAIN, WIDTH
 LEFT, RIGHT = slice(0, WIDTH // 2 - 4), slice(WIDTH // 2 + 4, WIDTH)
 
 
-def correction(path: Path, photos: dict[str, np.ndarray], **changed: object) -> Path:
+def correction(path: Path, pictures: dict[str, np.ndarray], **changed: object) -> Path:
     """Write corrections as the page does, from pictures [h, w] uint8."""
     texts = {
         name: "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", picture)[1]).decode()
-        for name, picture in photos.items()
+        for name, picture in pictures.items()
     }
     path.write_text(json.dumps({"version": 1, "scene": "scene", "photos": texts} | changed))
     return path
@@ -70,8 +70,8 @@ def test_a_shorter_run_goes_on_and_says_so(scene, tmp_path):
         run(scene, out, iterations=11)
     with pytest.raises(AwError, match="was continued from a shorter run"):
         verify(folder, None)
-    with pytest.raises(AwError, match="options"):  # other settings are no continuation
-        run(scene, out, iterations=20, overwrite="longer", settings=["3dgs.sh_degree=1"])
+    with pytest.raises(AwError, match="effects was"):  # other settings are no continuation
+        run(scene, out, iterations=20, overwrite="longer", effects="exposure")
 
 
 def test_an_interrupted_continuation_is_resumed(scene, tmp_path, monkeypatch):

@@ -1,7 +1,7 @@
 // What is chosen, what moves the camera, and the way all of it comes together.
 let R, T, camera, controls, over, under, wanted = true, pressed = new Set();
 let drawnAt = 0; // when the page was drawn for the first time
-let lastPicture = "";
+let lastPicture = "", drawing = false; // what is shown; whether it is not yet on the screen
 let touched = location.hash.length > 1; // whether somebody chose what is shown
 const isBeside = () => state.mode === "beside";
 const panes = () => (state.mode === "single" ? [over] : [over, under]);
@@ -35,7 +35,7 @@ async function drawPhotos() {
 /** Where the page opened: what the mask removes there, named above its place in the picture. */
 function placeStood() {
   const view = DATA.views[state.view], at = DATA.opening.place;
-  $("stood").hidden = !view || !at || state.view !== DATA.opening.view || state.correct || state.inset === "large";
+  $("stood").hidden = Boolean(!view || !at || state.view !== DATA.opening.view || state.correct || state.inset === "large");
   if ($("stood").hidden) return;
   const pane = isBeside() ? under.element : over.element;
   const { scale, left, top } = fitted(view, pane.clientWidth, pane.clientHeight);
@@ -83,9 +83,12 @@ async function refresh() {
     if (state.mode !== "single") await under.show(state.right);
     await drawPhotos();
     if (state.frusta) paintAllFrusta();
-    if (picture !== lastPicture) for (const pane of panes()) pane.drawn = false;
-    busy(picture === lastPicture ? "" : DRAWING);
+    if (picture !== lastPicture) {
+      for (const pane of panes()) pane.drawn = false;
+      drawing = true;
+    }
     lastPicture = picture;
+    busy(drawing ? DRAWING : "");
   } catch (error) {
     busy(`cannot show this model: ${error.message}`);
   }
@@ -180,7 +183,8 @@ function loop(now) {
   fly((now - last) / 1000);
   last = now;
   if (!wanted) {
-    if ($("busy").textContent === DRAWING && panes().every((pane) => pane.settled)) {
+    if (drawing && $("busy").textContent === DRAWING && panes().every((pane) => pane.settled)) {
+      drawing = false;
       busy("");
       drawnAt ||= now;
     }
@@ -233,61 +237,6 @@ async function explain(event, box) {
   });
 }
 
-/** The photo in the corner: a click enlarges it, then says why; while masks are corrected it is painted on. */
-function listenToPhoto() {
-  const canvas = $("photo").querySelector("canvas");
-  let stroke = null;
-  const complain = (text) => { $("corrected").textContent = text; };
-  const done = () => { stroke = null; keepCorrections(); drawPhotos(); };
-  canvas.addEventListener("pointerdown", async (event) => {
-    const view = DATA.views[state.view], at = inPhoto(event, canvas.getBoundingClientRect());
-    if (!state.correct || !at) return;
-    if (view.split !== "train") return complain("test photos have no mask");
-    complain("");
-    if (state.tool === "region") {
-      complain(await toggleRegion(view, ...at));
-      return done();
-    }
-    canvas.setPointerCapture(event.pointerId);
-    stroke = { context: correcting(view), at };
-    brush(stroke.context, at, at, state.tool === "keep", state.large);
-    drawPhotos();
-  });
-  canvas.addEventListener("pointermove", (event) => {
-    const at = stroke && inPhoto(event, canvas.getBoundingClientRect());
-    if (!at) return;
-    brush(stroke.context, stroke.at, at, state.tool === "keep", state.large);
-    stroke.at = at;
-    drawPhotos();
-  });
-  for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, () => stroke && done());
-  canvas.addEventListener("click", (event) => {
-    if (state.correct) return;
-    if (state.inset === "large") explain(event, canvas.getBoundingClientRect());
-    else choose({ inset: "large" });
-  });
-  $("fold").addEventListener("click", () => choose({ inset: state.inset === "large" || state.inset === "closed" ? "" : "closed" }));
-}
-
-/** Corrections are painted on a train photo: the one that is shown, else the one with the largest mask. */
-function correct() {
-  const view = DATA.views[state.view]?.split === "train" ? state.view : Math.max(DATA.opening.view, DATA.views.findIndex((v) => v.split === "train"));
-  $("corrected").textContent = "";
-  return choose(state.correct ? { correct: false } : { correct: true, tool: state.tool ?? "mask", view, masks: true });
-}
-
-function stepBack() {
-  undo();
-  keepCorrections();
-  return drawPhotos();
-}
-
-function keepFile() {
-  saveCorrections();
-  nextSteps();
-  open("next-steps", true);
-}
-
 /** What can be taken away, and what comes next. */
 function nextSteps() {
   const models = [...new Set(panes().map((pane) => (pane === over ? state.left : state.right)))].filter((c) => c !== PHOTO).map((c) => DATA.models[c]);
@@ -305,7 +254,7 @@ function nextSteps() {
 }
 
 /** Open or close a panel; the other one closes. */
-function open(id, wanted = $(id).hidden) {
+function openPanel(id, wanted = $(id).hidden) {
   for (const [panel, button] of [["help", "help-button"], ["next-steps", "next-button"]]) {
     $(panel).hidden = panel !== id || !wanted;
     $(button).setAttribute("aria-expanded", String(!$(panel).hidden));
@@ -313,8 +262,8 @@ function open(id, wanted = $(id).hidden) {
 }
 
 /** Escape closes what was opened last. */
-function close() {
-  if (!$("help").hidden || !$("next-steps").hidden) open("help", false);
+function closeLast() {
+  if (!$("help").hidden || !$("next-steps").hidden) openPanel("help", false);
   else if ($("why").textContent) $("why").textContent = "";
   else if (!$("map").hidden) toggleMap();
   else if (state.correct) correct();
@@ -333,17 +282,11 @@ function onKey(event) {
   else if (key === "t") toggleMap();
   else if (key === "p") addToPath();
   else if (key === "z" && state.correct) stepBack();
-  else if (key === "escape") close();
+  else if (key === "escape") closeLast();
   else if (key === "v") choose({ mode: { single: "beside", beside: "cut", cut: "single" }[state.mode] });
   else if (/^[1-9]$/.test(key) && Number(key) <= DATA.models.length) choose({ left: Number(key) - 1 });
   else return;
   event.preventDefault();
-}
-
-function cutAt(clientX) {
-  const box = $("stage").getBoundingClientRect();
-  state.cut = Math.min(Math.max((100 * (clientX - box.left)) / box.width, 0), 100);
-  placeCut();
 }
 
 function listen() {
@@ -358,8 +301,8 @@ function listen() {
   for (const id of ["chart", "map"]) $(id).addEventListener("click", toggleMap);
   $("path").addEventListener("click", () => (state.path.length > 1 ? savePath() : busyFor("press P at two cameras or more, then save the path")));
   $("slider").addEventListener("input", () => { state.cut = Number($("slider").value); placeCut(); });
-  $("help-button").addEventListener("click", () => open("help"));
-  $("next-button").addEventListener("click", () => open("next-steps"));
+  $("help-button").addEventListener("click", () => openPanel("help"));
+  $("next-button").addEventListener("click", () => openPanel("next-steps"));
   $("more").addEventListener("click", () => {
     const isOpen = document.querySelector("header").classList.toggle("open");
     $("more").setAttribute("aria-expanded", String(isOpen));
@@ -394,9 +337,9 @@ function listen() {
 function keepUp() {
   let used = 0, down = false;
   for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "keydown", "wheel", "input"]) {
-    window.addEventListener(kind, () => {
+    window.addEventListener(kind, (event) => {
       if (kind === "pointermove" && !down) return;
-      if (kind.startsWith("pointer")) down = kind === "pointerdown" || kind === "pointermove";
+      if (kind.startsWith("pointer")) down = event.buttons > 0;
       used = performance.now();
       touched = true;
     }, { capture: true, passive: true });

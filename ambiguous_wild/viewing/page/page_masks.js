@@ -184,3 +184,58 @@ async function recallCorrections() {
     corrections.clear();
   }
 }
+
+/** The photo in the corner: a click enlarges it, then says why; while masks are corrected it is painted on. */
+function listenToPhoto() {
+  const canvas = $("photo").querySelector("canvas");
+  let stroke = null;
+  const complain = (text) => { $("corrected").textContent = text; };
+  const done = () => { stroke = null; keepCorrections(); drawPhotos(); };
+  canvas.addEventListener("pointerdown", async (event) => {
+    const view = DATA.views[state.view], at = inPhoto(event, canvas.getBoundingClientRect());
+    if (!state.correct || !at) return;
+    if (view.split !== "train") return complain("test photos have no mask");
+    complain("");
+    if (state.tool === "region") {
+      complain(await toggleRegion(view, ...at));
+      return done();
+    }
+    canvas.setPointerCapture(event.pointerId);
+    stroke = { context: correcting(view), at };
+    brush(stroke.context, at, at, state.tool === "keep", state.large);
+    drawPhotos();
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const at = stroke && inPhoto(event, canvas.getBoundingClientRect());
+    if (!at) return;
+    brush(stroke.context, stroke.at, at, state.tool === "keep", state.large);
+    stroke.at = at;
+    drawPhotos();
+  });
+  for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, () => stroke && done());
+  canvas.addEventListener("click", (event) => {
+    if (state.correct) return;
+    if (state.inset === "large") explain(event, canvas.getBoundingClientRect());
+    else choose({ inset: "large" });
+  });
+  $("fold").addEventListener("click", () => choose({ inset: state.inset === "large" || state.inset === "closed" ? "" : "closed" }));
+}
+
+/** Corrections are painted on a train photo: the one that is shown, else the one with the largest mask. */
+function correct() {
+  const view = DATA.views[state.view]?.split === "train" ? state.view : Math.max(DATA.opening.view, DATA.views.findIndex((v) => v.split === "train"));
+  $("corrected").textContent = "";
+  return choose(state.correct ? { correct: false } : { correct: true, tool: state.tool ?? "mask", view, masks: true });
+}
+
+function stepBack() {
+  undo();
+  keepCorrections();
+  return drawPhotos();
+}
+
+function keepFile() {
+  saveCorrections();
+  nextSteps();
+  openPanel("next-steps", true);
+}

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.harness.trained_models import Viewer, view_runs
-from ambiguous_wild.io.files import own_json, write_json
 from ambiguous_wild.io.images import read_gray, write_png
 from ambiguous_wild.io.mask_reasons import reasons_of, write_reasons
 from ambiguous_wild.io.ply import read_splat_ply
@@ -29,7 +28,7 @@ from ambiguous_wild.viewing.video import fitted
 from tests.chromium import Browser, needs_chromium
 from tests.report.board_runs import change_result
 from tests.tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, write_tiny_scene
-from tests.viewing.wall_runs import wall_model, write_shown_run
+from tests.viewing.wall_runs import wall_model, write_mixed_scene, write_shown_run
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -273,8 +272,7 @@ def test_a_camera_path_is_saved_for_the_video(page: Browser, runs: Path, tmp_pat
 def removed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """3dgs without masks, and refinesplat with masks and their reasons; test photos may hold distractors."""
     root = tmp_path_factory.mktemp("removed")
-    scene = write_tiny_scene(root / "porch")
-    write_json(scene / "scene.json", own_json(scene / "scene.json") | {"split": "every-8"})
+    scene = write_mixed_scene(root / "porch")
     shutil.rmtree(write_shown_run(root / "runs", scene, "3dgs") / "masks")
     run = write_shown_run(root / "runs", scene, "refinesplat", 1)
     keep = read_gray(run / "masks" / TRAIN[1])

@@ -29,7 +29,7 @@ from ambiguous_wild.viewing.page_file import importance, opening, page_text, red
 from tests.command_line import aw
 from tests.report.board_runs import change_result
 from tests.tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, write_tiny_scene
-from tests.viewing.wall_runs import wall_model, write_shown_run
+from tests.viewing.wall_runs import wall_model, write_mixed_scene, write_shown_run
 
 HOSTILE = '</script><img src=x onerror="alert(1)">&-->'
 
@@ -286,10 +286,7 @@ def test_without_masks_it_opens_with_the_best_unless_test_photos_hold_distractor
 
 
 def test_psnr_of_mixed_test_photos_is_marked_and_names_its_fault(tmp_path: Path) -> None:
-    scene = write_tiny_scene(tmp_path / "scene")
-    info = scene / "scene.json"
-    write_json(info, own_json(info) | {"split": "every-8", "name": "scene"})
-    write_shown_run(tmp_path / "runs", scene, "3dgs")
+    write_shown_run(tmp_path / "runs", write_mixed_scene(tmp_path / "scene"), "3dgs")
     data = facts(page := view_runs([tmp_path / "runs"], tmp_path / "out").path.read_text())
     assert data["mixed"] and data["notes"][0].startswith("* PSNR here rewards ghosts: test photos may hold")
     assert sum("may hold distractors" in note for note in data["notes"]) == 1

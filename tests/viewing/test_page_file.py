@@ -312,7 +312,8 @@ def test_the_panel_names_files_and_the_command_that_trains_on(
             "--iterations 450 --overwrite longer --corrections corrections.json"
         )
         steps = "\n".join(data["next"])
-        assert f"`{above}runs/scene/refinesplat/seed0/masks`" in steps and f"`aw table {above}runs`" in steps
+        place = f"{above}{run.relative_to(tmp_path / 'out').as_posix()}"
+        assert f"`{place}/masks`" in steps and f"`aw table {above}runs`" in steps
         assert str(tmp_path) not in text
     chosen = facts(view_runs([run], tmp_path / "page", steps=[HOSTILE]).path.read_text())
     assert chosen["next"] == [HOSTILE]

@@ -56,7 +56,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile"), width=640, height=560, webgl=True) as page:
+    with Browser(tmp_path_factory.mktemp("profile"), width=800, height=560, webgl=True) as page:
         yield page
 
 
@@ -262,7 +262,8 @@ def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
     eye = facts(browser, "camera.position.toArray()")
     write("training: 2 iterations", 0.2)
     browser.run("state.path = []")
-    browser.until("DATA.training === 'training: 2 iterations' && Boolean(controls)")
+    loaded = "typeof DATA === 'object' && Boolean(controls) && DATA.training === "
+    browser.until(f"{loaded}'training: 2 iterations'")
     settle(browser)
     assert facts(browser, "[state.mode, state.right, state.view, state.masks]") == [
         "cut",
@@ -272,7 +273,7 @@ def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
     ]
     assert np.allclose(facts(browser, "camera.position.toArray()"), eye, atol=1e-3)
     write("", 0)  # the last page
-    browser.until("DATA.training === '' && Boolean(controls)")
+    browser.until(f"{loaded}''")
     settle(browser)
     assert browser.run("state.mode") == "cut" and browser.run("$('training').offsetHeight") == 0
     browser.run("window.same = 1")

@@ -29,7 +29,7 @@ HOSTILE = "</script><img src=x onerror=alert(1)>"
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile"), width=640, height=560, webgl=True) as page:
+    with Browser(tmp_path_factory.mktemp("profile"), width=800, height=560, webgl=True) as page:
         yield page
 
 
@@ -233,7 +233,7 @@ def test_the_photo_in_the_corner_is_small_and_can_be_closed(masked: Browser) -> 
 
 def test_an_old_picture_does_not_stand_under_a_new_name(masked: Browser) -> None:
     # as on a machine without a GPU, where another picture takes seconds
-    masked.run("Object.defineProperty(under, 'settled', { get: () => false, configurable: true })")
+    masked.run("Object.defineProperty(under, 'settled', { get: () => false, configurable: true }) && 1")
     masked.run("choose({ view: 0 }).then(() => 1)")
     assert masked.run("$('busy').textContent") == "drawing …"
     masked.until("getComputedStyle(under.canvas).opacity === '0'")

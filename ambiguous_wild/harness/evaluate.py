@@ -17,10 +17,13 @@ from ambiguous_wild.harness.regions import true_distractor
 from ambiguous_wild.harness.result_file import Cost, MaskScores
 from ambiguous_wild.io.files import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
+from ambiguous_wild.io.mask_reasons import FILE as REASONS
+from ambiguous_wild.io.mask_reasons import MaskReasons, reasons_of, write_reasons
 from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import mask_scores as mask_metrics
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import threads
+from ambiguous_wild.splat.step import Step
 from ambiguous_wild.splat.trainer import Trainer
 
 FPS_ROUNDS = 5
@@ -137,17 +140,44 @@ def drawn_by(trainer: Trainer, half: bool) -> Draw:
 
 
 def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
-    """Write the keep map of every train view and score it, see `write_keeps`."""
-    return write_keeps(trainer.data.scene, keep_maps(trainer), folder)
+    """Write the keep map of every train view and score it, see `write_keeps`; beside it, why it is so."""
+    reasons: dict[str, MaskReasons] = {}
+
+    def keeps() -> Iterator[tuple[View, np.ndarray]]:
+        for view, step, keep in _predicted(trainer):
+            if keep is not None:
+                if (why := mask_reasons(trainer, step)) is not None:
+                    reasons[view.name] = why
+                yield view, (keep > 0.5).cpu().numpy()
+
+    scores = write_keeps(trainer.data.scene, keeps(), folder)
+    write_reasons(folder.parent / REASONS, reasons)
+    return scores
 
 
 def keep_maps(trainer: Trainer) -> Iterator[tuple[View, np.ndarray]]:
     """Compute the keep map [H, W] bool of each train view that has one; each is rendered for it."""
-    for index, view in enumerate(trainer.data.scene.train):
-        step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
-        keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
+    for view, _, keep in _predicted(trainer):
         if keep is not None:
             yield view, (keep > 0.5).cpu().numpy()
+
+
+def _predicted(trainer: Trainer) -> Iterator[tuple[View, Step, torch.Tensor | None]]:
+    for index, view in enumerate(trainer.data.scene.train):
+        step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
+        yield view, step, trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
+
+
+def mask_reasons(trainer: Trainer, step: Step) -> MaskReasons | None:
+    """Return why the step's photo is masked where it is: by the capture's own mask, and by the method."""
+    reasons, own = trainer.hooks.mask.reasons(step), trainer.data.user_keep[step.view]
+    if own is None:
+        return reasons
+    outside = (own <= 0.5).cpu().numpy()
+    regions = np.full(outside.shape, -1) if reasons is None else reasons.regions.astype(int) - 1
+    sentences = () if reasons is None else reasons.sentences
+    regions[outside] = len(sentences)
+    return reasons_of(regions, [*sentences, "masked: the capture's own mask leaves it out"])
 
 
 def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path) -> MaskScores | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import shlex
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +17,18 @@ from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
-from ambiguous_wild.harness.result_file import CONFIG, MODEL, RESULT, check_model, metrics_of, read_result
+from ambiguous_wild.harness.result_file import (
+    CONFIG,
+    MODEL,
+    RESULT,
+    RunResult,
+    check_model,
+    metrics_of,
+    read_result,
+)
 from ambiguous_wild.harness.store import ReadConfig, read_config, run_folders, section
 from ambiguous_wild.io.files import write_text
+from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_arrays import SplatFile
@@ -53,6 +63,8 @@ class SceneModels:
     scene: Scene
     models: tuple[ViewedModel, ...]
     notes: tuple[str, ...]  # which runs are not shown, and why; the meaning of numbers
+    mixed: str = ""  # why test photos may hold distractors, see `mixed_tests`
+    runs: tuple[Path, ...] = ()  # folders of the models that are runs
 
 
 def read_models(
@@ -94,9 +106,8 @@ def read_models(
     if any(t.half for t in trained):
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
     opened = open_scene(trained[0].run, scene_folder)
-    notes += [mixed] if (mixed := mixed_tests(opened)) else []
     models = (*(t.model for t in trained), *(model.within(opened.transform) for model in files))
-    return SceneModels(opened, models, tuple(notes))
+    return SceneModels(opened, models, tuple(notes), mixed_tests(opened), tuple(t.run for t in trained))
 
 
 def read_files(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
@@ -203,10 +214,62 @@ def _read_model(run: Path) -> TrainedModel:
         render_settings=look,
         psnr={name: float(value) for name, value in psnr.items() if value is not None},
         masks=run / MASKS if (run / MASKS).is_dir() else None,
+        reasons=run / REASONS if (run / REASONS).is_file() else None,
+        retrain=_retrain_command(run, result),
         reference=knows_truth(result["method"]),
     )
     half = config.get("protocol") == "half"
     return TrainedModel(run, result["scene"], result["scene_hash"], model, half, note)
+
+
+def _retrain_command(run: Path, result: RunResult) -> str:
+    """Return the command that trains a run half as long again with corrected masks; "" if none is recorded.
+
+    Its paths are seen from the current folder if they are below, else from the one that holds scene and runs.
+    """
+    try:
+        words = shlex.split(str(result.get("reproduce", "")))
+    except ValueError:
+        return ""
+    iterations, runs = result["cost"].get("iterations"), run.resolve().parents[2]
+    if words[:2] != ["aw", "bench"] or not iterations:
+        return ""
+    options = [
+        (option, str(_from_here(Path(value), runs)) if value.startswith("/") else value)
+        for option, value in zip(words[2::2], words[3::2])
+        if option not in ("--device", "--iterations", "--budget")
+    ]
+    options += [("-o", str(_from_here(runs, runs))), ("--iterations", str(round(1.5 * iterations)))]
+    options += [("--overwrite", "longer"), ("--corrections", "corrections.json")]
+    return shlex.join(["aw", "bench", *(word for pair in options for word in pair)])
+
+
+def _from_here(path: Path, runs: Path) -> Path:
+    """Return the path from the current folder, else from the one above `runs`, else its name alone."""
+    for base in (Path.cwd(), runs.parent):
+        if path.is_relative_to(base):
+            return path.relative_to(base)
+    return Path(path.name)
+
+
+def next_steps(shown: SceneModels) -> list[str]:
+    """Return where masks and splat files of runs lie, and commands for them, for the page's panel."""
+    steps: list[str] = []
+    for run, model in zip(shown.runs, shown.models):
+        runs = run.resolve().parents[2]
+        place = str(_from_here(run.resolve(), runs))
+        if model.masks is not None:
+            steps.append(f"masks of {model.label}, white = static: `{place}/{MASKS}`")
+        export = shlex.join(["aw", "export", place])
+        steps.append(f"splat file of {model.label}: `{place}/{MODEL}`; as SPZ, SOG and glTF: `{export}`")
+        if run == shown.runs[-1]:
+            steps.append(f"table of the runs: `{shlex.join(['aw', 'table', str(_from_here(runs, runs))])}`")
+    return steps
+
+
+def page_title(scene: Scene) -> str:
+    """Return the scene's name; where it is only "scene", the name of the folder that holds it."""
+    return scene.root.resolve().parent.name if scene.name == "scene" else scene.name
 
 
 def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
@@ -254,6 +317,7 @@ def view_runs(
     scene_folder: Path | None = None,
     most_gaussians: int = MAX_GAUSSIANS,
     title: str | None = None,
+    steps: Sequence[str] | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Page:
     """Write OUTPUT/index.html with the models of runs.
@@ -265,6 +329,7 @@ def view_runs(
         scene_folder: where the scene lies; None = where the runs say.
         most_gaussians: a larger model is reduced to this number, with a note on the page.
         title: title of the page; None = the scene's name.
+        steps: lines of the panel "What next", see `page_text`; None = those of `next_steps`.
         say: gets a line about each step.
 
     Raises:
@@ -275,9 +340,11 @@ def view_runs(
     text, models_bytes = page_text(
         shown.scene,
         shown.models,
-        title=shown.scene.name if title is None else title,
+        title=page_title(shown.scene) if title is None else title,
         most_gaussians=most_gaussians,
         notes=shown.notes,
+        mixed=shown.mixed,
+        next_steps=next_steps(shown) if steps is None else steps,
         say=say,
     )
     write_text(output / PAGE, text)
@@ -320,7 +387,14 @@ class Viewer:
         shown = read_models(paths)
         self.labels = tuple(model.label for model in shown.models)
         self.height = height
-        self.page, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
+        self.page, _ = page_text(
+            shown.scene,
+            shown.models,
+            title=page_title(shown.scene),
+            notes=shown.notes,
+            mixed=shown.mixed,
+            next_steps=next_steps(shown),
+        )
 
     def __repr__(self) -> str:
         return f"Viewer of {', '.join(self.labels)}; a notebook shows it, 'aw view' writes it to a file"

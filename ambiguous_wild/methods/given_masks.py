@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.method_hooks import MaskPolicy
@@ -84,6 +85,9 @@ class GraftedPolicy(MaskPolicy):
 
     def panels(self, step: Step) -> dict[str, np.ndarray]:
         return self.mask.panels(step)
+
+    def reasons(self, step: Step) -> MaskReasons | None:
+        return self.mask.reasons(step)
 
     def explain(self, step: Step, x: int, y: int) -> list[str]:
         return self.mask.explain(step, x, y)

@@ -20,6 +20,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.harness.result_file import RESULT, encoded
 from ambiguous_wild.harness.trained_models import TrainedModel, find_models, open_scene
@@ -418,8 +419,10 @@ def write_model_pages(
         if len({f.scene_hash for _, f in shown}) > 1:
             raise AwError(f"runs on scene {scene!r} of {dataset!r} used different photos: publish them apart")
         name = _page_name(dataset, scene, names)
-        models = [replace(f.model, label=label) for label, f in shown]
-        text, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
+        # readers of the board have not the runs that a command would train on
+        models = [replace(f.model, label=label, retrain="") for label, f in shown]
+        opened = open_scene(shown[0][1].run)
+        text, _ = page_text(opened, models, title=f"{dataset}: {scene}", mixed=mixed_tests(opened))
         (out / MODELS).mkdir(exist_ok=True)
         (out / MODELS / name).write_text(text, encoding="utf-8")
         for label, _ in shown:

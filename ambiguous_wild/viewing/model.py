@@ -80,6 +80,8 @@ class ViewedModel:
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
     # keep maps of train views: a folder of PNGs (white = keep), or [H, W] bool by name of the view (1 = keep)
     masks: Path | Mapping[str, np.ndarray] | None = None
+    reasons: Path | None = None  # reasons.json of the run: why regions are masked or kept
+    retrain: str = ""  # command that trains it longer with the corrections.json of the page
     reference: bool = False  # trained with exact masks or clean photos, so it does not compete
     splats: SplatFile | None = field(
         default=None, repr=False, compare=False

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.replay import open_run, replay
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_keep_map, read_png_rgb, write_png
+from ambiguous_wild.io.mask_reasons import read_reasons
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
@@ -122,8 +124,17 @@ def test_a_pixel_is_explained(masked):
         done = CliRunner().invoke(cli, ["explain", str(masked), photo, str(column), str(row)])
         assert done.exit_code == 0, done.output
         said[kept] = done.output
-    assert "kept\n" in said[True] and "masked\n" in said[False]
+    assert said[True].startswith("kept: ") and said[False].startswith("masked: it ")
     assert "mask: yes" in said[False] and "threshold of the scene's instances: " in said[False]
+    # what the run stores for the page is what the command says first
+    stored = read_reasons(masked / "reasons.json")
+    assert {Path(name).stem for name in stored} == {path.stem for path in (masked / "masks").rglob("*.png")}
+    reasons = next(reasons for name, reasons in stored.items() if Path(name).stem == photo)
+    for kept in (True, False):
+        row, column = (int(v) for v in np.argwhere(written == kept)[0])
+        assert said[kept].splitlines()[0] == reasons.at(column, row)
+    words = np.array(["", *(sentence.partition(":")[0] for sentence in reasons.sentences)])[reasons.regions]
+    assert ((words == "kept") == (written > 0)).all()
 
 
 def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
@@ -137,7 +148,7 @@ def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
     monkeypatch.setattr(replay_module, "load_train_data", with_mask)
     photo = sorted((masked / "masks").rglob("*.png"))[0].stem
     done = CliRunner().invoke(cli, ["explain", str(masked), photo, "0", "0"])
-    assert "masked\n" in done.output and "the capture's own mask leaves it out" in done.output
+    assert done.output.startswith("masked: the capture's own mask leaves it out\n")
 
 
 @pytest.mark.parametrize(
@@ -145,6 +156,8 @@ def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
     [
         (("nowhere.png", "0", "0"), "unknown train photo"),
         (("{photo}", "999", "0"), "no pixel 999, 0"),
+        ((), "PHOTO, COLUMN, ROW not given: name a run, a train photo of it, and a pixel"),
+        (("{photo}", "1"), "ROW not given"),
     ],
 )
 def test_what_cannot_be_explained_is_named(masked, words, message):

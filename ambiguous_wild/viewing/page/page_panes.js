@@ -108,12 +108,12 @@ class Pane {
   }
 
   /** The photo lies where the model's picture of it would. */
-  async drawPhoto(view, model) {
+  async drawPhoto(view) {
     if (this.choice !== PHOTO) return;
     this.photo.style.visibility = view ? "visible" : "hidden";
     this.label.textContent = view ? "photo" : "photo: choose a camera";
     if (!view) return;
-    await paintPhoto(this.photo, view, model);
+    await paintPhoto(this.photo, view);
     const { scale, left, top } = fitted(view, this.element.clientWidth, this.element.clientHeight);
     Object.assign(this.photo.style, { left: `${left}px`, top: `${top}px`, width: `${scale * view.width}px`, height: `${scale * view.height}px` });
   }

@@ -13,15 +13,16 @@ import click
 
 from ambiguous_wild.cli.options import (
     PathName,
+    SectionedCommand,
     engine_options,
     json_option,
     metric_file_option,
-    say,
     training_options,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.terminal import line_width, say
 from ambiguous_wild.harness.benchmark import Engine, bench
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def parse_budget(text: str) -> float:
     return seconds
 
 
-@click.command(name="bench")
+@click.command(name="bench", cls=SectionedCommand)
 @click.option(
     "--method",
     "methods",
@@ -272,6 +273,8 @@ def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
     from ambiguous_wild.report.suite import suite_tables
 
     try:
-        click.echo(to_text(suite_tables(prepared, folder), color=sys.stdout.isatty()), nl=False)
+        click.echo(
+            to_text(suite_tables(prepared, folder), color=sys.stdout.isatty(), width=line_width()), nl=False
+        )
     except AwError as error:  # every run failed, which `finish` reports
         say(str(error))

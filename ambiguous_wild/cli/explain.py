@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, prepare_cpu, say
+from ambiguous_wild.cli.options import PathName, prepare_cpu
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.terminal import say
 
 
 @click.command("explain")

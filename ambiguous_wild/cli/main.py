@@ -18,7 +18,7 @@ import click
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, disk_line, logged_to, unknown
-from ambiguous_wild.core.names import plain
+from ambiguous_wild.core.terminal import line_width, say, wrapped
 
 # Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
 # `aw --help` imports no command.
@@ -148,7 +148,9 @@ def _printed() -> logging.Handler:
 
     handler = logging.Handler()
     handler.set_name(VERBOSE)
-    handler.emit = lambda record: tqdm.write(f"  {record.getMessage()}", file=sys.stderr)  # type: ignore[method-assign]
+    handler.emit = lambda record: tqdm.write(
+        wrapped(f"  {record.getMessage()}", line_width(err=True)), file=sys.stderr
+    )  # type: ignore[method-assign]
     return handler
 
 
@@ -174,7 +176,7 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click wraps the exception that says what was kept.
         text = str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
-        click.secho(text, fg="yellow", err=True)
+        say(text, fg="yellow")
         sys.exit(130)
     except BrokenPipeError:
         # The reader closed our output (`aw table | head`); this is not an error.
@@ -202,9 +204,9 @@ def _one_line_each() -> Callable[..., None]:
     printed: set[str] = set()
 
     def show(message: Warning | str, *_: object) -> None:
-        line = "warning: " + plain(" ".join(str(message).split()))
+        line = "warning: " + " ".join(str(message).split())
         if line not in printed:
-            click.echo(line, err=True)
+            say(line)
         printed.add(line)
 
     return show
@@ -238,7 +240,7 @@ def _click_message(error: click.ClickException) -> str:
 
 def _fail(message: str) -> None:
     # names may hold control characters, those of files need not be UTF-8
-    click.secho("error: " + plain(" ".join(message.split())), fg="red", err=True)
+    say("error: " + " ".join(message.split()), fg="red")
     sys.exit(AwError.exit_code)
 
 

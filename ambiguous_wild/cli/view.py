@@ -17,13 +17,13 @@ from ambiguous_wild.cli.options import (
     device_option,
     json_option,
     plugin_option,
-    say,
     scene_folder_option,
     seed_option,
     threads_option,
 )
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
+from ambiguous_wild.core.terminal import say
 from ambiguous_wild.io.splat_files import FORMATS
 
 if TYPE_CHECKING:
@@ -241,11 +241,11 @@ def export_command(
         click.echo(json.dumps(encoded(rows), indent=2, ensure_ascii=False, default=str))
         return
     for label, files in reports:
-        click.echo(f"{plain(label)}: {files[0].gaussians:,} Gaussians")
+        say(f"{plain(label)}: {files[0].gaussians:,} Gaussians", out=True)
         if told := [f"{e.format}: {_transform(e)}" for e in files if e.transform != type(e.transform)()]:
-            click.echo(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}")
+            say(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}", out=True)
         for e in files:
-            click.echo(f"  {_line(e)}")
+            say(f"  {_line(e)}", out=True)
 
 
 def _transform(e: ExportedModel) -> str:

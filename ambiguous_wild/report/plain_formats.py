@@ -10,7 +10,6 @@ import csv
 import io
 import math
 import re
-import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.names import csv_text, plain
+from ambiguous_wild.core.terminal import display_width, wrapped
 from ambiguous_wild.harness.measures import MEASURES, Measure
 from ambiguous_wild.report.table_layout import ARROWS, TIE, Column, Row, Table, TableCell
 
@@ -35,12 +35,6 @@ FIRST = (
 UNFITTED = "colours of test photos are not fitted"  # begins a note, with which PSNR affine comes second
 
 
-def display_width(text: str) -> int:
-    """Return the width in columns of a terminal: wide characters take two, combining ones none."""
-    wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
-    return len(text) + wide - sum(unicodedata.combining(c) > 0 for c in text)
-
-
 def marked(cell: TableCell, measure: Measure) -> str:
     """Return the cell's text with its rank and the mark of a tie with the best."""
     text = plain(cell.text(measure))
@@ -52,12 +46,18 @@ def row_name(row: Row) -> str:
     return plain(f"  {row.name}" if row.kind == "reported" else row.name)
 
 
-def to_text(tables: Sequence[Table], *, color: bool = False) -> str:
-    """Return tables as aligned text; with `color`, the three best are coloured."""
+def to_text(tables: Sequence[Table], *, color: bool = False, width: int | None = None) -> str:
+    """Return tables as aligned text.
+
+    Args:
+        tables: the tables.
+        color: colour the three best.
+        width: columns in which the lines below a table are broken; None: each stays one line.
+    """
     parts = []
     for table, below in _with_below(tables):
         parts += [plain(table.title), *_aligned(table, color), ""]
-        parts += [*map(plain, below), ""] if below else []
+        parts += [*(wrapped(plain(line), width) for line in below), ""] if below else []
     return "\n".join(parts).rstrip("\n") + "\n"
 
 

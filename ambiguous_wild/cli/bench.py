@@ -168,12 +168,12 @@ def command(
 
     \b
     Settings that few need, as --set NAME.KEY=VALUE:
-      train.probes=8               how often the test PSNR is measured while training
+      train.probes=8               measurements of the test PSNR while training
       train.checkpoint_every_s=60  seconds between checkpoints
-      train.on_nonfinite=stop      a NaN ends the run; rollback: go back and leave that photo out
-      engine.retries=3             how often a run is repeated whose process or node was lost
+      train.on_nonfinite=stop      at a NaN; rollback: leave that photo out
+      engine.retries=3             of a run whose process or node was lost
       engine.memory_per_cell=GB    with Ray: memory per run
-      engine.transfer_limit=4000   with Ray: MB of the largest scene or run that is sent
+      engine.transfer_limit=4000   with Ray: MB of the largest scene or run
     """
     if iterations is not None and budgets:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, threads_option
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, similar_path
 from ambiguous_wild.core.machine import usable_cores
 from ambiguous_wild.core.terminal import say
 
@@ -66,7 +66,7 @@ def capture_command(
     elif absent.startswith("camera"):
         raise AwError(f"unknown camera {absent!r}: write 'camera' or 'camera:1', and nothing beside it")
     else:
-        raise AwError(f"{absent} does not exist: {wanted}")
+        raise AwError(f"{absent} does not exist: {wanted}{similar_path(absent)}")
     videos = facts.get("videos", [])
     if "frames_read" in facts:
         counts = facts["frames_read"], facts["frames_announced"]

@@ -18,7 +18,7 @@ from ambiguous_wild.cli.options import (
     only_option,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.core.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.cost_runs import CostRuns
@@ -81,7 +81,9 @@ def command(
     from ambiguous_wild.report.cost_plots import draw_all
 
     written += draw_all(report, output)
-    click.echo(json.dumps(plain_data(report), indent=2) if as_json else to_text(report), nl=as_json)
+    click.echo(
+        json.dumps(plain_data(report), indent=2) if as_json else to_text(report, line_width()), nl=as_json
+    )
     say(f"wrote {', '.join(p.name for p in written)} in {output}")
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, json_option, reported_option, title_option
+from ambiguous_wild.cli.options import CommandGroup, PathName, json_option, reported_option, title_option
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.core.terminal import say
 
@@ -27,7 +27,7 @@ _board = click.option(
 )
 
 
-@click.group("leaderboard")
+@click.group("leaderboard", cls=CommandGroup)
 def command() -> None:
     """Leaderboard: check runs, collect them in CSV files, publish them as a page.
 

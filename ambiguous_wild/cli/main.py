@@ -12,6 +12,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import click
@@ -231,7 +232,11 @@ def _click_message(error: click.ClickException) -> str:
     if isinstance(error, click.UsageError) and error.ctx is not None:
         stray = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", message)
         flags = {flag for param in error.ctx.command.params for flag in param.opts}
-        if stray and {"--method", "--scene"} <= flags:
+        words = pairwise(sys.argv) if stray else ()
+        comma = next((a for a, b in words if a.endswith(",") and b == stray[1].split()[0]), "")
+        if stray and comma:
+            message += f": write {comma}{stray[1].replace(' ', '')} without a space"
+        elif stray and {"--method", "--scene"} <= flags:
             folder = Path(stray[1]).is_dir() or "/" in stray[1]
             message += f": did you mean {'--scene' if folder else '--method'} {stray[1]}?"
         message += f" (see '{error.ctx.command_path} --help')"

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, similar_path
 from ambiguous_wild.core.terminal import say
 
 
@@ -25,7 +25,12 @@ class PathName(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
             self.fail("the name is empty; write . for the current folder", param, ctx)
-        return super().convert(value, param, ctx)
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter as error:
+            if "does not exist" in error.message:
+                error.message = error.message.rstrip(".") + (similar_path(value) or ".")
+            raise
 
 
 class PathOrAlone(PathName):
@@ -56,6 +61,21 @@ class Count(click.IntRange):
         return super().convert(round(float(thousands[1]) * 1000) if thousands else value, param, ctx)
 
 
+class Format(click.Choice[str]):
+    """A format by its name, or by another name that people use for it."""
+
+    def __init__(
+        self, names: Sequence[str], also: Mapping[str, str] = {}, unsupported: Mapping[str, str] = {}
+    ) -> None:
+        super().__init__(names)
+        self.also, self.unsupported = also, unsupported
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value in self.unsupported:
+            self.fail(f"{value!r} is not supported: {self.unsupported[value]}", param, ctx)
+        return super().convert(self.also.get(value, value), param, ctx)
+
+
 class SectionedCommand(click.Command):
     """A command of many options: its help shows them under headings, the most used ones first."""
 
@@ -81,6 +101,15 @@ OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
                  "--protocol", "--plugin", "--metric-file"),
     "Ray": ("--engine", "--address", "--cpus-per-cell", "--gpus-per-cell", "--transfer"),
 }  # fmt: skip
+
+
+class CommandGroup(click.Group):
+    """A group whose help shows the first sentence of each command whole."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            rows = [(name, self.commands[name].get_short_help_str(limit=1000)) for name in self.commands]
+            formatter.write_dl(rows)
 
 
 def _write_section(

@@ -8,11 +8,18 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, json_option, only_option, seed_option, title_option
+from ambiguous_wild.cli.options import (
+    CommandGroup,
+    PathName,
+    json_option,
+    only_option,
+    seed_option,
+    title_option,
+)
 from ambiguous_wild.core.terminal import say
 
 
-@click.group("study")
+@click.group("study", cls=CommandGroup)
 def command() -> None:
     """Blind user study: how hard are distractors to see, and which render is better?
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ambiguous_wild.cli.options import (
+    Format,
     PathName,
     command_line,
     json_option,
@@ -43,7 +44,10 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.command(name="table")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "--format", "style", type=click.Choice(STYLES), help="[default: by the suffix of -o, else text]"
+    "--format",
+    "style",
+    type=Format(STYLES, {"tex": "latex", "md": "markdown", "txt": "text"}),
+    help="[default: by the suffix of -o, else text]",
 )
 @click.option(
     "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,

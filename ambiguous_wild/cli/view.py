@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import (
+    Count,
     FiniteFloat,
+    Format,
     PathName,
     device_option,
     json_option,
@@ -22,7 +24,6 @@ from ambiguous_wild.cli.options import (
     threads_option,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import plain
 from ambiguous_wild.core.terminal import say
 from ambiguous_wild.io.splat_files import FORMATS
 
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 
 MAX_GAUSSIANS = 150_000
 THIS_MACHINE = "127.0.0.1"
+NO_FORMAT = {  # what people ask for -> what to do instead
+    "splat": "it has no harmonics and no scale of the scene; viewers that read .splat also read PLY or SPZ, so "
+    "write --format spz",
+}
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
@@ -71,7 +76,7 @@ class HostPort(click.ParamType):
     help="Train on SCENE and watch it in a browser.",
 )
 @click.option("--method", default="refinesplat", show_default=True, help="With --live: method to train.")
-@click.option("--iterations", type=click.IntRange(1), help="With --live: iterations.  [default: 30000]")
+@click.option("--iterations", type=Count(1), help="With --live: iterations.  [default: 30000]")
 @seed_option("With --live: seed.")
 @threads_option
 @device_option("With --live: auto is the GPU if torch and gsplat can use one, else the CPU.")
@@ -186,7 +191,7 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
 @click.command(name="export")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "--format", "formats", multiple=True, type=click.Choice(FORMATS), default=[name for name in FORMATS if name != "ply"],
+    "--format", "formats", multiple=True, type=Format(list(FORMATS), unsupported=NO_FORMAT), default=[name for name in FORMATS if name != "ply"],
     show_default="all but ply", help="Repeatable.",
 )  # fmt: skip
 @click.option(
@@ -241,7 +246,7 @@ def export_command(
         click.echo(json.dumps(encoded(rows), indent=2, ensure_ascii=False, default=str))
         return
     for label, files in reports:
-        say(f"{plain(label)}: {files[0].gaussians:,} Gaussians", out=True)
+        say(f"{label}: {files[0].gaussians:,} Gaussians", out=True)
         if told := [f"{e.format}: {_transform(e)}" for e in files if e.transform != type(e.transform)()]:
             say(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}", out=True)
         for e in files:

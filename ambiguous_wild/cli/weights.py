@@ -7,12 +7,12 @@ import json
 
 import click
 
-from ambiguous_wild.cli.options import json_option
+from ambiguous_wild.cli.options import CommandGroup, json_option
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.core.terminal import say
 
 
-@click.group(name="weights")
+@click.group("weights", cls=CommandGroup)
 def command() -> None:
     """Pretrained networks for LPIPS, features and instance masks. No method needs them by default.
 

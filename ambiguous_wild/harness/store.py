@@ -15,7 +15,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.core.errors import counted, unknown
+from ambiguous_wild.core.errors import counted, similar_path, unknown
 from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.measures import MASK_LABELS, MEASURES, Metric, measure, users_metrics
 from ambiguous_wild.harness.result_file import (
@@ -265,7 +265,9 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     runs: dict[Path, Path] = {}
     for root in folders:
         if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+            raise AwError(
+                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote{similar_path(root)}"
+            )
         runs |= {run.resolve(): run for run in run_folders(root)}
     return list(runs.values())
 

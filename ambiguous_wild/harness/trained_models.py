@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
-from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.core.errors import shortlist, similar_path, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import CONFIG, MODEL, RESULT, check_model, metrics_of, read_result
@@ -118,7 +118,7 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
         if not root.is_dir():
             raise AwError(
                 f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, a run in it, or a "
-                "splat file"
+                f"splat file{similar_path(root)}"
             )
         for run in dict.fromkeys(run_folders(root)):
             if any(t.run.samefile(run) for t in trained):

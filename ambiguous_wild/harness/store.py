@@ -41,7 +41,7 @@ from ambiguous_wild.io.ply import splat_count
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",
     "options_hash", "training", "unrecorded", "timing", "timing_reason", "timing_kernel", "hardware",
-    "effects", "length", "features", "test_photos", "start", "metric_functions",
+    "effects", "length", "features", "test_photos", "no_masks", "start", "metric_functions",
 )  # fmt: skip
 IN_FOLDER = " in "  # between a method and its folder, where several folders hold runs of it
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
@@ -71,8 +71,8 @@ class Runs:
         version, code_hash, source (hash of the method's own file, or empty), options_hash, fit (what was done
         with test photos, see report/notes.py), effects, length, features and other settings of the training
         (words; features are empty if the method has none), test_photos (a warning about them, or empty),
-        device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason, timing_kernel,
-        hardware, and mask_iou, mask_precision, mask_recall.
+        no_masks (why, or empty), device, the numbers of "cost", timing ("alone", "contended", "unknown"),
+        timing_reason, timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -363,6 +363,7 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "effects": effects_of(result["facts"]),
             "length": str(result["facts"].get("length") or _length(config)),
             "test_photos": str(result["facts"].get("test_photos", "")),
+            "no_masks": str(result["facts"].get("no_masks", "")),
             "features": _features(result["options"]),
             "start": str(result["facts"].get("start", "the scene's points")),
         }

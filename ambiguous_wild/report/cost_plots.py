@@ -129,8 +129,9 @@ def label_points(axes: Any, points: Sequence[tuple[str, float, float, float, Any
     for (name, x, bar, y, colour), height in zip(points, heights):
         on_right = to_axes.transform((x, y))[0] > 0.5
         axes.annotate(
-            plain(name), (x - bar if on_right else x + bar, height), xytext=(-8 if on_right else 8, 0), textcoords="offset points",
-            color=colour, fontsize=8, va="center", ha="right" if on_right else "left", parse_math=False,
+            plain(name), (x - bar if on_right else x + bar, height), xytext=(-8 if on_right else 8, 0),
+            textcoords="offset points", color=colour, fontsize=8, va="center",
+            ha="right" if on_right else "left", parse_math=False,
         )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from typing import Any
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.names import csv_text, plain
 from ambiguous_wild.core.terminal import display_width, wrapped
+from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import MEASURES, Measure
 from ambiguous_wild.report.table_layout import ARROWS, TIE, Column, Row, Table, TableCell
 
@@ -29,8 +30,8 @@ UNEQUAL = "not comparable"  # begins a note that every format with ranks shows
 WIDTH = 100
 # The most important columns; others follow in the order of the table.
 FIRST = (
-    "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
-    "flip", "fps", "model_mb",
+    "psnr", "psnr_consistent", "effects", "lpips_alex", "ssim", "mask_iou", "train_s", "psnr_covered",
+    "gaussians", "lpips_vgg", "flip", "fps", "model_mb",
 )  # fmt: skip
 UNFITTED = "colours of test photos are not fitted"  # begins a note, with which PSNR affine comes second
 
@@ -118,7 +119,7 @@ def to_markdown(tables: Sequence[Table]) -> str:
     for table, below in _with_below(tables):
         parts += [f"**{markdown_text(table.title)}**", ""] if table.title else []
         head = [
-            f"{markdown_text(c.group)} {markdown_text(c.measure.label)} {ARROWS[c.measure.better]}".strip()
+            f"{markdown_text(c.group)} {markdown_text(c.name)} {ARROWS[c.measure.better]}".strip()
             for c in table.columns
         ]
         parts.append(_markdown_row([table.head, *head]))
@@ -259,7 +260,7 @@ def to_long_csv(tables: Sequence[Table]) -> str:
 
 
 def _limits(table: Table) -> str:
-    return "; ".join(note for note in table.notes if note.startswith(UNEQUAL))
+    return "; ".join(note for note in table.notes if note.startswith((UNEQUAL, MIXED)))
 
 
 def to_wide_csv(tables: Sequence[Table]) -> str:
@@ -304,7 +305,9 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
     left = width - max(map(display_width, names))
     unfitted = any(note.startswith(UNFITTED) for note in tables[-1].notes)
     first = (FIRST[0], "psnr_affine", *FIRST[1:]) if unfitted else FIRST
-    order = sorted(range(len(columns)), key=lambda i: (_importance(columns[i].measure, first), i))
+    ranged = [any(row.cells[i].ranged for table in tables for row in table.rows) for i in range(len(columns))]
+    # a time that is not ranked tells less than any other column
+    order = sorted(range(len(columns)), key=lambda i: (ranged[i], _importance(columns[i].measure, first), i))
     kept: list[int] = []
     for i in order:
         need = max(_column_width(table, i) for table in tables)

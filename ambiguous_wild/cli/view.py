@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import re
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -181,8 +182,13 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
     from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.report.model_views import video_runs
 
-    with ticking(unit="frame") as tick:
-        done = video_runs(runs, output, path=path, **options, say=say, tick=tick)
+    # the end of a time limit is an interruption, which keeps the frames
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with ticking(unit="frame") as tick:
+            done = video_runs(runs, output, path=path, **options, say=say, tick=tick)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
     if done.gif is not None:
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")

@@ -56,6 +56,19 @@ def test_a_bar_says_what_is_done_and_goes(words: list[str], monkeypatch: pytest.
     assert "|" not in shown.left() and "PSNR" in shown.left()
 
 
+def test_set_up_has_a_clock_of_its_own_and_the_end_of_a_budget_is_known(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = seen([*words, "--effects", "none"], monkeypatch).getvalue()
+    begun = shown.index("training: ")
+    assert "setting up: [00:00]" in shown[:begun] and "%" not in shown[:begun]
+    assert re.search(r"training: +3%\|.*\| 1/30it \[00:00<", shown)
+    budget = [*words[: words.index("--iterations")], "--budget", "1s", "--seed", "1", "--effects", "none"]
+    shown = seen(budget, monkeypatch).getvalue()
+    assert "setting up: [00:00, then 00:01 of training]" in shown
+    assert re.search(r"training: .*/100% \[00:00, 00:0[01] left, \d+ ms/it", shown) and "?" not in shown
+
+
 STOPPING = "stopping: the model is measured and saved, Ctrl-C again to quit"
 
 

@@ -23,10 +23,19 @@ def notes_of(root: Path, *methods: tuple[str, dict]) -> list[str]:  # type: igno
     return list(comparison(read_runs(root))[-1].notes)
 
 
-def test_refinesplat_is_said_to_be_weight_free(tmp_path):
-    (note,) = [n for n in notes_of(tmp_path, ("3dgs", {}), ("refinesplat", {})) if "weight-free" in n]
-    assert note.startswith("refinesplat: ")
-    assert not [n for n in notes_of(tmp_path / "other", ("3dgs", {})) if "weight-free" in n]
+def test_a_note_that_is_the_same_for_all_runs_stands_in_the_docs_alone(tmp_path):
+    assert not [
+        n for n in notes_of(tmp_path, ("3dgs", {}), ("refinesplat", {})) if n.startswith("refinesplat")
+    ]
+    about = registry.get_method("refinesplat").about([])
+    assert about.startswith("weight-free; ") and "docs/fidelity.md" in about  # as 'aw methods' shows it
+    assert "refinesplat" in (Path(__file__).parents[2] / "docs/fidelity.md").read_text()
+
+
+def test_methods_with_equal_notes_share_a_line(tmp_path):
+    both = {"features": "vgg16"}
+    notes = notes_of(tmp_path, ("robustsplat", both), ("spotlesssplats", both))
+    assert "robustsplat, spotlesssplats: features vgg16" in notes
 
 
 def test_the_papers_method_names_the_networks_of_its_runs(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import sys
@@ -35,13 +34,8 @@ def display_width(text: str) -> int:
 
 
 def line_width(err: bool = False) -> int | None:
-    """Return the columns of standard output or standard error; None: no terminal, lines are not broken.
-
-    COLUMNS gives a width to anything, as for tables.
-    """
-    if not (sys.stderr if err else sys.stdout).isatty() and not os.environ.get("COLUMNS", "").isdigit():
-        return None
-    return shutil.get_terminal_size().columns
+    """Return the columns of standard output or standard error; None: no terminal, lines are not broken."""
+    return shutil.get_terminal_size().columns if (sys.stderr if err else sys.stdout).isatty() else None
 
 
 def wrapped(text: str, width: int | None) -> str:

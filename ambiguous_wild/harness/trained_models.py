@@ -132,7 +132,8 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
                 notes.append(trained[-1].note)
     if not trained:
         why = f" ({notes[0]})" if notes else ""
-        if scene := next((path for path in paths if (path / "scene.json").exists()), None):
+        scenes = (path for path in paths for part in ("scene.json", "sparse") if (path / part).exists())
+        if scene := next(scenes, None):
             why = f": {scene} is a scene, which 'aw bench --method NAME --scene {scene} -o runs' trains"
         raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
     return _with_labels(trained), notes

@@ -70,7 +70,7 @@ MISTAKES = [
     ("view run", "no folder of runs run ... did you mean runs?"),
     ("view above/scene", "above/scene is a scene, which 'aw bench"),
     ("capture rwa -o out", "did you mean raw?"),
-    ("import rwa -o out", "did you mean raw?"),
+    ("import rwa -o out", "did you mean ... /raw?"),
     ("build-scene rwa -o out", "capture rwa does not exist; did you mean raw?"),
     ("export runs --format splat", "'splat' is not supported ... --format spz"),
     ("bench --method 3dgs --scene scene --iterations 5 -o file", "file"),

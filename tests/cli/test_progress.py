@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import re
 import signal
 import sys
@@ -12,25 +11,10 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.cli import main, run_progress
-from tests.command_line import aw
+from tests.command_line import Terminal, aw
 from tests.tiny_scene import write_tiny_scene
 
 LENGTH = 30
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-    def left(self) -> str:
-        """What still stands there: after a carriage return a line is written over."""
-        lines = []
-        for line in self.getvalue().split("\n"):
-            shown = ""
-            for piece in line.split("\r"):
-                shown = piece + shown[len(piece) :]
-            lines.append(shown.rstrip())
-        return "\n".join(lines)
 
 
 @pytest.fixture

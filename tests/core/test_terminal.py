@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sys
 import time
 
@@ -10,6 +9,7 @@ import pytest
 from tqdm import tqdm
 
 from ambiguous_wild.core.terminal import clock, display_width, keep_clock_running, line_width, say, wrapped
+from tests.command_line import Terminal
 
 LINE = "3 of 30 photos share too few features with two others at once: IMG_0012.jpg, IMG_0017.jpg and 1 more"
 COMMAND = "aw bench --method 3dgs,refinesplat --scene my-scene -o runs"
@@ -52,23 +52,17 @@ def test_wide_characters_take_two_columns() -> None:
     assert max(map(display_width, wrapped("写真 " * 30, 40).splitlines())) <= 40
 
 
-def test_what_is_said_fits_the_columns_that_are_set(
+def test_what_is_said_fits_the_terminal_and_stays_whole_in_a_file(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv("COLUMNS", raising=False)
-    say(LINE)
-    assert capsys.readouterr() == ("", f"{LINE}\n") and line_width() is None
     monkeypatch.setenv("COLUMNS", "40")
-    say(LINE, out=True)
-    out, err = capsys.readouterr()
-    assert max(map(len, out.splitlines())) <= 40 and err == ""
+    say(LINE)
     say("a\x1b[31mb\nc", out=True)
-    assert capsys.readouterr().out == "a\\x1b[31mb\\nc\n"
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
+    assert capsys.readouterr() == ("a\\x1b[31mb\\nc\n", f"{LINE}\n") and line_width() is None
+    monkeypatch.setattr(sys, "stdout", terminal := Terminal())
+    say(LINE, out=True)
+    lines = terminal.getvalue().splitlines()
+    assert max(map(len, lines)) <= 40 < len(LINE) and line_width() == 40
 
 
 def test_a_clock_runs_while_nothing_is_done_and_ends_with_its_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,7 +177,7 @@ def test_runs_of_versions_of_a_methods_file_have_no_mean(tmp_path: Path, scenes:
 MIXED = {"test_photos": "test photos may hold distractors: every 8th photo tests"}
 
 
-def ghosts(consistent: bool = True, **changes: Any) -> list[dict[str, Any]]:  # noqa: ANN401
+def ghosts(consistent: bool = True, **changes: Any) -> list[dict[str, Any]]:
     """Runs on a scene whose test photos hold distractors: the one that draws them has more PSNR."""
     runs = []
     for method, psnr, true in (("3dgs", 22.0, 19.0), ("a", 21.0, 23.0), ("b", 20.0, 21.0)):

@@ -112,7 +112,8 @@ def photo_consistency(scene: Scene) -> dict[str, np.ndarray] | str:
             looking += sees
             agreeing += sees & _shown(photo, world, sees, cameras[k], photos[k])
         agree = (looking >= SUPPORTED_FROM) & (agreeing >= AGREEING_FROM * looking)
-        most = cv2.medianBlur(agree.astype(np.uint8), 5)  # chance agreement within a distractor is small
+        # agreement by chance within a distractor is small, and beside its rim a pixel holds some of it
+        most = cv2.erode(cv2.medianBlur(agree.astype(np.uint8), 5), np.ones((3, 3), np.uint8))
         size = (view.camera.width, view.camera.height)
         consistent[view.name] = cv2.resize(most, size, interpolation=cv2.INTER_NEAREST) > 0
     return consistent
@@ -132,8 +133,7 @@ def _shown(
     x, y = in_map(camera, local, other.shape[:2])
     around = np.ones((3, 3), np.uint8)
     low, high = (_look_up(f(other, around), x, y, sees) for f in (cv2.erode, cv2.dilate))
-    middle = np.median(low[sees] + high[sees], axis=0) / 2
-    gain = np.median(photo[sees], axis=0) / np.maximum(middle, 1e-3)
+    gain = np.median(photo[sees] / np.maximum((low + high)[sees] / 2, 0.02), axis=0)
     return np.all((photo >= gain * low - COLOUR_RANGE) & (photo <= gain * high + COLOUR_RANGE), axis=-1)
 
 

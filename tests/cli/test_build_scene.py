@@ -94,6 +94,4 @@ def test_the_verdict_says_that_much_of_a_walk_is_missing(placed, missing):
         {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1}, (4, 3), Path("s")
     )
     told = f"not whole: what the {missing} photos left out show is missing"
-        f"not whole: what the {missing} photos left out show is missing ('aw screen' says where to take more)"
-    )
     assert (told in line) == (missing is not None) == ("ready" not in line)

@@ -7,7 +7,7 @@ import threading
 
 from tqdm import tqdm
 
-from ambiguous_wild.core.terminal import keep_clock_running, say
+from ambiguous_wild.io.terminal import keep_clock_running, say
 
 
 class Bar:

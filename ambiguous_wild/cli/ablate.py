@@ -21,7 +21,7 @@ from ambiguous_wild.cli.options import (
     training_options,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 from ambiguous_wild.methods.ablation_groups import Group
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from ambiguous_wild.cli.options import PathName, json_option
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 
 @click.command("ambiguity-report")

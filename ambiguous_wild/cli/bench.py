@@ -22,8 +22,8 @@ from ambiguous_wild.cli.options import (
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.core.terminal import line_width, say
 from ambiguous_wild.harness.benchmark import Engine, bench
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.suite import PreparedSuite

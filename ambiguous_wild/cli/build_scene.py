@@ -20,7 +20,7 @@ from ambiguous_wild.cli.options import (
     threads_option,
 )
 from ambiguous_wild.core.processes import python_meanwhile
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import BuildResult

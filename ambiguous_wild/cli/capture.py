@@ -14,7 +14,7 @@ import click
 from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, threads_option
 from ambiguous_wild.core.errors import AwError, similar_path
 from ambiguous_wild.core.machine import usable_cores
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.checks import CaptureReport

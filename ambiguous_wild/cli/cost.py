@@ -18,7 +18,7 @@ from ambiguous_wild.cli.options import (
     only_option,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.terminal import line_width, say
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.cost_runs import CostRuns

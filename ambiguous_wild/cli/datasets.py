@@ -20,7 +20,7 @@ from ambiguous_wild.cli.options import (
 )
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.machine import usable_cores
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.datasets.write import ImportRecord

@@ -27,8 +27,8 @@ from ambiguous_wild.cli.options import json_option
 from ambiguous_wild.core.errors import AwError, install_command, installed
 from ambiguous_wild.core.machine import usable_cores, usable_memory
 from ambiguous_wild.core.processes import python_command
-from ambiguous_wild.core.terminal import say
 from ambiguous_wild.io.images import ximgproc
+from ambiguous_wild.io.terminal import say
 from ambiguous_wild.splat import readiness
 
 TIMEOUT_S = 60

@@ -8,7 +8,7 @@ import click
 
 from ambiguous_wild.cli.options import PathName, prepare_cpu
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 
 @click.command("explain")

@@ -13,7 +13,7 @@ import click
 
 from ambiguous_wild.cli.options import CommandGroup, PathName, json_option, reported_option, title_option
 from ambiguous_wild.core.errors import AwError, counted
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.board_edit import AddReport

@@ -19,7 +19,7 @@ import click
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, disk_line, logged_to, unknown
-from ambiguous_wild.core.terminal import line_width, say, wrapped
+from ambiguous_wild.io.terminal import line_width, say, wrapped
 
 # Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
 # `aw --help` imports no command.

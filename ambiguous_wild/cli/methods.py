@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import json_option, plugin_option
-from ambiguous_wild.core.terminal import line_width, say
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.entry import MethodEntry

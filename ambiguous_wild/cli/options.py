@@ -13,7 +13,17 @@ from typing import Any
 import click
 
 from ambiguous_wild.core.errors import AwError, similar_path
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
+
+# Heading -> options, of every command that has them.
+OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
+    "Most used": ("-o", "--method", "--scene", "--group", "--budget", "--iterations", "--seed", "--effects",
+                  "--mask", "--jobs", "--overwrite", "--name", "--test-list", "--keep-masks"),
+    "Structure from motion": ("--sfm", "--matcher", "--mapper", "--camera", "--max-features", "--part"),
+    "Training": ("--set", "--sweep", "--resolution", "--factor", "--max-gaussians", "--start", "--suite",
+                 "--protocol", "--plugin", "--metric-file"),
+    "Ray": ("--engine", "--address", "--cpus-per-cell", "--gpus-per-cell", "--transfer"),
+}  # fmt: skip
 
 
 class PathName(click.Path):
@@ -90,17 +100,6 @@ class SectionedCommand(click.Command):
             left = [option for option in left if option not in under]
             _write_section(ctx, formatter, heading, under)
         _write_section(ctx, formatter, "Other options", left)
-
-
-# Heading -> options, of every command that has them.
-OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
-    "Most used": ("-o", "--method", "--scene", "--group", "--budget", "--iterations", "--seed", "--effects",
-                  "--mask", "--jobs", "--overwrite", "--name", "--test-list", "--keep-masks"),
-    "Structure from motion": ("--sfm", "--matcher", "--mapper", "--camera", "--max-features", "--part"),
-    "Training": ("--set", "--sweep", "--resolution", "--factor", "--max-gaussians", "--start", "--suite",
-                 "--protocol", "--plugin", "--metric-file"),
-    "Ray": ("--engine", "--address", "--cpus-per-cell", "--gpus-per-cell", "--transfer"),
-}  # fmt: skip
 
 
 class CommandGroup(click.Group):

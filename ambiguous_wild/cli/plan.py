@@ -14,7 +14,7 @@ import click
 
 from ambiguous_wild.cli.options import PathName, json_option, prepare_cpu
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.terminal import line_width, say
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan

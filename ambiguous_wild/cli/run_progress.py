@@ -15,8 +15,8 @@ import click
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
-from ambiguous_wild.core.terminal import keep_clock_running, line_width, say, wrapped
 from ambiguous_wild.harness.callbacks import Lines, outcome_line, run_name
+from ambiguous_wild.io.terminal import keep_clock_running, line_width, say, wrapped
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.benchmark import BenchReport

@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, seed_option
 from ambiguous_wild.core.errors import AwError, counted
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.simulate.spec import CaptureSpec

@@ -17,7 +17,7 @@ from ambiguous_wild.cli.options import (
     style_of,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 SUFFIXES = {".txt": "text", ".md": "markdown", ".json": "json", "": "text"}  # of -o
 

@@ -16,7 +16,7 @@ from ambiguous_wild.cli.options import (
     seed_option,
     title_option,
 )
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 
 @click.group("study", cls=CommandGroup)

@@ -25,7 +25,7 @@ from ambiguous_wild.cli.options import (
     style_of,
 )
 from ambiguous_wild.core.errors import AwError, counted
-from ambiguous_wild.core.terminal import line_width, say
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.store import Runs

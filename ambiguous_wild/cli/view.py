@@ -25,8 +25,8 @@ from ambiguous_wild.cli.options import (
     threads_option,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.terminal import say
 from ambiguous_wild.io.splat_files import FORMATS
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.viewing.model_export import ExportedModel

@@ -9,7 +9,7 @@ import click
 
 from ambiguous_wild.cli.options import CommandGroup, json_option
 from ambiguous_wild.core.errors import AwError, counted
-from ambiguous_wild.core.terminal import say
+from ambiguous_wild.io.terminal import say
 
 
 @click.group("weights", cls=CommandGroup)

@@ -12,10 +12,10 @@ from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
-from ambiguous_wild.core.terminal import wrapped
 from ambiguous_wild.harness.result_file import encoded
 from ambiguous_wild.harness.timing import seconds_range
 from ambiguous_wild.io.files import is_record, refuse_files_there, write_json, write_text
+from ambiguous_wild.io.terminal import wrapped
 from ambiguous_wild.report import plain_formats
 from ambiguous_wild.report.cost_changes import Change, changes
 from ambiguous_wild.report.cost_curves import (

@@ -17,9 +17,9 @@ from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.names import csv_text, plain
-from ambiguous_wild.core.terminal import display_width, wrapped
 from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import MEASURES, Measure
+from ambiguous_wild.io.terminal import display_width, wrapped
 from ambiguous_wild.report.table_layout import ARROWS, TIE, Column, Row, Table, TableCell
 
 RANKS = "(1) (2) (3): first, second and third in the column"

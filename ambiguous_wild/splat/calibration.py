@@ -19,7 +19,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.processes import python_meanwhile
-from ambiguous_wild.core.terminal import clock
+from ambiguous_wild.io.terminal import clock
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import how_often, one_thread
 from ambiguous_wild.splat.gaussians import Gaussians

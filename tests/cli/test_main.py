@@ -16,8 +16,8 @@ import pytest
 from ambiguous_wild import __version__
 from ambiguous_wild.cli.main import COMMANDS
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.terminal import say
 from ambiguous_wild.core.weight_files import read_tensors
+from ambiguous_wild.io.terminal import say
 from tests.command_line import aw
 from tests.harness.fake_runs import fake_result, save
 

@@ -6,7 +6,6 @@ import csv
 import io
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -172,92 +171,6 @@ def test_runs_of_versions_of_a_methods_file_have_no_mean(tmp_path: Path, scenes:
     assert "version of the method's file, so they have no mean" in named and named in to_text(table)
     states = {row.name: row.cells[0].state for row in table[0].rows}
     assert states == {"a": "ok", "b": "missing"}
-
-
-MIXED = {"test_photos": "test photos may hold distractors: every 8th photo tests"}
-
-
-def ghosts(consistent: bool = True, **changes: Any) -> list[dict[str, Any]]:
-    """Runs on a scene whose test photos hold distractors: the one that draws them has more PSNR."""
-    runs = []
-    for method, psnr, true in (("3dgs", 22.0, 19.0), ("a", 21.0, 23.0), ("b", 20.0, 21.0)):
-        rows = [{"name": f"{k}.png", "psnr": psnr + k, "ssim": psnr / 30} for k in range(3)]
-        for row in rows if consistent else []:
-            row["psnr_consistent"] = true
-        runs.append(fake_result(method, per_image=rows, facts=MIXED, missing={}, **changes))
-    return runs
-
-
-def test_the_model_with_the_ghosts_is_not_first_where_test_photos_may_hold_distractors(
-    tmp_path: Path,
-) -> None:
-    table = papers.in_blocks(read_runs(save(tmp_path, *ghosts())))
-    for method in ("3dgs", "a", "b"):
-        assert cell(table, method, "psnr").rank is None and cell(table, method, "ssim").rank is None
-        assert not cell(table, method, "psnr").tie
-    assert [cell(table, m, "psnr_consistent").rank for m in ("3dgs", "a", "b")] == [3, 1, 2]
-    assert cell(table, "a", "fps").rank is None  # equal
-    (note,) = [note for note in table[-1].notes if "distractors" in note]
-    assert note == (
-        "test photos may hold distractors: every 8th photo tests (yard): † is not ranked, as a model that "
-        "draws distractors gains by it; ranked is PSNR consistent, over pixels that other photos show alike"
-    )
-    for name, render in (RENDERERS | {"html": html_of}).items():
-        text = render(table)
-        assert "test photos may hold distractors" in text, name
-        assert ("PSNR†" in text or r"PSNR\dag{}" in text) or name == "csv"
-        assert "PSNR consistent†" not in text and "MB†" not in text
-    shown = [line for line in to_latex(table).splitlines() if not line.startswith("%")]
-    assert any("test photos may hold distractors" in line for line in shown)
-    (paper,) = papers.paper(read_runs(tmp_path))
-    heads = [c.label for c in paper.columns]
-    assert heads[:3] == ["PSNR†↑", "PSNR consistent↑", "SSIM†↑"]
-    for text in (to_wide_csv(table), to_long_csv([paper])):
-        assert all("† is not ranked" in row["note"] for row in csv.DictReader(io.StringIO(text)))
-    assert "psnr_consistent" in keys(fitted(table, 40))
-
-
-def test_without_such_a_metric_nothing_is_ranked_by_photos_with_distractors(tmp_path: Path) -> None:
-    clean = [fake_result(m, "clean", psnr=(p,)) for m, p in (("3dgs", 20.0), ("a", 21.0), ("b", 22.0))]
-    table = table_of(tmp_path, *ghosts(consistent=False, scene="mixed"), *clean)
-    ranks = [[cell(table, m, "psnr", which).rank for m in ("3dgs", "a", "b")] for which in range(3)]
-    assert ranks == [[None] * 3, [3, 2, 1], [None] * 3]  # the mean, clean, mixed
-    labels = [t.columns[0].label for t in table]
-    assert labels == ["PSNR†↑", "PSNR↑", "PSNR†↑"]
-    (note,) = [note for note in table[-1].notes if "distractors" in note]
-    assert note.endswith("gains by it") and "(mixed)" in note
-
-
-def test_why_there_is_no_mask_iou_stands_below(tmp_path: Path) -> None:
-    short = {"no_masks": "masks had not begun at 200 iterations"}
-    scored = fake_result("mine", masks={"iou": 0.5, "precision": 0.6, "recall": 0.7, "images": 2})
-    none = fake_result("3dgs", facts={"no_masks": "the method makes no masks"})
-    late = [fake_result(m, facts=short) for m in ("refinesplat", "robustsplat")]
-    notes = table_of(tmp_path / "some", scored, none, *late)[-1].notes
-    assert "no mask IoU: 3dgs on yard: the method makes no masks" in notes
-    assert (
-        "no mask IoU: refinesplat on yard, robustsplat on yard: masks had not begun at 200 iterations"
-        in notes
-    )
-    notes = table_of(tmp_path / "absent", none, *late)[-1].notes  # no run has masks: there is no column
-    assert [note for note in notes if note.startswith("no mask IoU")] == [
-        "no mask IoU: refinesplat on yard, robustsplat on yard: masks had not begun at 200 iterations"
-    ]
-
-
-def test_times_that_were_not_alone_share_a_line_and_give_way_in_a_narrow_table(tmp_path: Path) -> None:
-    busy = {
-        method: fake_result(method, psnr=(psnr,), masks={"iou": 0.5, "recall": 0.5, "images": 1})
-        for method, psnr in (("a", 20.0), ("b", 21.0))
-    }
-    for used, run in zip(("1.4", "1.5"), busy.values()):
-        why = f"other programs used {used} of 2 processors"
-        run["cost"]["timing"] = {"verdict": "contended", "reason": why, "kernel": "cpu-1"}
-    table = table_of(tmp_path, *busy.values())
-    lines = [note for note in table[-1].notes if note.startswith("times not ranked")]
-    assert lines == ["times not ranked: all (contended: other programs used 1.5 of 2 processors)"]
-    narrow = keys(fitted(table, 52))
-    assert {"psnr", "ssim", "mask_iou"} <= {*narrow} and "train_s" not in narrow
 
 
 def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import time
 import pytest
 from tqdm import tqdm
 
-from ambiguous_wild.core.terminal import clock, display_width, keep_clock_running, line_width, say, wrapped
+from ambiguous_wild.io.terminal import clock, display_width, keep_clock_running, line_width, say, wrapped
 from tests.command_line import Terminal
 
 LINE = "3 of 30 photos share too few features with two others at once: IMG_0012.jpg, IMG_0017.jpg and 1 more"

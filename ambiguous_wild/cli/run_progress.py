@@ -67,7 +67,7 @@ class ProgressBar(Lines):
         from tqdm import tqdm
 
         if self.bar is not None:
-            settings["desc"] = self.bar.desc.removesuffix(": ")
+            settings["desc"] = self.bar.desc
             self.bar.close()
         self.bar = tqdm(
             mininterval=1.0, disable=not sys.stderr.isatty(), leave=False, file=sys.stderr, **settings
@@ -91,20 +91,18 @@ class ProgressBar(Lines):
     def tick(self, trainer: Trainer) -> None:
         budget = trainer.config.budget_s
         done = 100.0 * trainer.progress(trainer.iteration) if budget else trainer.iteration
-        if self.bar.total is None:  # until here the method was set up, which has a clock of its own
+        setting_up = self.bar.total is None  # until here, with a clock of its own
+        if setting_up or budget or trainer.iteration % 25 == 0 or trainer.done:
+            state = f"{trainer.ms_per_iteration:.0f} ms/it, {len(trainer.gaussians):,} Gaussians"
+            if budget:  # its end is known, and need not be guessed from the steps so far
+                left = self.bar.format_interval(max(budget - trainer.clock.now(), 0.0))
+                state = f"{left} left, {state}"
+            self.bar.set_postfix_str(state, refresh=False)
+        if setting_up:
             form = "{desc}{percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f}"
-            if budget:
-                self._open(total=100.0, bar_format=form + "% [{elapsed}{postfix}]")
-            else:
-                form += "it [{elapsed}<{remaining}{postfix}]"
-                self._open(total=trainer.config.iterations, initial=done - 1, bar_format=form)
-        if trainer.iteration % 25 == 0 or trainer.done or budget:
-            speed = f"{trainer.ms_per_iteration:.0f} ms/it, {len(trainer.gaussians):,} Gaussians"
-            # the end of a budget is known, and need not be guessed from the steps so far
-            left = (
-                f"{self.bar.format_interval(max(budget - trainer.clock.now(), 0.0))} left, " if budget else ""
-            )
-            self.bar.set_postfix_str(left + speed, refresh=False)
+            form += "% [{elapsed}{postfix}]" if budget else "it [{elapsed}<{remaining}{postfix}]"
+            total = 100.0 if budget else trainer.config.iterations
+            self._open(total=total, initial=0.0 if budget else done - 1, bar_format=form, postfix=state)
         self.bar.update(done - self.bar.n)
 
     def ended(self, cell: Cell, report: CellReport) -> None:

@@ -41,6 +41,7 @@ from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.scene_folder import MAP
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
+MUCH_MISSING = 1 / 3  # of the readable photos; then the scene lacks a part of the place
 ENOUGH_PHOTOS = 20  # with fewer, most of a place is seen in one or two of them
 MIN_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
 SFM_STAGES = ("features", "matches", "mapping")
@@ -172,6 +173,11 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
     named = f", {len(info['lost'])} left out" if info["lost"] else ""
     few = counts["registered"] < ENOUGH_PHOTOS
     ready = f"few photos, about {ENOUGH_PHOTOS} are needed for a good model" if few else "ready"
+    out = counts["readable"] - counts["registered"]
+    if out >= MUCH_MISSING * counts["readable"]:
+        ready = (
+            f"not whole: what the {out} photos left out show is missing ('aw screen' says where to take more)"
+        )
     return (
         f"registered {counts['registered']} of {counts['photos']}{named}, {points} points, "
         f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: {ready}; "

@@ -13,16 +13,17 @@ import click
 
 from ambiguous_wild.cli.options import (
     PathName,
+    SectionedCommand,
     engine_options,
     json_option,
     metric_file_option,
-    say,
     training_options,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.benchmark import Engine, bench
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.suite import PreparedSuite
@@ -53,7 +54,7 @@ def parse_budget(text: str) -> float:
     return seconds
 
 
-@click.command(name="bench")
+@click.command(name="bench", cls=SectionedCommand)
 @click.option(
     "--method",
     "methods",
@@ -173,12 +174,12 @@ def command(
 
     \b
     Settings that few need, as --set NAME.KEY=VALUE:
-      train.probes=8               how often the test PSNR is measured while training
+      train.probes=8               measurements of the test PSNR while training
       train.checkpoint_every_s=60  seconds between checkpoints
-      train.on_nonfinite=stop      a NaN ends the run; rollback: go back and leave that photo out
-      engine.retries=3             how often a run is repeated whose process or node was lost
+      train.on_nonfinite=stop      at a NaN; rollback: leave that photo out
+      engine.retries=3             of a run whose process or node was lost
       engine.memory_per_cell=GB    with Ray: memory per run
-      engine.transfer_limit=4000   with Ray: MB of the largest scene or run that is sent
+      engine.transfer_limit=4000   with Ray: MB of the largest scene or run
     """
     if iterations is not None and budgets:
         raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
@@ -278,6 +279,8 @@ def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
     from ambiguous_wild.report.suite import suite_tables
 
     try:
-        click.echo(to_text(suite_tables(prepared, folder), color=sys.stdout.isatty()), nl=False)
+        click.echo(
+            to_text(suite_tables(prepared, folder), color=sys.stdout.isatty(), width=line_width()), nl=False
+        )
     except AwError as error:  # every run failed, which `finish` reports
         say(str(error))

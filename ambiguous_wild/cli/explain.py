@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, prepare_cpu, say
+from ambiguous_wild.cli.options import PathName, prepare_cpu
 from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.io.terminal import say
 
 
 class _Pixel(click.Command):

@@ -12,13 +12,14 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import click
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, disk_line, logged_to, unknown
-from ambiguous_wild.core.names import plain
+from ambiguous_wild.io.terminal import line_width, say, wrapped
 
 # Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
 # `aw --help` imports no command.
@@ -148,7 +149,9 @@ def _printed() -> logging.Handler:
 
     handler = logging.Handler()
     handler.set_name(VERBOSE)
-    handler.emit = lambda record: tqdm.write(f"  {record.getMessage()}", file=sys.stderr)  # type: ignore[method-assign]
+    handler.emit = lambda record: tqdm.write(
+        wrapped(f"  {record.getMessage()}", line_width(err=True)), file=sys.stderr
+    )  # type: ignore[method-assign]
     return handler
 
 
@@ -174,7 +177,7 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click wraps the exception that says what was kept.
         text = str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
-        click.secho(text, fg="yellow", err=True)
+        say(text, fg="yellow")
         sys.exit(130)
     except BrokenPipeError:
         # The reader closed our output (`aw table | head`); this is not an error.
@@ -202,9 +205,9 @@ def _one_line_each() -> Callable[..., None]:
     printed: set[str] = set()
 
     def show(message: Warning | str, *_: object) -> None:
-        line = "warning: " + plain(" ".join(str(message).split()))
+        line = "warning: " + " ".join(str(message).split())
         if line not in printed:
-            click.echo(line, err=True)
+            say(line)
         printed.add(line)
 
     return show
@@ -229,7 +232,11 @@ def _click_message(error: click.ClickException) -> str:
     if isinstance(error, click.UsageError) and error.ctx is not None:
         stray = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", message)
         flags = {flag for param in error.ctx.command.params for flag in param.opts}
-        if stray and {"--method", "--scene"} <= flags:
+        words = pairwise(sys.argv) if stray else ()
+        comma = next((a for a, b in words if a.endswith(",") and b == stray[1].split()[0]), "")
+        if stray and comma:
+            message += f": write {comma}{stray[1].replace(' ', '')} without a space"
+        elif stray and {"--method", "--scene"} <= flags:
             folder = Path(stray[1]).is_dir() or "/" in stray[1]
             message += f": did you mean {'--scene' if folder else '--method'} {stray[1]}?"
         message += f" (see '{error.ctx.command_path} --help')"
@@ -238,7 +245,7 @@ def _click_message(error: click.ClickException) -> str:
 
 def _fail(message: str) -> None:
     # names may hold control characters, those of files need not be UTF-8
-    click.secho("error: " + plain(" ".join(message.split())), fg="red", err=True)
+    say("error: " + " ".join(message.split()), fg="red")
     sys.exit(AwError.exit_code)
 
 

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import plain
+from ambiguous_wild.core.errors import AwError, similar_path
+from ambiguous_wild.io.terminal import say
+
+# Heading -> options, of every command that has them.
+OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
+    "Most used": ("-o", "--method", "--scene", "--group", "--budget", "--iterations", "--seed", "--effects",
+                  "--mask", "--jobs", "--overwrite", "--name", "--test-list", "--keep-masks"),
+    "Structure from motion": ("--sfm", "--matcher", "--mapper", "--camera", "--max-features", "--part"),
+    "Training": ("--set", "--sweep", "--resolution", "--factor", "--max-gaussians", "--start", "--suite",
+                 "--protocol", "--plugin", "--metric-file"),
+    "Ray": ("--engine", "--address", "--cpus-per-cell", "--gpus-per-cell", "--transfer"),
+}  # fmt: skip
 
 
 class PathName(click.Path):
@@ -24,7 +35,12 @@ class PathName(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
             self.fail("the name is empty; write . for the current folder", param, ctx)
-        return super().convert(value, param, ctx)
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter as error:
+            if "does not exist" in error.message:
+                error.message = error.message.rstrip(".") + (similar_path(value) or ".")
+            raise
 
 
 class PathOrAlone(PathName):
@@ -45,6 +61,63 @@ class FiniteFloat(click.FloatRange):
 
     def _describe_range(self) -> str:
         return "" if self.min is None and self.max is None else super()._describe_range()
+
+
+class Count(click.IntRange):
+    """A whole number, also as 10k."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        thousands = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)k", value) if isinstance(value, str) else None
+        return super().convert(round(float(thousands[1]) * 1000) if thousands else value, param, ctx)
+
+
+class Format(click.Choice[str]):
+    """A format by its name, or by another name that people use for it."""
+
+    def __init__(
+        self, names: Sequence[str], also: Mapping[str, str] = {}, unsupported: Mapping[str, str] = {}
+    ) -> None:
+        super().__init__(names)
+        self.also, self.unsupported = also, unsupported
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value in self.unsupported:
+            self.fail(f"{value!r} is not supported: {self.unsupported[value]}", param, ctx)
+        return super().convert(self.also.get(value, value), param, ctx)
+
+
+class SectionedCommand(click.Command):
+    """A command of many options: its help shows them under headings, the most used ones first."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        left = [param for param in self.params if isinstance(param, click.Option)]
+        left.append(self.get_help_option(ctx))
+        for heading, flags in OPTION_SECTIONS.items():
+            under = sorted(
+                (option for option in left if option is not None and option.opts[0] in flags),
+                key=lambda option: flags.index(option.opts[0]),
+            )
+            left = [option for option in left if option not in under]
+            _write_section(ctx, formatter, heading, under)
+        _write_section(ctx, formatter, "Other options", left)
+
+
+class CommandGroup(click.Group):
+    """A group whose help shows the first sentence of each command whole."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            rows = [(name, self.commands[name].get_short_help_str(limit=1000)) for name in self.commands]
+            formatter.write_dl(rows)
+
+
+def _write_section(
+    ctx: click.Context, formatter: click.HelpFormatter, heading: str, options: Sequence[click.Option | None]
+) -> None:
+    rows = [row for option in options if option is not None and (row := option.get_help_record(ctx))]
+    if rows:
+        with formatter.section(heading):
+            formatter.write_dl(rows)
 
 
 def _load_plugins(_: click.Context, __: click.Parameter, paths: tuple[Path, ...]) -> None:
@@ -130,7 +203,7 @@ training_options = _all(
         show_default=True,
         help="Random seed; repeatable.",
     ),
-    click.option("--iterations", type=click.IntRange(1), help="Training iterations.  [default: 30000]"),
+    click.option("--iterations", type=Count(1), help="Training iterations, also as 10k.  [default: 30000]"),
     device_option("auto: the GPU if torch and gsplat can use one, else the CPU."),
     threads_option,
     click.option(
@@ -198,11 +271,6 @@ def prepare_cpu(threads: int | None) -> None:
     from ambiguous_wild.splat import calibration
 
     calibration.prepare_cpu(threads, say)
-
-
-def say(text: str) -> None:
-    """Write a line on stderr, so that stdout stays clean for results; names of runs cannot break it."""
-    click.echo(plain(text), err=True)
 
 
 def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = "") -> str:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ambiguous_wild.cli.options import (
+    Format,
     PathName,
     command_line,
     json_option,
@@ -24,6 +25,7 @@ from ambiguous_wild.cli.options import (
     style_of,
 )
 from ambiguous_wild.core.errors import AwError, counted
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.store import Runs
@@ -42,7 +44,10 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.command(name="table")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "--format", "style", type=click.Choice(STYLES), help="[default: by the suffix of -o, else text]"
+    "--format",
+    "style",
+    type=Format(STYLES, {"tex": "latex", "md": "markdown", "txt": "text"}),
+    help="[default: by the suffix of -o, else text]",
 )
 @click.option(
     "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,
@@ -123,14 +128,15 @@ def table_command(
         from ambiguous_wild.harness.sheets import write_sheet
 
         shown = write_sheet(loaded, sheet, scene=scenes[0] if scenes else None)
-        click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
+        say(f"wrote {sheet}: {shown} methods side by side")
     named_style = None if style == "text" else style
     made_by = "command: " + command_line(style=named_style, output=None, sheet=None, metrics=metrics)
     tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported)
     blocks = layout == "blocks" and style != "html"
     width = _width(everything or (blocks and bool(metrics)), output) if style == "text" else None
     color = style == "text" and output is None and sys.stdout.isatty()
-    _put(*_formatted(tables, style, blocks, made_by, color, width), output)
+    notes_width = None if output is not None else line_width()
+    _put(*_formatted(tables, style, blocks, made_by, color, width, notes_width), output)
 
 
 def _put(text: str, summary: str, output: Path | None) -> None:
@@ -141,7 +147,7 @@ def _put(text: str, summary: str, output: Path | None) -> None:
     from ambiguous_wild.io.files import write_text
 
     write_text(output, text)
-    click.echo(f"wrote {output}: {summary}", err=True)
+    say(f"wrote {output}: {summary}")
 
 
 def _read(runs: Sequence[Path]) -> Runs:
@@ -165,16 +171,22 @@ def _write_tidy(loaded: Runs, output: Path | None, metrics: Sequence[str], scene
 
     for note in comparison(loaded, metrics=metrics, scenes=scenes)[-1].notes:
         if note.startswith(UNEQUAL):
-            click.echo(note, err=True)
+            say(note)
     frame = tidy(loaded, metrics=metrics, scenes=scenes)
     text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
     for run in loaded.incomplete:
-        click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
+        say(f"incomplete: {run.folder}: {run.reason}")
     _put(text, f"{len(frame)} rows", output)
 
 
 def _formatted(
-    tables: list[Table], style: str, blocks: bool, made_by: str, color: bool, width: int | None
+    tables: list[Table],
+    style: str,
+    blocks: bool,
+    made_by: str,
+    color: bool,
+    width: int | None,
+    notes_width: int | None,
 ) -> tuple[str, str]:
     """Return the tables as text, and what they hold in words; `blocks`: all have the same columns."""
     from ambiguous_wild.report.papers import cost_at_the_end
@@ -191,26 +203,24 @@ def _formatted(
         return to_wide_csv(tables) if blocks else to_long_csv(tables), summary
     if blocks:
         tables = [cost_at_the_end(tables)] if style == "latex" else tables
-        return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color), summary
+        return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color, notes_width), summary
     tables = [one.with_notes(made_by) for one in tables]
     if width is not None:
         tables = [part for one in tables for part in divided(one, width)]
-    return _written(tables, style, color), summary
+    return _written(tables, style, color, notes_width), summary
 
 
 def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
-    from ambiguous_wild.core.names import plain
-
     for note in dict.fromkeys([note for table in tables for note in table.notes] + [made_by]):
-        click.echo(plain(note), err=True)
+        say(note)
 
 
-def _written(tables: Sequence[Table], style: str, color: bool) -> str:
+def _written(tables: Sequence[Table], style: str, color: bool, width: int | None) -> str:
     from ambiguous_wild.report.plain_formats import to_markdown, to_text
     from ambiguous_wild.report.typeset import to_html, to_latex
 
     if style == "text":
-        return to_text(tables, color=color)
+        return to_text(tables, color=color, width=width)
     return {"markdown": to_markdown, "latex": to_latex, "html": to_html}[style](tables)
 
 
@@ -285,9 +295,9 @@ def rescore_command(
         for r in reports:
             what = r.error or (f"added {', '.join(r.added)}" if r.added else "nothing to add")
             still = f"; still missing: {', '.join(r.missing)}" if r.missing and not r.error else ""
-            click.echo(f"{r.run}: {what}{still}")
+            say(f"{r.run}: {what}{still}", out=True)
     counts = Counter(r.outcome for r in reports)
-    click.echo(", ".join(f"{n} {outcome}" for outcome, n in counts.items()), err=True)
+    say(", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
     refused = [r for r in reports if r.outcome == "refused"]
     if refused:
         raise AwError(f"{len(refused)} of {len(reports)} runs refused: {refused[0].error}")
@@ -323,6 +333,6 @@ def audit_command(tables: tuple[Path, ...], output: Path | None, strict: bool, a
     else:
         click.echo(text, nl=style == "text" and bool(findings))
     count = len({n.table for n in numbers})
-    click.echo(f"{len(findings)} findings in {len(numbers)} numbers of {count} tables", err=True)
+    say(f"{len(findings)} findings in {len(numbers)} numbers of {count} tables")
     if strict and findings:
         sys.exit(1)

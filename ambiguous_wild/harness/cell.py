@@ -27,6 +27,7 @@ from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_pro
 from ambiguous_wild.harness.command_lines import bench_command, length_options, length_text, option_text
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
+    NOT_BEGUN,
     SCHEMA,
     Continued,
     Cost,
@@ -237,6 +238,8 @@ class Cell:
             all_facts["corrections"] = f"by hand ({self.corrections.sha256[:8]})"
         if mixed := mixed_tests(self.scene):
             all_facts["test_photos"] = mixed
+        if masks is None and error is None and (why := self._why_no_masks(cost or {})):
+            all_facts["no_masks"] = why
         if self.start is not None:
             all_facts["start"] = f"{self.start.path.name} ({self.start.sha256[:8]})"
         return {
@@ -257,6 +260,18 @@ class Cell:
             "scene_hash": self.scene_id,
             "version": __version__,
         }
+
+    def _why_no_masks(self, cost: Cost) -> str:
+        """Return why no masks could be compared with the exact ones; empty if the scene has none."""
+        if not any((self.scene.root / "truth" / "distractor").glob("*")):
+            return ""
+        if self.method.program is not None:
+            return "the program wrote no masks"
+        from ambiguous_wild.methods.given_masks import makes_masks
+
+        if not makes_masks(self.method.build(self.options)):
+            return "the method makes no masks"
+        return f"{NOT_BEGUN} at {cost.get('iterations', self.train.iterations)} iterations"
 
 
 @dataclass(frozen=True)

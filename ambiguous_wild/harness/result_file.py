@@ -31,6 +31,7 @@ Count = Annotated[int, Meta(ge=0, le=10**15)]  # more is no number of anything
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
 Options = dict[str, Any]  # plain values of a method's options: every method has its own keys
+NOT_BEGUN = "masks had not begun"  # begins the reason why a short run has none
 RunFacts = dict[str, Any]  # of a run; beside the keys of `Cell.result`, methods and effects add their own
 # Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
 # values that are not finite (the result says so where there were any), where the scene lies.

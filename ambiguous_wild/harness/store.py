@@ -15,7 +15,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.core.errors import counted, unknown
+from ambiguous_wild.core.errors import counted, similar_path, unknown
 from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.measures import MASK_LABELS, MEASURES, Metric, measure, users_metrics
 from ambiguous_wild.harness.result_file import (
@@ -41,7 +41,7 @@ from ambiguous_wild.io.ply import splat_count
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",
     "options_hash", "training", "unrecorded", "timing", "timing_reason", "timing_kernel", "hardware",
-    "effects", "length", "features", "test_photos", "start", "metric_functions",
+    "effects", "length", "features", "test_photos", "no_masks", "start", "metric_functions",
 )  # fmt: skip
 IN_FOLDER = " in "  # between a method and its folder, where several folders hold runs of it
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
@@ -71,8 +71,8 @@ class Runs:
         version, code_hash, source (hash of the method's own file, or empty), options_hash, fit (what was done
         with test photos, see report/notes.py), effects, length, features and other settings of the training
         (words; features are empty if the method has none), test_photos (a warning about them, or empty),
-        device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason, timing_kernel,
-        hardware, and mask_iou, mask_precision, mask_recall.
+        no_masks (why, or empty), device, the numbers of "cost", timing ("alone", "contended", "unknown"),
+        timing_reason, timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
     """
 
@@ -265,7 +265,9 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     runs: dict[Path, Path] = {}
     for root in folders:
         if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+            raise AwError(
+                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote{similar_path(root)}"
+            )
         runs |= {run.resolve(): run for run in run_folders(root)}
     return list(runs.values())
 
@@ -358,6 +360,7 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "effects": effects_of(result["facts"]),
             "length": str(result["facts"].get("length") or _length(config)),
             "test_photos": str(result["facts"].get("test_photos", "")),
+            "no_masks": str(result["facts"].get("no_masks", "")),
             "features": _features(result["options"]),
             "start": str(result["facts"].get("start", "the scene's points")),
         }

@@ -14,7 +14,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
-from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.core.errors import shortlist, similar_path, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.result_file import (
@@ -136,7 +136,7 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
         if not root.is_dir():
             raise AwError(
                 f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, a run in it, or a "
-                "splat file"
+                f"splat file{similar_path(root)}"
             )
         for run in dict.fromkeys(run_folders(root)):
             if any(t.run.samefile(run) for t in trained):
@@ -150,7 +150,8 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
                 notes.append(trained[-1].note)
     if not trained:
         why = f" ({notes[0]})" if notes else ""
-        if scene := next((path for path in paths if (path / "scene.json").exists()), None):
+        scenes = (path for path in paths for part in ("scene.json", "sparse") if (path / part).exists())
+        if scene := next(scenes, None):
             why = f": {scene} is a scene, which 'aw bench --method NAME --scene {scene} -o runs' trains"
         raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
     return _with_labels(trained), notes

@@ -36,10 +36,10 @@ from ambiguous_wild.harness.start import started
 from ambiguous_wild.io.files import atomic_dir, own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.io.ply import write_splat_ply
-from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
+from ambiguous_wild.methods.given_masks import FixedMasks, makes_masks
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import Stopped, Tick, train
@@ -236,9 +236,7 @@ def check_passes(cell: Cell) -> None:
 
 def refuse_without_masks(name: str, hooks: MethodHooks) -> None:
     """Raise AwError if the method's mask policy keeps every pixel."""
-    policy = hooks.mask.mask if isinstance(hooks.mask, GraftedPolicy) else hooks.mask
-    kind = type(policy)
-    if kind.keep is MaskPolicy.keep and kind.predict is MaskPolicy.predict:
+    if not makes_masks(hooks):
         raise AwError(
             f"+2passes trains again with the final masks, and {name} has none: "
             "choose another method, or give it masks with --mask METHOD"

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeGuard, cast
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
-from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.errors import shortlist, similar_path
 from ambiguous_wild.core.names import check_name, plain, quoted
 from ambiguous_wild.core.scene import SceneInfo, Split, centred
 from ambiguous_wild.io.colmap_model import read_model
@@ -64,7 +64,8 @@ def load_scene(
     if root.is_file():
         raise AwError(f"{root} is a file, not a scene folder; give the folder: {root.parent}")
     if not root.is_dir():
-        raise AwError(f"there is no scene folder {root}; 'aw build-scene PHOTOS -o {root}' makes one")
+        hint = similar_path(root) or f"; 'aw build-scene PHOTOS -o {root}' makes one"
+        raise AwError(f"there is no scene folder {root}{hint}")
     read = read_scene_json(root)
     if read is not None and verify:
         verify_files(root, read, quick=verify == "quick")

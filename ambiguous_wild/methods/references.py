@@ -67,6 +67,8 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
         del _helpers[helper]
         sys.modules.pop(helper, None)
     before = set(sys.modules)
+    # first, as Python does for a script; afterwards last, for imports in functions, where it hides nothing
+    sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(module)
     except AwError as error:
@@ -79,6 +81,9 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
             why += "; Parts is MethodHooks of ambiguous_wild.splat.method_hooks now"
         raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
     finally:
+        sys.path.remove(str(folder))
+        if str(folder) not in sys.path:
+            sys.path.append(str(folder))
         files = {new: _file_of(new) for new in sys.modules.keys() - before}
         own = {new: file for new, file in files.items() if file and file.is_relative_to(folder)}
         _helpers.update(own)

@@ -199,7 +199,7 @@ def _panel(axes: Any, group: GroupFacts, points: list[tuple[str, float, float, f
         colour = "k" if is_default else f"C{index % 10}"
         axes.errorbar(ms, psnr, yerr=spread or None, fmt="*" if is_default else "o", color=colour,
                       ms=13 if is_default else 7, elinewidth=1, capsize=2)  # fmt: skip
-        ends.append((name, ms, psnr, colour))
+        ends.append((name, ms, 0.0, psnr, colour))
     axes.margins(0.12)
     label_points(axes, ends)
     axes.set_title(f"{group['name']}: {group['title']}", fontsize=8)

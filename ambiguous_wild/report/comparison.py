@@ -27,6 +27,7 @@ from ambiguous_wild.report.notes import (
     incomparable,
     metric_versions,
     mixed_runs,
+    mixed_scenes,
     notes,
     scenes_apart,
     untimed,
@@ -85,6 +86,8 @@ def comparison(
     unranked = incomparable(runs.runs, columns) | versions.keys()
     apart, quality = scenes_apart(runs), frozenset(c.key for c in columns if c.quality)
     apart |= {""} if apart else set()  # the mean over scenes
+    mixed, whole = mixed_scenes(runs.runs), frozenset(c.key for c in columns if c.whole_photo)
+    mixed |= {""} if mixed else set()
     rows = {scene: [_scene_row(index, m, scene, columns) for m in methods] for scene in chosen}
     if len(chosen) > 1:
         mean = [_mean_row(index, k, m, chosen, columns, rows, defined) for k, m in enumerate(methods)]
@@ -93,11 +96,12 @@ def comparison(
     tables = [
         Table(
             scene or title,
-            tuple(Column("", measure, scene) for measure in columns),
-            tuple(_ranked(of, columns, unranked | (quality if scene in apart else frozenset()))),
+            tuple(Column("", measure, scene, doubtful=measure.key in doubtful) for measure in columns),
+            tuple(_ranked(of, columns, unranked | doubtful | (quality if scene in apart else frozenset()))),
             continued=True,
         )
         for scene, of in rows.items()
+        for doubtful in [whole if scene in mixed else frozenset()]
     ]
     tables = [_with_effects(table, runs.runs) for table in tables]
     tables[-1] = replace(tables[-1], continued=False).with_notes(

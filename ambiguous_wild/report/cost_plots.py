@@ -116,16 +116,22 @@ def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> Non
         )  # fmt: skip
 
 
-def label_points(axes: Any, points: Sequence[tuple[str, float, float, Any]]) -> None:
-    """Write names beside points, on the side of the panel's middle; each point is (name, x, y, colour)."""
+def label_points(axes: Any, points: Sequence[tuple[str, float, float, float, Any]]) -> None:
+    """Write names beside points and their error bars, on the side of the panel's middle.
+
+    Args:
+        axes: the panel.
+        points: (name, x, half the length of its horizontal bar, y, colour) of each.
+    """
     low, high = axes.get_ylim()
     to_axes = axes.transData + axes.transAxes.inverted()
-    heights = spread_out([y for _, _, y, _ in points], 0.062 * (high - low))
-    for (name, x, y, colour), height in zip(points, heights):
+    heights = spread_out([y for _, _, _, y, _ in points], 0.062 * (high - low))
+    for (name, x, bar, y, colour), height in zip(points, heights):
         on_right = to_axes.transform((x, y))[0] > 0.5
         axes.annotate(
-            plain(name), (x, height), xytext=(-8 if on_right else 8, 0), textcoords="offset points",
-            color=colour, fontsize=8, va="center", ha="right" if on_right else "left", parse_math=False,
+            plain(name), (x - bar if on_right else x + bar, height), xytext=(-8 if on_right else 8, 0),
+            textcoords="offset points", color=colour, fontsize=8, va="center",
+            ha="right" if on_right else "left", parse_math=False,
         )  # fmt: skip
 
 
@@ -284,7 +290,11 @@ def draw_front(report: CostReport) -> Any | None:
             panel.plot([x for _, x in line], [p.psnr.mean for p, _ in line], **styles[name], linewidth=1.0,
                        alpha=0.6)  # fmt: skip
         # of a curve of several lengths, the longest has the name
-        ends = [(c, line[-1][1], line[-1][0].psnr.mean, styles[c]["color"]) for c, line in lines.items()]
+        ends = []
+        for c, line in lines.items():
+            point, x = line[-1]
+            spread = _x(point, key, unit).spread
+            ends.append((c, x, spread if finite(spread) else 0.0, point.psnr.mean, styles[c]["color"]))
         if key == "minutes":
             label = f"{label}{' and set-up' if report.setup else ''} ({unit.name})"
         panel.margins(x=0.08, y=0.1)

@@ -26,6 +26,7 @@ from ambiguous_wild.io.files import check_output, refuse_files_there, write_text
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
+from ambiguous_wild.report.cost_curves import duration
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
 from ambiguous_wild.viewing.model import space_of
@@ -221,6 +222,7 @@ def video_runs(
     prepare_cpu(threads, say)
     labels = tuple(model.label for model in shown.models)
     say(f"drawing {frames} frames of {', '.join(labels)}")
+    begin = time.perf_counter()
     kept: list[Frame] = []
     chosen = {
         round(k * (frames - 1) / max(1, round(gif_seconds * GIF_FPS) - 1))
@@ -232,6 +234,9 @@ def video_runs(
             if gif is not None and number in chosen:
                 kept.append(narrowed(frame, gif_width))
             yield frame
+            if number == 1:  # written, and most of what only the first frames take is over
+                spent = time.perf_counter() - begin
+                say(f"about {duration(spent * frames / 2)}; a smaller --width or --fps is faster")
 
     written = write_mp4(output, watched(), fps)
     if gif is not None:

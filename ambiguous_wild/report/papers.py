@@ -166,7 +166,8 @@ def quality_columns(runs: Runs) -> tuple[str, ...]:
     measured = set(runs.images.dropna(subset=["value"])["metric"])
     present = measured | set(runs.images["metric"])
     lpips = next((k for k in LPIPS if k in measured), next((k for k in LPIPS if k in present), ""))
-    return ("psnr", "ssim", *([lpips] if lpips else []))
+    consistent = ["psnr_consistent"] if "psnr_consistent" in measured else []
+    return ("psnr", *consistent, "ssim", *([lpips] if lpips else []))
 
 
 def difference_interval(

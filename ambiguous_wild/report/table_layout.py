@@ -18,6 +18,7 @@ State = Literal["ok", "missing", "failed", "absent", "blank"]
 SHOWN = {"missing": "—", "failed": "failed", "absent": "no run", "blank": ""}  # blank: no value is expected
 ARROWS = {"higher": "↑", "lower": "↓", None: ""}
 TIE = "≈"
+DOUBTFUL = "†"
 
 
 @dataclass(frozen=True)
@@ -29,10 +30,16 @@ class Column:
     scene: str = ""  # empty: a mean over scenes
     dataset: str = ""  # dataset of the scene, or of all scenes of the mean
     words: bool = False  # text, aligned left, not numbers, aligned right, if the format can do so
+    doubtful: bool = False  # distractors in test photos count as truth: marked, and not ranked
 
     @property
     def label(self) -> str:
-        return f"{self.measure.label}{ARROWS[self.measure.better]}"
+        return f"{self.name}{ARROWS[self.measure.better]}"
+
+    @property
+    def name(self) -> str:
+        """The label without its arrow."""
+        return self.measure.label + (DOUBTFUL if self.doubtful else "")
 
 
 @dataclass(frozen=True)

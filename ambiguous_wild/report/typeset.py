@@ -10,7 +10,7 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.report.plain_formats import UNEQUAL
-from ambiguous_wild.report.table_layout import TIE, Row, Table, TableCell
+from ambiguous_wild.report.table_layout import DOUBTFUL, TIE, Row, Table, TableCell
 
 NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}"
 COLORS = (("awfirst", "1,0.75,0.75"), ("awsecond", "1,0.87,0.72"), ("awthird", "1,0.98,0.72"))
@@ -31,6 +31,7 @@ SPECIAL = {
     "↑": r"$\uparrow$",
     "↓": r"$\downarrow$",
     TIE: r"$\approx$",
+    DOUBTFUL: r"\dag{}",
     "–": "--",
     "—": "---",
 }

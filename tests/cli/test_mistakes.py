@@ -38,7 +38,8 @@ MISTAKES = [
     (f"{BENCH} refinsplat", "did you mean 'refinesplat'"),
     (f"{BENCH} 3dgs --iterations 5 --budget 1m", "exclude each other"),
     (f"{BENCH} 3dgs --iterations 0", "--iterations"),
-    (f"{BENCH} 3dgs --iterations 10k", "'10k' is not a whole number"),
+    (f"{BENCH} 3dgs --iterations 10kk", "'10kk' is not a whole number"),
+    (f"{BENCH} 3dgs, refinesplat", "write 3dgs,refinesplat without a space"),
     (f"{BENCH} 3DGS --seed 2 refinesplat", "did you mean --method refinesplat?"),
     (f"{BENCH} 3dgs ./other", "did you mean --scene ./other?"),
     (f"{BENCH} mine:trimmed", "write FILE.py:RECIPE, as mine.py:trimmed"),
@@ -62,6 +63,16 @@ MISTAKES = [
     (f"{BENCH} 3dgs --effects gone.json", "there is no plan gone.json"),
     (f"{BENCH} 3dgs --effects gone.json --effects auto", "gone.json is a plan, and auto"),
     ("bench --method 3dgs --scene nothing -o out", "there is no scene folder"),
+    ("bench --method 3dgs --scene scenee -o out", "no scene folder scenee; did you mean scene?"),
+    ("bench --method 3dgs --scene above -o out", "above is no scene; did you mean above/scene?"),
+    ("try rwa -o out", "'rwa' does not exist; did you mean raw?"),
+    ("table run", "no folder of runs run ... did you mean runs?"),
+    ("view run", "no folder of runs run ... did you mean runs?"),
+    ("view above/scene", "above/scene is a scene, which 'aw bench"),
+    ("capture rwa -o out", "did you mean raw?"),
+    ("import rwa -o out", "did you mean ... /raw?"),
+    ("build-scene rwa -o out", "capture rwa does not exist; did you mean raw?"),
+    ("export runs --format splat", "'splat' is not supported ... --format spz"),
     ("bench --method 3dgs --scene scene --iterations 5 -o file", "file"),
     ("bench --method 3dgs --scene scene --iterations 5 -o file/deeper", "file"),
     ("plan scene -o scene/plan.json", "would change the scene"),
@@ -181,6 +192,8 @@ def here(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "own.py").write_text(OWN)
     save(root / "runs", fake_result("3dgs"))
     (root / "scene").symlink_to(scene)
+    (root / "above").mkdir()
+    (root / "above" / "scene").symlink_to(scene)
     (root / "link").symlink_to(scene)
     (root / "to-raw").symlink_to("raw")
     for name in ("pipe", "pipe.png"):

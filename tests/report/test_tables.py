@@ -173,15 +173,6 @@ def test_runs_of_versions_of_a_methods_file_have_no_mean(tmp_path: Path, scenes:
     assert states == {"a": "ok", "b": "missing"}
 
 
-def test_test_photos_that_may_hold_distractors_are_named_in_every_format(tmp_path: Path) -> None:
-    mixed = {"test_photos": "test photos may hold distractors: every 8th photo tests"}
-    table = table_of(tmp_path, fake_result("a", facts=mixed), fake_result("b", facts=mixed))
-    for render in (to_text, to_markdown, html_of):
-        assert "test photos may hold distractors" in render(table)
-    shown = [line for line in to_latex(table).splitlines() if not line.startswith("%")]
-    assert any("test photos may hold distractors" in line for line in shown)
-
-
 def test_equal_in_print_shares_the_rank(tmp_path: Path) -> None:
     runs = [fake_result(m, psnr=(p,)) for m, p in (("a", 20.001), ("b", 20.002), ("c", 19.0))]
     table = table_of(tmp_path, *runs, metrics=["psnr", "gaussians"])

@@ -19,8 +19,8 @@ class _Pixel(click.Command):
         if missing and not ctx.resilient_parsing:
             raise click.UsageError(
                 f"{', '.join(missing)} not given: name a run, a train photo of it, and a pixel from its upper "
-                "left, e.g. aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64; the page of 'aw view' "
-                "says the same at a click",
+                "left, e.g. aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64; a click in the page of "
+                "'aw view' says the same",
                 ctx,
             )
         return rest

@@ -20,8 +20,8 @@ class _Pixel(click.Command):
         if missing and not ctx.resilient_parsing:
             raise click.UsageError(
                 f"{', '.join(missing)} not given: name a run, a train photo of it, and a pixel from its upper "
-                "left, e.g. aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64; the page of 'aw view' "
-                "says the same at a click",
+                "left, e.g. aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64; a click in the page of "
+                "'aw view' says the same",
                 ctx,
             )
         return rest
@@ -41,7 +41,7 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     \b
     aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64
     """
-    from ambiguous_wild.harness.evaluate import mask_reasons
+    from ambiguous_wild.harness.evaluate import explained_keep
     from ambiguous_wild.harness.replay import open_run
     from ambiguous_wild.harness.store import read_config
 
@@ -58,16 +58,14 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     height, width = step.photo.shape[:2]
     if column >= width or row >= height:
         raise AwError(f"{photo} is trained at {width} x {height}: there is no pixel {column}, {row}")
-    predicted = trainer.hooks.mask.predict(step)
-    keep = trainer.combine_user_keep(step, predicted)
+    keep, reasons = explained_keep(trainer, step)
     kept = keep is None or bool(keep[row, column] > 0.5)
-    reasons = mask_reasons(trainer, step)
     sentence = "" if reasons is None else reasons.at(column, row)
-    if predicted is None and not sentence:
+    if keep is None:
         sentence = f"kept: {method} masks nothing in this photo, or had not begun to"
     say(sentence or f"{'kept' if kept else 'masked'} by {method}, which gives no reasons")
     say(f"  {names[found[0]]}, column {column}, row {row}")
-    if predicted is not None:
+    if keep is not None:
         for line in trainer.hooks.mask.explain(step, column, row):
             say(f"  {line}")
     if not trainer.done:

@@ -144,10 +144,11 @@ def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
     reasons: dict[str, MaskReasons] = {}
 
     def keeps() -> Iterator[tuple[View, np.ndarray]]:
-        for view, step, keep in _predicted(trainer):
+        for index, view in enumerate(trainer.data.scene.train):
+            keep, why = explained_keep(trainer, _last_step(trainer, index))
+            if why is not None:
+                reasons[view.name] = why
             if keep is not None:
-                if (why := mask_reasons(trainer, step)) is not None:
-                    reasons[view.name] = why
                 yield view, (keep > 0.5).cpu().numpy()
 
     scores = write_keeps(trainer.data.scene, keeps(), folder)
@@ -157,27 +158,28 @@ def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
 
 def keep_maps(trainer: Trainer) -> Iterator[tuple[View, np.ndarray]]:
     """Compute the keep map [H, W] bool of each train view that has one; each is rendered for it."""
-    for view, _, keep in _predicted(trainer):
+    for index, view in enumerate(trainer.data.scene.train):
+        step = _last_step(trainer, index)
+        keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
         if keep is not None:
             yield view, (keep > 0.5).cpu().numpy()
 
 
-def _predicted(trainer: Trainer) -> Iterator[tuple[View, Step, torch.Tensor | None]]:
-    for index, view in enumerate(trainer.data.scene.train):
-        step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
-        yield view, step, trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
+def _last_step(trainer: Trainer, view: int) -> Step:
+    return trainer.make_step(max(trainer.iteration, 1), view, downsampling=1)
 
 
-def mask_reasons(trainer: Trainer, step: Step) -> MaskReasons | None:
-    """Return why the step's photo is masked where it is: by the capture's own mask, and by the method."""
-    reasons, own = trainer.hooks.mask.reasons(step), trainer.data.user_keep[step.view]
+def explained_keep(trainer: Trainer, step: Step) -> tuple[torch.Tensor | None, MaskReasons | None]:
+    """Return the keep map of the step's photo at its own size, and why its regions are masked or kept."""
+    predicted, reasons = trainer.hooks.mask.predict_with_reasons(step)
+    keep, own = trainer.combine_user_keep(step, predicted), trainer.data.user_keep[step.view]
     if own is None:
-        return reasons
+        return keep, reasons
     outside = (own <= 0.5).cpu().numpy()
     regions = np.full(outside.shape, -1) if reasons is None else reasons.regions.astype(int) - 1
     sentences = () if reasons is None else reasons.sentences
     regions[outside] = len(sentences)
-    return reasons_of(regions, [*sentences, "masked: the capture's own mask leaves it out"])
+    return keep, reasons_of(regions, [*sentences, "masked: the capture's own mask leaves it out"])
 
 
 def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path) -> MaskScores | None:

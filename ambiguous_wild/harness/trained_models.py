@@ -214,7 +214,7 @@ def _read_model(run: Path) -> TrainedModel:
         ply=ply,
         render_settings=look,
         psnr={name: float(value) for name, value in psnr.items() if value is not None},
-        masks=run / MASKS if (run / MASKS).is_dir() else None,
+        masks=run / MASKS if any((run / MASKS).rglob("*.png")) else None,  # empty where nothing is masked
         reasons=run / REASONS if (run / REASONS).is_file() else None,
         retrain=_retrain_command(run, result),
         reference=knows_truth(result["method"]),

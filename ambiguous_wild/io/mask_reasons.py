@@ -14,7 +14,7 @@ from ambiguous_wild.io.files import own_json, write_json
 from ambiguous_wild.io.page_parts import data_uri
 
 FILE = "reasons.json"  # in the run's folder
-WIDTH = 480  # px, largest width of a written map
+WIDTH = 320  # px, largest width of a written map
 _MAX_REGIONS = 255
 _MAX_SENTENCE = 300  # characters
 _PNG = "data:image/png;base64,"
@@ -58,7 +58,9 @@ def regions_uri(regions: np.ndarray, width: int) -> str:
     if regions.shape[1] > width:
         height = max(1, round(regions.shape[0] * width / regions.shape[1]))
         regions = cv2.resize(regions, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    return data_uri("png", bytes(cv2.imencode(".png", regions)[1]))
+    # a fifth of the time, and 30 % less than OpenCV's default, for such maps
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    return data_uri("png", bytes(cv2.imencode(".png", regions, options)[1]))
 
 
 def write_reasons(path: Path, photos: Mapping[str, MaskReasons]) -> None:

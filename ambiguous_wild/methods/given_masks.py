@@ -86,8 +86,8 @@ class GraftedPolicy(MaskPolicy):
     def panels(self, step: Step) -> dict[str, np.ndarray]:
         return self.mask.panels(step)
 
-    def reasons(self, step: Step) -> MaskReasons | None:
-        return self.mask.reasons(step)
+    def predict_with_reasons(self, step: Step) -> tuple[Tensor | None, MaskReasons | None]:
+        return self.mask.predict_with_reasons(step)
 
     def explain(self, step: Step, x: int, y: int) -> list[str]:
         return self.mask.explain(step, x, y)

@@ -164,9 +164,9 @@ class MaskPolicy:
         """
         return {}
 
-    def reasons(self, step: Step) -> MaskReasons | None:
-        """Return why the regions of the photo, at its own size, are kept or masked; None without reasons."""
-        return None
+    def predict_with_reasons(self, step: Step) -> tuple[Tensor | None, MaskReasons | None]:
+        """Return `predict` at the photo's own size, and why regions are kept or masked, if it is known."""
+        return self.predict(step), None
 
     def explain(self, step: Step, x: int, y: int) -> list[str]:
         """Return what was measured at the pixel in column x and row y of the photo, in lines."""

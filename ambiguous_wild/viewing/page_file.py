@@ -33,6 +33,7 @@ MAX_PHOTO_BYTES = 1_000_000  # text of all photos and of the map
 MAX_MAP_BYTES = 200_000
 MAX_POINTS = 20_000  # moving and static features of all photos
 MAX_MASK_BYTES = 300_000  # text of the masks of all models
+MAX_REASON_BYTES = 200_000  # text of the maps of reasons of all models that have any
 _SPZ = FORMATS["spz"]  # the format that the page's renderer reads
 SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_masks.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
@@ -112,6 +113,8 @@ def page_text(
     page_notes, elements, facts = list(notes), [], []
     if mixed:
         page_notes.insert(0, f"* PSNR here rewards ghosts: {mixed}")
+    explained = sum(model.reasons is not None for model in models)
+    shares = MAX_MASK_BYTES // len(models), MAX_REASON_BYTES // max(explained, 1)
     for number, model in enumerate(models):
         say(f"{model.label}: {model.count:,} Gaussians")
         gaussians = model.read()
@@ -133,7 +136,7 @@ def page_text(
         elements.append(
             f'<script id="{element}" type="text/plain">{base64.b64encode(packed).decode("ascii")}</script>'
         )
-        facts.append(_model_facts(model, element, views, scene.train, MAX_MASK_BYTES // len(models)))
+        facts.append(_model_facts(model, element, views, scene.train, shares))
         facts[-1]["whole"] = shown == given
     for line in page_notes:
         say(line)
@@ -183,7 +186,11 @@ def _rounding_cost(
 
 
 def _model_facts(
-    model: ViewedModel, element: str, views: Sequence[View], train: Sequence[View], most_mask_bytes: int
+    model: ViewedModel,
+    element: str,
+    views: Sequence[View],
+    train: Sequence[View],
+    most_bytes: tuple[int, int],
 ) -> dict[str, object]:
     psnr = {v.name: model.psnr[v.name] for v in views if np.isfinite(model.psnr.get(v.name, np.nan))}
     return {
@@ -195,8 +202,8 @@ def _model_facts(
         "background": list(model.render_settings.background),
         "psnr": psnr,
         "mean": sum(psnr.values()) / len(psnr) if psnr else None,
-        "masks": {} if model.masks is None else mask_uris(model.masks, train, most_mask_bytes),
-        "reasons": {} if model.reasons is None else _reason_facts(model.reasons, train, most_mask_bytes),
+        "masks": {} if model.masks is None else mask_uris(model.masks, train, most_bytes[0]),
+        "reasons": {} if model.reasons is None else _reason_facts(model.reasons, train, most_bytes[1]),
         "retrain": model.retrain,
     }
 

@@ -298,20 +298,24 @@ def test_the_panel_names_files_and_the_command_that_trains_on(
 ) -> None:
     scene = write_tiny_scene(tmp_path / "out" / "scene")
     run = write_shown_run(tmp_path / "out" / "runs", scene, "refinesplat", iterations=300)
+    plain = write_shown_run(tmp_path / "out" / "runs", scene, "3dgs")
+    for mask in (plain / "masks").iterdir():
+        mask.unlink()  # as a run leaves the folder of a method without masks
     command = (
         f"aw bench --method refinesplat --scene {scene} --seed 0 --iterations 300 --device cpu --set a.b=1"
     )
     change_result(run, lambda r: r.update(reproduce=command))
     for here, above in ((tmp_path, "out/"), (tmp_path / "out", ""), (runs, "")):
         monkeypatch.chdir(here)
-        text = view_runs([run], tmp_path / "page").path.read_text()
+        text = view_runs([run, plain], tmp_path / "page").path.read_text()
         data = facts(text)
-        (model,) = data["models"]
+        model = data["models"][0]
         assert model["retrain"] == (
             f"aw bench --method refinesplat --scene {above}scene --seed 0 --set a.b=1 -o {above}runs "
             "--iterations 450 --overwrite longer --corrections corrections.json"
         )
         steps = "\n".join(data["next"])
+        assert steps.count("masks of ") == 1
         place = f"{above}{run.relative_to(tmp_path / 'out').as_posix()}"
         assert f"`{place}/masks`" in steps and f"`aw table {above}runs`" in steps
         assert str(tmp_path) not in text

@@ -208,7 +208,7 @@ def test_the_shown_model_is_saved_and_panels_close(masked: Browser, removed: Pat
     assert masked.run("files[0][0]") == "refinesplat.spz"
     code = "Array.from(new Uint8Array(b), (c) => String.fromCharCode(c)).join('')"
     packed = base64.b64decode(masked.run(f"files[0][1].arrayBuffer().then((b) => btoa({code}))"))
-    (ply,) = removed.parents[1].glob("runs/porch/refinesplat/*/point_cloud.ply")
+    (ply,) = removed.parents[1].glob("runs/porch/*/seed1/point_cloud.ply")
     saved = decode_spz(packed, "m").gaussians["means"]
     assert len(saved) == len(read_splat_ply(ply)["means"])
     masked.click("#help-button")  # one panel at a time

@@ -62,14 +62,13 @@ def panels(
     }
 
 
-def reasons(store: MaskStore, step: Step) -> MaskReasons:
-    """Return why the regions of the step's photo are masked or kept.
+def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskReasons:
+    """Return why the regions of a photo are masked or kept.
 
     A region is the part of an instance, or of what lies in none, for which the same decided; the value in its
     sentence is its mean, and the threshold that of the scene's instances.
     """
-    maps, masks = store.examine(step)
-    view, config = step.view, store.limited.get(step.view, store.config.mask)
+    config = store.limited.get(view, store.config.mask)
     labels = store.labels.of_pixel[view].view(store.labels.shapes[view])
     judged, threshold = _judged(store, view, maps, masks), float(masks.cut.threshold)
     structure, fused = config.statistic == "structure", _is_fused(config)
@@ -78,7 +77,7 @@ def reasons(store: MaskStore, step: Step) -> MaskReasons:
     if structure:
         agrees = "it looks as the other photos predict"
         differs = "it differs from what the other photos predict"
-    value, weak = "{0:.2f} of {1:.2f}", config.hold * threshold
+    value, weak = "{0:.1f} of {1:.1f}", config.hold * threshold
     limit = "but its instance as a whole does not"
     if fused:
         limit = f"but the mask may cover at most {100 * config.most:.0f} % of this photo"
@@ -94,7 +93,7 @@ def reasons(store: MaskStore, step: Step) -> MaskReasons:
     add(~masked & (judged > threshold), f"kept: {differs} ({value}), {limit}")
     add(masked, "masked: it fills a gap of a masked region, or lies at its rim")
     if fused:
-        near = f"masked: it adjoins what differs more, and is itself above {weak:.2f} ({{0:.2f}})"
+        near = f"masked: it adjoins what differs more, and is itself above {weak:.1f} ({{0:.1f}})"
         add(masked & (judged > weak), near)
     else:
         add(masked & masks.global_, "masked: it stands out from the rest of the photo")

@@ -270,8 +270,11 @@ class RefineSplatMask(PausingMask):
         points = self.points.get(self.data.scene.train[step.view].name)
         return mask_pictures.panels(self.masks, step, photo, labels, points, begun=self.begun(step))
 
-    def reasons(self, step: Step) -> MaskReasons | None:
-        return mask_pictures.reasons(self.masks, step) if self.begun(step) else None
+    def predict_with_reasons(self, step: Step) -> tuple[Tensor | None, MaskReasons | None]:
+        if not self.begun(step):
+            return None, None
+        maps, masks = self.masks.examine(step)
+        return masks.keep, mask_pictures.reasons(self.masks, step.view, maps, masks)
 
     def explain(self, step: Step, x: int, y: int) -> list[str]:
         return mask_pictures.explain(self.masks, step, x, y)

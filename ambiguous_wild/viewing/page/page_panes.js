@@ -59,6 +59,7 @@ class Pane {
     const model = choice === PHOTO ? null : DATA.models[choice];
     this.label.textContent = model ? model.label : "photo";
     this.photo.hidden = choice !== PHOTO;
+    this.element.style.background = model ? "" : "#000"; // the other model does not go on beside the photo
     this.choice = choice;
     if (this.canvas) this.canvas.style.visibility = model ? "visible" : "hidden";
     if (!model || this.showing === choice) return;

@@ -149,7 +149,7 @@ def _compile_sample() -> float:
     """Compile a small kernel, and keep it nowhere; returns the seconds, a measure of this machine."""
     import numba
 
-    def sample(values, out):  # type: ignore[no-untyped-def]
+    def sample(values, out):
         for i in numba.prange(len(values)):
             total = 0.0
             for j in range(len(values)):

@@ -136,7 +136,7 @@ def _print(report: CaptureReport) -> None:
         line = f"{check.name:<{width}}  {word:<7}  {check.finding} [{check.basis}]"
         say(line, out=True, fg=colour, only=word)
         if check.advice:
-            say(f"{'':<{width}}           ->  {check.advice}", out=True)
+            say(f"{'':<{width}}           -> {check.advice}", out=True)
     bad = len(report.warnings)
     verdict = "all checks passed" if not bad else f"{bad} of {len(report.checks)} checks failed"
     unknown = sum(c.state == "unknown" for c in report.checks)

@@ -149,9 +149,11 @@ def _printed() -> logging.Handler:
 
     handler = logging.Handler()
     handler.set_name(VERBOSE)
-    handler.emit = lambda record: tqdm.write(
-        wrapped(f"  {record.getMessage()}", line_width(err=True)), file=sys.stderr
-    )  # type: ignore[method-assign]
+
+    def emit(record: logging.LogRecord) -> None:
+        tqdm.write(wrapped(f"  {record.getMessage()}", line_width(err=True)), file=sys.stderr)
+
+    handler.emit = emit  # type: ignore[method-assign]
     return handler
 
 
@@ -232,8 +234,8 @@ def _click_message(error: click.ClickException) -> str:
     if isinstance(error, click.UsageError) and error.ctx is not None:
         stray = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", message)
         flags = {flag for param in error.ctx.command.params for flag in param.opts}
-        words = pairwise(sys.argv) if stray else ()
-        comma = next((a for a, b in words if a.endswith(",") and b == stray[1].split()[0]), "")
+        first = stray[1].split()[0] if stray else ""
+        comma = next((a for a, b in pairwise(sys.argv) if a.endswith(",") and b == first), "")
         if stray and comma:
             message += f": write {comma}{stray[1].replace(' ', '')} without a space"
         elif stray and {"--method", "--scene"} <= flags:

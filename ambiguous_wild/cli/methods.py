@@ -95,7 +95,8 @@ def _in_full(entries: Sequence[MethodEntry], as_json: bool) -> None:
 
 def _show(one: dict[str, Any]) -> None:
     click.echo(click.style(one["name"], bold=True) + "\n")
-    say(one["about"] or one["summary"], out=True)
+    paragraphs = (one["about"] or one["summary"]).split("\n\n")
+    click.echo("\n\n".join(_filled(" ".join(text.split()), "", "") for text in paragraphs))
     click.echo()
     facts = {
         "paper": one["paper"],

@@ -38,9 +38,10 @@ class PathName(click.Path):
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:
-            if "does not exist" in error.message:
-                error.message = error.message.rstrip(".") + (similar_path(value) or ".")
-            raise
+            hint = similar_path(value) if "does not exist" in error.message else ""
+            if not hint:
+                raise
+            self.fail(error.message.rstrip(".") + hint, param, ctx)
 
 
 class PathOrAlone(PathName):
@@ -90,11 +91,10 @@ class SectionedCommand(click.Command):
     """A command of many options: its help shows them under headings, the most used ones first."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        left = [param for param in self.params if isinstance(param, click.Option)]
-        left.append(self.get_help_option(ctx))
+        left = [param for param in self.get_params(ctx) if isinstance(param, click.Option)]
         for heading, flags in OPTION_SECTIONS.items():
             under = sorted(
-                (option for option in left if option is not None and option.opts[0] in flags),
+                (option for option in left if option.opts[0] in flags),
                 key=lambda option: flags.index(option.opts[0]),
             )
             left = [option for option in left if option not in under]
@@ -112,9 +112,9 @@ class CommandGroup(click.Group):
 
 
 def _write_section(
-    ctx: click.Context, formatter: click.HelpFormatter, heading: str, options: Sequence[click.Option | None]
+    ctx: click.Context, formatter: click.HelpFormatter, heading: str, options: Sequence[click.Option]
 ) -> None:
-    rows = [row for option in options if option is not None and (row := option.get_help_record(ctx))]
+    rows = [row for option in options if (row := option.get_help_record(ctx))]
     if rows:
         with formatter.section(heading):
             formatter.write_dl(rows)

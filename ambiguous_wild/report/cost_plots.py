@@ -117,7 +117,7 @@ def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> Non
 
 
 def label_points(axes: Any, points: Sequence[tuple[str, float, float, float, Any]]) -> None:
-    """Write names beside points and their error bars, on the side of the panel's middle.
+    """Write names beside points and their error bars, on the side with more room.
 
     Args:
         axes: the panel.
@@ -127,7 +127,8 @@ def label_points(axes: Any, points: Sequence[tuple[str, float, float, float, Any
     to_axes = axes.transData + axes.transAxes.inverted()
     heights = spread_out([y for _, _, _, y, _ in points], 0.062 * (high - low))
     for (name, x, bar, y, colour), height in zip(points, heights):
-        on_right = to_axes.transform((x, y))[0] > 0.5
+        left, right = (to_axes.transform((end, y))[0] for end in (x - bar, x + bar))
+        on_right = left > 1 - right
         axes.annotate(
             plain(name), (x - bar if on_right else x + bar, height), xytext=(-8 if on_right else 8, 0),
             textcoords="offset points", color=colour, fontsize=8, va="center",

@@ -239,7 +239,12 @@ def to_text(report: CostReport, width: int | None = None) -> str:
     notes = ["±: sample standard deviation over seeds"] if spread else []
     notes += [TIMES[report.reference], *report.notes]
     notes += [f"command: {report.made_by}"] if report.made_by else []
-    return "\n".join([plain_formats.to_text(tables), *(wrapped(plain(note), width) for note in notes)]) + "\n"
+    return (
+        "\n".join(
+            [plain_formats.to_text(tables, width=width), *(wrapped(plain(note), width) for note in notes)]
+        )
+        + "\n"
+    )
 
 
 def tables_of(report: CostReport) -> list[Table]:

@@ -87,6 +87,7 @@ class CostRun:
     error: str = ""
     unprobed: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
     added_s: float = 0.0  # added to times that are compared: the set-up, if it was asked for
+    doubt: str = ""  # whether test photos are truth
     apart: str = ""  # why no run on its scene is ranked: they measured other pixels
     speed: float = 1.0  # reference seconds in a second of the training; 1: times are wall seconds
 
@@ -151,6 +152,8 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
             notes.append(f"not comparable: {apart}")
             runs = [replace(run, apart=apart) if run.scene == scene else run for run in runs]
         notes += _unequal_methods(scene, of)
+        doubts = dict.fromkeys(run.doubt for run in of if run.doubt)
+        notes += [f"{doubt} ({scene}): a model that draws distractors gains PSNR by it" for doubt in doubts]
     runs = _with_effects_of_plans(runs)
     reference = _all_calibrated(runs)
     if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
@@ -287,6 +290,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         scene_hash=result["scene_hash"],
         reproduce=str(result.get("reproduce", "")),
         error=result["error"] or "",
+        doubt=str(result["facts"].get("test_photos", "")),
         unprobed="" if result["error"] else damage or no_probes,
     )
 

@@ -53,11 +53,11 @@ def to_text(tables: Sequence[Table], *, color: bool = False, width: int | None =
     Args:
         tables: the tables.
         color: colour the three best.
-        width: columns in which the lines below a table are broken; None: each stays one line.
+        width: columns at which titles and the lines below a table are broken; None: each stays one line.
     """
     parts = []
     for table, below in _with_below(tables):
-        parts += [plain(table.title), *_aligned(table, color), ""]
+        parts += [wrapped(plain(table.title), width), *_aligned(table, color), ""]
         parts += [*(wrapped(plain(line), width) for line in below), ""] if below else []
     return "\n".join(parts).rstrip("\n") + "\n"
 

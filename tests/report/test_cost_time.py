@@ -1,4 +1,4 @@
-"""Cost in reference seconds, the one-line answer, and the recommended setting."""
+"""Cost in reference seconds, what is said of it, and the recommended setting."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.report import cost_recommend as advice
 from ambiguous_wild.report.cost_changes import changes
 from ambiguous_wild.report.cost_curves import timeline, times_to_reach
+from ambiguous_wild.report.cost_plots import draw_front
 from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, value_at, words_of
 from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text
 from tests.report.fake_cost import ALONE, BUSY, RISING, cost_run, curves, read, rising
@@ -230,3 +231,23 @@ def test_runs_of_another_scene_or_metric_are_neither_ranked_nor_averaged(tmp_pat
     (curve,) = (curve for curve in curves(tmp_path) if curve.method == "b")
     assert not len(timeline(curve, ("yard",))[0])
     assert "differ beside the seed" in times_to_reach([curve])[0].missing
+
+
+def test_names_in_a_plot_stand_beside_error_bars(tmp_path: Path) -> None:
+    for seed, (early, late) in enumerate(((50.0, 100.0), (70.0, 140.0))):
+        cost_run(tmp_path, "a", seed=seed, train_s=early)
+        cost_run(tmp_path, "b", seed=seed, train_s=late, psnr=(25.0,))
+    figure = draw_front(cost_report(read(tmp_path)))
+    panel = figure.axes[0]
+    names = {text.get_text(): text for text in panel.texts}
+    spread = np.std([50.0, 70.0], ddof=1)
+    assert names["a"].xy[0] == pytest.approx(60.0 + spread) and names["a"].get_ha() == "left"
+    assert names["b"].xy[0] == pytest.approx(120.0 - 2 * spread) and names["b"].get_ha() == "right"
+
+
+def test_where_test_photos_may_hold_distractors_the_report_says_so(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", facts={"test_photos": "test photos may hold distractors: every 8th photo tests"})
+    told = "every 8th photo tests (yard): a model that draws distractors gains PSNR by it"
+    assert told in to_text(cost_report(read(tmp_path)))
+    narrow = to_text(cost_report(read(tmp_path)), 60)
+    assert max(map(len, narrow.splitlines())) <= 60 and "part 1 of" in narrow

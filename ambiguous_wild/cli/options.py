@@ -14,6 +14,8 @@ import click
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import plain
 
+PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
+
 
 class PathName(click.Path):
     """A path; an empty name is an error (an unset variable in a script), not the current folder."""
@@ -203,6 +205,32 @@ def prepare_cpu(threads: int | None) -> None:
 def say(text: str) -> None:
     """Write a line on stderr, so that stdout stays clean for results; names of runs cannot break it."""
     click.echo(plain(text), err=True)
+
+
+def own_step(ctx: click.Context, *words: str | Path) -> None:
+    """Print a command of ours and run it, for commands that consist of others.
+
+    Raises:
+        AwError: the command's.
+    """
+    line = [str(word) for word in words]
+    click.echo(f"\n$ aw {shlex.join(line)}", err=True)
+    try:
+        ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
+    except AwError as error:
+        if "--overwrite" not in str(error):
+            raise
+        raise AwError(
+            f"{error} ('aw {ctx.info_name}' has no such option: give it to the step printed above)"
+        ) from None
+
+
+def scene_name(photos: Path) -> str:
+    """Return the name of a scene of these photos: that of their folder, or of the one above images/."""
+    named = photos.resolve()
+    if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
+        named = named.parent
+    return named.stem
 
 
 def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = "") -> str:

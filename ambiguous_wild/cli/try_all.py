@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, prepare_cpu, say, threads_option
+from ambiguous_wild.cli.options import PathName, own_step, prepare_cpu, say, scene_name, threads_option
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import own_json
 
@@ -18,7 +18,6 @@ IN_3DGS = 1 + 1.2  # an iteration of 3dgs and one of refinesplat, in iterations 
 # Share of the time after the scene is built; the plan, measuring and the page take the rest.
 TRAINING = 0.7
 SHORTEST, LONGEST = 300, 30_000  # iterations; shorter runs show no difference of methods
-PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
 FRAMES = 60  # taken from a video
 # 'aw build-scene' on two idle cores with photos of about 1 MP: 11 take 9 to 11 s, 23 take 15 s, 40 take 43 s.
 SCENE_S = (3.0, 1.0)  # for any scene; for each photo
@@ -52,19 +51,11 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     cores = ["--threads", str(threads)] if threads else []
 
     def step(*words: str | Path, done: Path | None = None) -> None:
-        line = [str(word) for word in words]
-        click.echo(f"\n$ aw {shlex.join(line)}", err=True)
         if done is not None and done.exists():
+            click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)
             say(f"done before: {done}")
             return
-        try:
-            ctx.find_root().command.main(line, prog_name="aw", standalone_mode=False)
-        except AwError as error:
-            if "--overwrite" not in str(error):
-                raise
-            raise AwError(
-                f"{error} ('aw try' has no such option: give it to the step printed above)"
-            ) from None
+        own_step(ctx, *words)
 
     if video:
         record = own_json(photos / "capture.json").get("source")
@@ -73,10 +64,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
     if not (scene / "scene.json").exists():
         step("screen", photos, *cores)
-    named = source.resolve()
-    if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
-        named = named.parent
-    step("build-scene", photos, "-o", scene, "--name", named.stem, *cores)
+    step("build-scene", photos, "-o", scene, "--name", scene_name(source), *cores)
     iterations = known_iterations(runs) or _iterations(scene, seconds - (time.monotonic() - begin), threads)
     length = ["--iterations", str(iterations)]
     step("plan", scene, "--no-probe", "-o", plan, done=plan)

@@ -127,7 +127,7 @@ def plan_cells(
     distinct = list({path.resolve(): path for path in scenes}.values())
     loaded = [load_scene(path, factor=factor) for path in distinct]
     for scene in loaded:
-        if not scene.test:
+        if not scene.test and scene.info["missing"].get("test") != []:  # an empty list: train on all
             raise AwError(
                 f"{scene.root} tests nothing: no name in its test_list.txt is a photo of the model; correct "
                 "the list (one name a line, UTF-8), or remove both lists, then every 8th photo tests"

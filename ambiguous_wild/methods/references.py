@@ -3,6 +3,7 @@
 recipe.py:my_recipe     a function, or a MethodEntry, in a Python file, which is loaded as a module
 external:my.yaml        a program with commands of its own, see external.py
 nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see nerfbaselines_methods.py
+masks:FOLDER            masks in files, see folder_masks.py
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ambiguous_wild.methods.entry import MethodEntry, required
 _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
 _helpers: dict[str, Path] = {}  # files of modules that loaded files imported from beside them, by name
 _NO_HELPERS = (Path(os.__file__).resolve().parent, Path(__file__).resolve().parents[1])  # Python's and ours
-EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
+EXTERNAL, NERFBASELINES, MASKS = "external:", "nerfbaselines:", "masks:"
 _GRAFTED = re.compile(r"@(?:mask|density|regulariser|effects)=[^@]*$")
 _RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
@@ -134,7 +135,7 @@ def error_location(error: BaseException) -> str:
 
 def is_reference(name: str) -> bool:
     """Whether the name is a reference."""
-    return is_program(name) or _recipe_match(name) is not None
+    return is_program(name) or name.startswith(MASKS) or _recipe_match(name) is not None
 
 
 def _recipe_match(name: str) -> re.Match[str] | None:
@@ -151,7 +152,7 @@ def reference_file(name: str) -> Path | None:
     """Return the file that a reference names; None if it names no file."""
     if name.startswith(EXTERNAL):
         return Path(name.removeprefix(EXTERNAL))
-    match = None if name.startswith(NERFBASELINES) else _recipe_match(name)
+    match = None if name.startswith((NERFBASELINES, MASKS)) else _recipe_match(name)
     return Path(match["path"]) if match else None
 
 
@@ -164,6 +165,8 @@ def with_file(name: str, path: Path) -> str:
 
 def absolute(name: str) -> str:
     """Return the reference with an absolute path."""
+    if name.startswith(MASKS):
+        return f"{MASKS}{Path(name.removeprefix(MASKS)).resolve()}"
     path = reference_file(name)
     return name if path is None else with_file(name, path.resolve())
 
@@ -186,6 +189,10 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
         from ambiguous_wild.methods.nerfbaselines_methods import nerfbaselines_entry
 
         entry = nerfbaselines_entry(name.removeprefix(NERFBASELINES))
+    elif name.startswith(MASKS):
+        from ambiguous_wild.methods.folder_masks import folder_entry
+
+        entry = folder_entry(Path(name.removeprefix(MASKS)))
     else:
         entry = _recipe(name)
     return dataclasses.replace(entry, given_as=absolute(given_as or name))

@@ -50,7 +50,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.motion_points import FILE
-from ambiguous_wild.io.scene_folder import MAP, TEST_EVERY, read_list
+from ambiguous_wild.io.scene_folder import ALL_TRAINED, MAP, TEST_EVERY, read_list
 
 
 @dataclass(frozen=True)
@@ -344,7 +344,7 @@ def split_photos(photos: Sequence[ScreenedPhoto], registered: set[str], tests: s
     inside = sorted((photo for photo in photos if photo.name in registered), key=lambda photo: photo.stem)
     warnings = []
     if tests is not None:
-        how, test = "list" if tests else "none", [photo.name for photo in inside if photo.name in tests]
+        how, test = "list" if tests else ALL_TRAINED, [photo.name for photo in inside if photo.name in tests]
         wanted = len(tests)
     elif any(photo.side for photo in photos):
         how, test = "folders", [photo.name for photo in inside if photo.side == "test"]

@@ -18,7 +18,7 @@ from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 MIN_SHARE, MAX_SHARE = 0.1, 1.1  # plausible shares of the photo that undistortion keeps
 NEGLIGIBLE_PX = 0.1  # distortion below this everywhere is ignored
-_GRID = 8  # px; between the points of such a grid the map back is linear to a few hundredths of a px
+_GRID = 4  # px; between the points of such a grid the map back is linear to hundredths of a px
 
 
 @dataclass(frozen=True)
@@ -60,24 +60,27 @@ class Lens:
         """
         width, height = self.camera.width, self.camera.height
         scale = np.array([picture.shape[1], picture.shape[0]]) / [self.pinhole.width, self.pinhole.height]
-        flat: np.ndarray = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+        x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+        flat: np.ndarray = np.stack(np.meshgrid(x, y), axis=-1)
         if self.map_xy is not None:
             # Undistorting is iterative, so few points are undistorted, and those between are interpolated.
             rows, columns = (np.linspace(0, side, side // _GRID + 2) for side in (height, width))
             few = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
             seen = self.undistort_points(few).reshape(len(rows), len(columns), 2)
-            down, across = _between(rows, height), _between(columns, width)
-            flat = np.stack([down @ seen[..., k] @ across.T for k in (0, 1)], axis=-1)
+            down = _between(seen, height)
+            flat = _between(down.transpose(1, 0, 2), width).transpose(1, 0, 2)
         source = (flat * scale - 0.5).astype(np.float32)  # OpenCV counts from pixel centres
         return cv2.remap(
             picture, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
 
 
-def _between(points: np.ndarray, side: int) -> np.ndarray:
-    """Return the weights [side, K] that interpolate evenly spaced points [K] px at the centres of pixels."""
-    at = (np.arange(side) + 0.5) * (len(points) - 1) / points[-1]
-    return np.clip(1 - np.abs(at[:, None] - np.arange(len(points))), 0, None)
+def _between(values: np.ndarray, side: int) -> np.ndarray:
+    """Interpolate values [K, N, 2] at evenly spaced points from 0 to `side` px at the centres of its pixels."""
+    at = (np.arange(side) + 0.5) * (len(values) - 1) / side
+    low = at.astype(np.intp)
+    part = (at - low)[:, None, None]
+    return values[low] * (1 - part) + values[low + 1] * part
 
 
 def make_lens(camera: ModelCamera) -> Lens:

@@ -76,7 +76,7 @@ class Lens:
 
 
 def _between(values: np.ndarray, side: int) -> np.ndarray:
-    """Interpolate values [K, N, 2] at evenly spaced points from 0 to `side` px at the centres of its pixels."""
+    """Interpolate values [K, N, 2], at even distances from 0 to `side` px, at the centres of pixels."""
     at = (np.arange(side) + 0.5) * (len(values) - 1) / side
     low = at.astype(np.intp)
     part = (at - low)[:, None, None]

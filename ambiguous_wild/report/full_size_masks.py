@@ -38,8 +38,8 @@ from ambiguous_wild.io.original_photos import OriginalPhoto, capture_folder, ori
 from ambiguous_wild.io.photos import read_photo
 from ambiguous_wild.report.inpainting import Inpainting
 
-RADIUS = 4.0  # of the filter, in pixels of the mask
-EDGE = 1e-4  # variance of colours in [0, 1] that the filter takes for an edge
+RADIUS = 3.0  # of the filter, in pixels of the mask
+EDGE = 1e-3  # variance of colours in [0, 1] that the filter takes for an edge
 UNTRAINED = "the run was not trained on it"
 _BACK = {6: 8, 8: 6}  # EXIF orientations that another one undoes; the others undo themselves
 _ORIENTATION = 0x0112  # EXIF

@@ -30,7 +30,6 @@ from ambiguous_wild.io.images import (
     read_keep_map,
     read_png_rgb,
     upright,
-    ximgproc,
 )
 from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.mask_files import MASK_FOLDERS, MASK_STYLES, OWN_STYLE, MaskStyle, mask_names
@@ -40,6 +39,7 @@ from ambiguous_wild.report.inpainting import Inpainting
 
 RADIUS = 3.0  # of the filter, in pixels of the mask
 EDGE = 1e-3  # variance of colours in [0, 1] that the filter takes for an edge
+_STRIP = 2_000_000  # px that are filtered at a time
 UNTRAINED = "the run was not trained on it"
 _BACK = {6: 8, 8: 6}  # EXIF orientations that another one undoes; the others undo themselves
 _ORIENTATION = 0x0112  # EXIF
@@ -199,8 +199,40 @@ def full_size(
     if not follow_edges or keep.min() == keep.max():
         return large >= 0.5
     radius = max(1, round(RADIUS * max(size) / max(keep.shape)))
-    guide = photo.astype(np.float32) / np.float32(255)
-    return ximgproc().guidedFilter(guide, large, radius, EDGE) >= 0.5
+    guided, rows = np.empty_like(large), max(1, _STRIP // size[0])
+    for top in range(0, size[1], rows):  # strips, as a photo of 12 megapixels would need 1 GB
+        first, last = max(0, top - 2 * radius), min(size[1], top + rows + 2 * radius)
+        strip = _guided(photo[first:last].astype(np.float32) / 255, large[first:last], radius)
+        guided[top : top + rows] = strip[top - first : top - first + rows]
+    return guided >= 0.5
+
+
+def _guided(guide: np.ndarray, values: np.ndarray, radius: int) -> np.ndarray:
+    """Filter values [H, W] so that they follow the colours of a guide [H, W, 3].
+
+    OpenCV's colour version gives up where colours hardly vary, which moves rims in front of plain walls.
+    """
+
+    def mean(image: np.ndarray) -> np.ndarray:
+        return cv2.blur(image, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REFLECT)
+
+    bands = [np.ascontiguousarray(guide[..., k]) for k in range(3)]
+    means, middle = [mean(band) for band in bands], mean(values)
+    c0, c1, c2 = (mean(band * values) - m * middle for band, m in zip(bands, means))
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    rr, rg, rb, gg, gb, bb = (
+        mean(bands[i] * bands[j]) - means[i] * means[j] + (EDGE if i == j else 0) for i, j in pairs
+    )
+    # slopes = inverse of the covariance of the colours, by cofactors, times their covariance with the values
+    i00, i01, i02 = gg * bb - gb * gb, gb * rb - rg * bb, rg * gb - gg * rb
+    i11, i12, i22 = rr * bb - rb * rb, rb * rg - rr * gb, rr * gg - rg * rg
+    determinant = i00 * rr + i01 * rg + i02 * rb
+    slopes = [
+        (a * c0 + b * c1 + c * c2) / determinant
+        for a, b, c in ((i00, i01, i02), (i01, i11, i12), (i02, i12, i22))
+    ]
+    offset = middle - sum(slope * m for slope, m in zip(slopes, means))
+    return sum(mean(slope) * band for slope, band in zip(slopes, bands)) + mean(offset)
 
 
 def masks_of_run(folder: Path, scene_folder: Path | None = None) -> tuple[Path, Scene, dict[str, Path]]:

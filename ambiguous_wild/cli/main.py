@@ -25,7 +25,10 @@ from ambiguous_wild.core.names import plain
 SECTIONS = {
     "In one go": {
         "try": ("try_all", "Try it on your photos or video: scene, two methods, page and table in one go."),
-        "masks": ("masks", "Masks of your photos, or of a run, in the names of COLMAP, RealityScan, ..."),
+        "masks": (
+            "photo_masks",
+            "Masks of your photos, or of a run, in the names of COLMAP, RealityScan, ...",
+        ),
     },
     "Photos": {
         "simulate": (

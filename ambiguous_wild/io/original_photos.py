@@ -27,24 +27,29 @@ class OriginalPhoto:
 
 
 def original_photos(info: Mapping[str, Any]) -> tuple[OriginalPhoto, ...] | None:
-    """Return the photos that scene.json tells of, in its order; None for a scene of another origin.
+    """Return the photos that scene.json tells of, in its order; None where it does not tell of their lenses.
+
+    It does so in scenes of 'aw build-scene' alone, and not in those of earlier versions.
 
     Args:
         info: scene.json as read; it may be a stranger's.
 
     Raises:
-        AwError: the scene was built by a version that kept no lenses, or scene.json was changed.
+        AwError: scene.json was changed.
     """
-    if "imported" in info or "chosen" not in info:
-        return None
-    if "capture" not in info:
-        raise AwError(f"scene {info.get('name')} does not say by which lenses it was undistorted: {AGAIN}")
     try:
+        if not is_built(info) or "params" not in info["cameras"][0]:
+            return None
         return tuple(_originals(info))
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise AwError(
             f"scene.json of {info.get('name')} is damaged ({type(error).__name__}: {error}); {AGAIN}"
         ) from None
+
+
+def is_built(info: Mapping[str, Any]) -> bool:
+    """Whether scene.json is one of 'aw build-scene'."""
+    return "chosen" in info
 
 
 def _originals(info: Mapping[str, Any]) -> list[OriginalPhoto]:
@@ -94,8 +99,10 @@ def capture_folder(scene: Path, info: Mapping[str, Any]) -> Path:
     """Return the folder of the photos that a scene was built from.
 
     Raises:
-        AwError: it is gone.
+        AwError: it is gone, or scene.json does not name it.
     """
+    if "capture" not in info:
+        raise AwError(f"{scene} does not say where its photos are, as packed scenes do not: {AGAIN}")
     folder = (scene.resolve() / str(info["capture"])).resolve()
     if not folder.is_dir():
         raise AwError(

@@ -5,56 +5,39 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import torch
 
 from ambiguous_wild.core import AwError, Scene, View
-from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.core.names import check_name
-from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import orientation, read_mask, upright
 from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.lens import Lens, make_lens
-from ambiguous_wild.io.mask_files import SPELLINGS, find_masks, mask_files
+from ambiguous_wild.io.mask_files import SPELLINGS, find_masks
 from ambiguous_wild.io.original_photos import OriginalPhoto, original_photos
-from ambiguous_wild.methods.entry import MethodEntry
-
-if TYPE_CHECKING:
-    from ambiguous_wild.splat.method_hooks import MethodHooks
+from ambiguous_wild.methods.given_masks import FixedMasks
+from ambiguous_wild.splat.method_hooks import MethodHooks
+from ambiguous_wild.splat.step import TrainData
 
 SAME_SHAPE = 0.01  # relative difference of the sides' ratios, as of a photo whose sides were rounded
 
 
-def folder_entry(folder: Path) -> MethodEntry:
-    """Return 3DGS with the masks in a folder, under the folder's name; changed masks are another method.
+class FolderMasks(FixedMasks):
+    """The masks in a folder of files."""
 
-    Raises:
-        AwError: no such folder, no mask in it, or a name that no method can have.
-    """
-    if not folder.is_dir():
-        raise AwError(
-            f"no folder of masks {folder}: give one with a PNG for each train photo, white = static"
-        )
-    if bad := [sign for sign in ",=@" if sign in str(folder.resolve())]:
-        raise AwError(
-            f"the path of the masks {folder} holds {bad[0]!r}, which no name of a method may: rename it"
-        )
-    files = sorted(mask_files(folder))
-    if not files:
-        raise AwError(f"{folder} holds no masks: {SPELLINGS}")
-    digest = config_hash([[path.relative_to(folder).as_posix(), sha256_file(path)] for path in files])
-    name = check_name("name of a folder of masks", folder.resolve().name)
-    recipe = functools.partial(_hooks, folder.resolve())
-    return MethodEntry(name, f"3dgs with the masks in {folder.name}/", recipe, source_hash=digest)
+    def __init__(self, folder: Path) -> None:
+        super().__init__([])
+        self.folder = folder
+
+    def setup(self, data: TrainData) -> None:
+        self.keeps = [torch.from_numpy(keep) for keep in folder_keeps(self.folder, data.scene)]
+        super().setup(data)
 
 
-def _hooks(folder: Path) -> MethodHooks:
-    from ambiguous_wild.methods.given_masks import FolderMasks
-    from ambiguous_wild.splat.method_hooks import MethodHooks
-
+def build(folder: Path) -> MethodHooks:
+    """Return 3DGS with these masks."""
     return MethodHooks(mask=FolderMasks(folder))
 
 

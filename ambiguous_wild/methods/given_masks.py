@@ -1,4 +1,4 @@
-"""Mask policies of other sources: fixed masks, of a first pass or of files; parts of two methods."""
+"""Mask policies of other sources: fixed masks of a first pass, or masks and losses of two methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import Facts, State
-from ambiguous_wild.methods.folder_masks import folder_keeps
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.method_hooks import MaskPolicy
@@ -37,18 +36,6 @@ class FixedMasks(MaskPolicy):
     def facts(self) -> Facts:
         shares = [1.0 - float(keep.mean()) for keep in self.keeps]
         return {"masked_share": sum(shares) / max(len(shares), 1)}
-
-
-class FolderMasks(FixedMasks):
-    """The masks in a folder of files, see `folder_masks.folder_keeps`."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__([])
-        self.folder = folder
-
-    def setup(self, data: TrainData) -> None:
-        self.keeps = [torch.from_numpy(keep) for keep in folder_keeps(self.folder, data.scene)]
-        super().setup(data)
 
 
 class GraftedPolicy(MaskPolicy):

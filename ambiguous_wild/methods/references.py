@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import importlib.metadata
 import importlib.util
 import inspect
@@ -19,12 +20,17 @@ import sys
 import traceback
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.mask_files import SPELLINGS, mask_files
 from ambiguous_wild.methods.entry import MethodEntry, required
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.method_hooks import MethodHooks
 
 _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
 _helpers: dict[str, Path] = {}  # files of modules that loaded files imported from beside them, by name
@@ -190,12 +196,31 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
 
         entry = nerfbaselines_entry(name.removeprefix(NERFBASELINES))
     elif name.startswith(MASKS):
-        from ambiguous_wild.methods.folder_masks import folder_entry
-
-        entry = folder_entry(Path(name.removeprefix(MASKS)))
+        entry = _folder(Path(name.removeprefix(MASKS)))
     else:
         entry = _recipe(name)
     return dataclasses.replace(entry, given_as=absolute(given_as or name))
+
+
+def _folder(folder: Path) -> MethodEntry:
+    """Return 3DGS with the masks in a folder, under the folder's name; changed masks are another method."""
+    if not folder.is_dir():
+        raise AwError(f"no folder of masks {folder}: give one with a mask for each train photo")
+    if bad := [sign for sign in ",=@" if sign in str(folder.resolve())]:
+        raise AwError(f"the path of the masks {folder.resolve()} holds {bad[0]!r}: rename that folder")
+    files = sorted(mask_files(folder))
+    if not files:
+        raise AwError(f"{folder} holds no masks: {SPELLINGS}")
+    digest = config_hash([[path.relative_to(folder).as_posix(), sha256_file(path)] for path in files])
+    name = check_name("name of a folder of masks", folder.resolve().name)
+    recipe = functools.partial(_build_folder, folder.resolve())
+    return MethodEntry(name, f"3dgs with the masks in {folder.name}/", recipe, source_hash=digest)
+
+
+def _build_folder(folder: Path) -> MethodHooks:
+    from ambiguous_wild.methods.folder_masks import build
+
+    return build(folder)
 
 
 def _recipe(name: str) -> MethodEntry:

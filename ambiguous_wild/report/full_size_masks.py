@@ -33,7 +33,7 @@ from ambiguous_wild.io.images import (
 )
 from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.mask_files import MASK_FOLDERS, MASK_STYLES, OWN_STYLE, MaskStyle, mask_names
-from ambiguous_wild.io.original_photos import OriginalPhoto, capture_folder, original_photos
+from ambiguous_wild.io.original_photos import AGAIN, OriginalPhoto, capture_folder, is_built, original_photos
 from ambiguous_wild.io.photos import read_photo
 from ambiguous_wild.report.inpainting import Inpainting
 
@@ -290,6 +290,10 @@ def _photos_of(scene: Scene) -> _Photos:
     photos = original_photos(scene.info)
     if photos is not None:
         return _Photos(capture_folder(scene.root, scene.info), photos)
+    if is_built(scene.info):
+        raise AwError(
+            f"{scene.root} does not say by which lenses it was undistorted: {AGAIN}, and train again"
+        )
     folder = "images"
     if not (scene.root / folder).is_dir():
         folder = f"images_{scene.info['loaded_factor']}"

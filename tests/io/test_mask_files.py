@@ -2,7 +2,7 @@
 
 import pytest
 
-from ambiguous_wild.cli.masks import TOOLS
+from ambiguous_wild.cli.photo_masks import TOOLS
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.mask_files import MASK_STYLES, OWN_STYLE, find_masks, mask_names
 

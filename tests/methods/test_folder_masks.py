@@ -8,7 +8,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.benchmark import bench
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.methods.folder_masks import folder_entry, folder_keeps
+from ambiguous_wild.methods.folder_masks import folder_keeps
+from ambiguous_wild.methods.registry import get_method
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH
 
 
@@ -89,4 +90,4 @@ def test_what_is_wrong_with_a_folder_is_said(scene, tmp_path):
         ("none", "no folder of masks"),
     ):
         with pytest.raises(AwError, match=words):
-            folder_entry(tmp_path / wrong)
+            get_method(f"masks:{tmp_path / wrong}")

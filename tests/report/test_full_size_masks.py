@@ -164,6 +164,14 @@ def _escape(case):
 def _be_older(case):
     path = case / "scene/scene.json"
     record = json.loads(path.read_text())
+    for camera in record["cameras"]:
+        del camera["params"]
+    path.write_text(json.dumps(record))
+
+
+def _be_packed(case):
+    path = case / "scene/scene.json"
+    record = json.loads(path.read_text())
     del record["capture"]
     path.write_text(json.dumps(record))
 
@@ -183,6 +191,7 @@ def _two_runs(case):
         (_fill_output, "masks exists; nothing is overwritten"),
         (_escape, "is no path in a folder"),
         (_be_older, "does not say by which lenses it was undistorted"),
+        (_be_packed, "does not say where its photos are"),
         (_two_runs, "holds 2 runs, give one of them"),
     ],
 )

@@ -42,10 +42,9 @@ class Inpainting:
 
     def why_not(self, name: str) -> str:
         """Return why a photo is left out; empty where it is not."""
-        share = self._unseen[name]
-        if share <= UNSEEN:
+        if self._unseen[name] <= UNSEEN:
             return ""
-        return f"no other photo shows {share:.0%} of what is masked, so the model knows nothing of it"
+        return f"no other photo shows {UNSEEN:.0%} or more of what is masked, so the model knows nothing of it"
 
     def draw(
         self,

@@ -44,7 +44,7 @@ class Inpainting:
         """Return why a photo is left out; empty where it is not."""
         if self._unseen[name] <= UNSEEN:
             return ""
-        return f"no other photo shows {UNSEEN:.0%} or more of what is masked, so the model knows nothing of it"
+        return f"no other photo shows {UNSEEN:.0%} or more of what is masked, so the model cannot know it"
 
     def draw(
         self,

@@ -88,7 +88,7 @@ class _Opened:
 
 
 @dataclass
-class _Photos:
+class _CapturePhotos:
     """The photos that masks are made for."""
 
     root: Path
@@ -285,11 +285,11 @@ def _check_size(path: Path, view: View) -> None:
         )
 
 
-def _photos_of(scene: Scene) -> _Photos:
+def _photos_of(scene: Scene) -> _CapturePhotos:
     """Return the capture's photos, or those in the scene's folder where it was not built from a capture."""
     photos = original_photos(scene.info)
     if photos is not None:
-        return _Photos(capture_folder(scene.root, scene.info), photos)
+        return _CapturePhotos(capture_folder(scene.root, scene.info), photos)
     if is_built(scene.info):
         raise AwError(
             f"{scene.root} does not say by which lenses it was undistorted: {AGAIN}, and train again"
@@ -304,7 +304,7 @@ def _photos_of(scene: Scene) -> _Photos:
             raise AwError(f"{scene.root / folder} has no photo {view.name}: restore it")
         name = path.relative_to(scene.root / folder).as_posix()
         inside.append(OriginalPhoto(name, "", view.name, image_size(path)))
-    return _Photos(
+    return _CapturePhotos(
         scene.root / folder,
         inside,
         original=False,

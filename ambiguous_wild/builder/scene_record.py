@@ -28,6 +28,7 @@ from ambiguous_wild.builder.records import (
     MotionResult,
     PhotoSplit,
     ResampleResult,
+    SceneCamera,
     ScenePhoto,
     SceneRecord,
     ScreenedPhoto,
@@ -37,7 +38,7 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import exif_focal
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import counted, shortlist
-from ambiguous_wild.io.colmap_records import ColmapModel
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.scene_folder import MAP
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
@@ -71,9 +72,8 @@ def scene_record(
     summary, factor = mapping["model"], results.resampled["factor"]
     assert summary is not None  # a build without a model has ended before
     sources = {photo.name: photo.source for photo in photos}
-    cameras: list[CameraFact] = [
-        {**camera, "photos": [sources[name] for name in camera["photos"]]} for camera in mapping["cameras"]
-    ]
+    lenses = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    cameras = [_camera(camera, lenses[camera["photos"][0]], sources) for camera in mapping["cameras"]]
     only_test, short = point_checks(model, set(split.test))
     return {
         "name": settings.name,
@@ -132,6 +132,17 @@ def scene_record(
             for area in matches["fixed"]
         ],
         "truth": results.resampled["truth"],
+    }
+
+
+def _camera(camera: CameraFact, lens: ModelCamera, sources: Mapping[str, str]) -> SceneCamera:
+    return {
+        **camera,
+        "photos": [sources[name] for name in camera["photos"]],
+        "model": lens.model,
+        "width": lens.width,
+        "height": lens.height,
+        "params": [float(value) for value in lens.params],
     }
 
 
@@ -265,7 +276,7 @@ def _photo(
     }
 
 
-def _focal_warnings(cameras: Sequence[CameraFact], photos: Sequence[ScreenedPhoto]) -> list[str]:
+def _focal_warnings(cameras: Sequence[SceneCamera], photos: Sequence[ScreenedPhoto]) -> list[str]:
     """Warn of cameras whose focal length contradicts their photos' EXIF."""
     stated = {photo.source: (exif_focal(photo), max(photo.size)) for photo in photos}
     odd = []

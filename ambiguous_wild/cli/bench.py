@@ -93,8 +93,9 @@ def parse_budget(text: str) -> float:
 )
 @click.option(
     "--mask",
-    metavar="METHOD",
-    help="Masks of another method, for all; none; motion: of moving features; or truth: exact masks.",
+    metavar="METHOD|FOLDER",
+    help="Masks of another method, for all; FOLDER: of files, white = static (docs/training.md); none; motion: of "
+    "moving features; or truth: exact masks.",
 )
 @click.option(
     "--set",

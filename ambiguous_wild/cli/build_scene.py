@@ -113,6 +113,7 @@ def _compiled() -> bool:
     help="A photo without a mask: error refuses the capture, keep uses the whole photo.",
 )
 @click.option("--test-list", type=PathName(), help="File with the names of the test photos, one per line.")
+@click.option("--no-test", is_flag=True, help="Train on all photos; nothing is measured then.")
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
 @threads_option
 @seed_option("Seed of COLMAP's random choices.")

@@ -161,12 +161,22 @@ def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
 )
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder to make.")
 @click.option("--copy", is_flag=True, help="Copy photos instead of linking them.")
+@click.option(
+    "--masks", "run", type=PathName(), metavar="RUN", help="The masks of this run, not the scene's own."
+)
 @json_option
-def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_json: bool) -> None:
+def export_scene_command(
+    scene: Path, form: str, output: Path, copy: bool, run: Path | None, as_json: bool
+) -> None:
     """Write SCENE in another tool's layout: photos at their training size, cameras, split, points, masks."""
     from ambiguous_wild.datasets.export import export_scene
 
-    done = export_scene(scene, form, output, copy=copy)
+    masks = None
+    if run is not None:
+        from ambiguous_wild.report.full_size_masks import masks_of_run
+
+        _, _, masks = masks_of_run(run, scene)
+    done = export_scene(scene, form, output, copy=copy, masks=masks)
     if as_json:
         facts = {"folder": str(done.folder), "layout": form, "train": done.train, "test": done.test}
         click.echo(json.dumps({**facts, "left_out": list(done.left_out)}, indent=2))

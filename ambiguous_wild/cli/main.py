@@ -26,6 +26,10 @@ from ambiguous_wild.io.terminal import line_width, say, wrapped
 SECTIONS = {
     "In one go": {
         "try": ("try_all", "Try it on your photos or video: scene, two methods, page and table in one go."),
+        "masks": (
+            "photo_masks",
+            "Masks of your photos, or of a run, in the names of COLMAP, RealityScan, ...",
+        ),
     },
     "Photos": {
         "simulate": (
@@ -126,6 +130,7 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
 
     \b
     aw try photos/ -o out               all of this in one go
+    aw masks photos/ -o masks           masks of the distractors, for other tools too
     aw simulate courtyard -o raw        a simulated capture; or use your own photos
     aw build-scene raw -o scene         check, COLMAP, downsample, split
     aw bench --method 3dgs,refinesplat --scene scene -o runs

@@ -25,6 +25,8 @@ OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
     "Ray": ("--engine", "--address", "--cpus-per-cell", "--gpus-per-cell", "--transfer"),
 }  # fmt: skip
 
+PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
+
 
 class PathName(click.Path):
     """A path; an empty name is an error (an unset variable in a script), not the current folder."""
@@ -271,6 +273,36 @@ def prepare_cpu(threads: int | None) -> None:
     from ambiguous_wild.splat import calibration
 
     calibration.prepare_cpu(threads, say)
+
+
+def print_command(*words: str | Path) -> None:
+    """Print a command of ours as one line to copy."""
+    click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)
+
+
+def own_step(ctx: click.Context, *words: str | Path) -> None:
+    """Print a command of ours and run it, for commands that consist of others.
+
+    Raises:
+        AwError: the command's.
+    """
+    print_command(*words)
+    try:
+        ctx.find_root().command.main(list(map(str, words)), prog_name="aw", standalone_mode=False)
+    except AwError as error:
+        if "--overwrite" not in str(error):
+            raise
+        raise AwError(
+            f"{error} ('aw {ctx.info_name}' has no such option: give it to the step printed above)"
+        ) from None
+
+
+def scene_name(photos: Path) -> str:
+    """Return the name of a scene of these photos: that of their folder, or of the one above images/."""
+    named = photos.resolve()
+    if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
+        named = named.parent
+    return named.stem
 
 
 def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = "") -> str:

@@ -6,13 +6,20 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ambiguous_wild.cli.options import PathName, prepare_cpu, say, threads_option
+from ambiguous_wild.cli.options import (
+    PathName,
+    own_step,
+    prepare_cpu,
+    print_command,
+    say,
+    scene_name,
+    threads_option,
+)
 from ambiguous_wild.cli.run_progress import ProgressBar
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import own_json
@@ -22,7 +29,6 @@ if TYPE_CHECKING:
     from ambiguous_wild.report.model_views import GrowingPage
     from ambiguous_wild.splat.trainer import Trainer
 
-PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
 FRAMES = 60  # taken from a video
 # 'aw screen' and 'aw build-scene' on two idle cores: seconds for any scene, and for each photo
 SCENE_S = (3.0, 1.2)
@@ -66,18 +72,11 @@ def command(
     cores = ["--threads", str(threads)] if threads else []
 
     def step(*words: str | Path, done: Path | None = None) -> None:
-        _print_command(words)
         if done is not None and done.exists():
+            print_command(*words)
             say(f"done before: {done}")
             return
-        try:
-            ctx.find_root().command.main([str(word) for word in words], prog_name="aw", standalone_mode=False)
-        except AwError as error:
-            if "--overwrite" not in str(error):
-                raise
-            raise AwError(
-                f"{error} ('aw try' has no such option: give it to the step printed above)"
-            ) from None
+        own_step(ctx, *words)
 
     if video:
         record = own_json(photos / "capture.json").get("source")
@@ -86,10 +85,7 @@ def command(
         step("capture", source, "-o", photos, "--frames", str(FRAMES), *cores, done=photos)
     if not (scene / "scene.json").exists():
         step("screen", photos, *cores)
-    named = source.resolve()
-    if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
-        named = named.parent
-    step("build-scene", photos, "-o", scene, "--name", named.stem, *cores)
+    step("build-scene", photos, "-o", scene, "--name", scene_name(source), *cores)
     step("plan", scene, "--no-probe", "-o", plan, done=plan)
     _train(methods, scene, runs, plan, output / "view", seconds - (time.monotonic() - begin), threads)
     step("view", runs, "-o", output / "view")
@@ -141,8 +137,8 @@ def _train(
         budget_s = before
     camera = opened.train[0].camera
     say(_bought(budget_s, len(opened.train), camera.width * camera.height))
-    words: list[str | Path] = ["bench", "--method", methods, "--scene", scene, "--budget", f"{budget_s:g}s"]
-    _print_command([*words, "--effects", plan, "--overwrite", "longer", "-o", runs])
+    words = ["bench", "--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
+    print_command(*words, "--effects", plan, "--overwrite", "longer", "-o", runs)
     growing = GrowingPage(page, runs)
     try:
         report = bench(
@@ -181,10 +177,6 @@ class _ProgressAndPage(ProgressBar):
             self.bar.write(
                 f"    look at it while it trains: {self.page.folder / 'index.html'}", file=sys.stderr
             )
-
-
-def _print_command(words: Sequence[str | Path]) -> None:
-    click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)
 
 
 def _announced(source: Path, scene: Path, seconds: float) -> str:

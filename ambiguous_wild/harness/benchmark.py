@@ -177,7 +177,8 @@ def bench(
             several = every choice, each in its own group.
         plan: a plan of `aw plan`, or its file, for the only scene; None = made where one is needed.
         settings: options of methods, "METHOD.KEY=VALUE".
-        parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}.
+        parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}; for
+            "mask" also a folder of masks.
         passes: 2 = train again from the start with the final masks; the runs are called METHOD+2passes.
         train: other settings of training.
         plugins: Python files that register methods.
@@ -309,12 +310,14 @@ def find_methods(
     """
     from ambiguous_wild.methods.entry import second_pass_name, trained_once
     from ambiguous_wild.methods.graft import graft_name
-    from ambiguous_wild.methods.references import reference_file
+    from ambiguous_wild.methods.references import MASKS, reference_file
     from ambiguous_wild.methods.registry import get_method, load_plugin
 
     for plugin in plugins:
         load_plugin(Path(plugin))
     donors: dict[str, str | None] = dict(parts.items())
+    if (mask := donors.get("mask")) and Path(mask).is_dir():
+        donors["mask"] = MASKS + mask
     names = []
     for text in methods:
         file = reference_file(text)

@@ -27,6 +27,7 @@ MAX_FACTOR = 1000  # largest downsampling factor; the builder allows 64
 SIDES: tuple[Split, Split] = ("train", "test")
 MAP = "map.png"  # in the scene's folder: the cameras from above
 TEST_EVERY = 8  # in scenes without lists every 8th photo is a test photo, as in 3DGS and gsplat
+ALL_TRAINED = "none"  # "split" in scene.json: there are no test photos, and none are missed
 TESTS_OF_3DGS = "test.txt"  # names of test photos, one a line
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")

@@ -18,6 +18,7 @@ from ambiguous_wild.io.splat_files import read_splats
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.gaussians import Gaussians
+    from ambiguous_wild.splat.rendered import Rendered
 
 AXES = {
     sign + axis: (-1.0 if sign else 1.0) * row for sign in ("", "-") for axis, row in zip("xyz", np.eye(3))
@@ -197,13 +198,17 @@ class Renderer:
 
     def __call__(self, camera: Camera) -> np.ndarray:  # [H, W, 3] uint8
         """Render the picture that a camera sees, as a run writes it to PNG."""
+        return to_uint8(self.frame(camera).image.numpy())
+
+    def frame(self, camera: Camera) -> Rendered:
+        """Render picture, alpha and depth of a camera."""
         import torch
 
         from ambiguous_wild.splat.render import render
 
         settings = self._render_settings
         with torch.no_grad():
-            drawn = render(
+            return render(
                 self._gaussians,
                 camera,
                 sh_degree=min(settings.sh_degree, self._gaussians.sh_degree),
@@ -211,7 +216,6 @@ class Renderer:
                 antialias=settings.antialias,
                 blur=settings.blur,
             )
-        return to_uint8(drawn.image.numpy())
 
 
 def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:

@@ -53,7 +53,7 @@ def test_an_option_of_one_name_has_one_kind_of_value() -> None:
 def test_the_same_meaning_has_the_same_name() -> None:
     for command, options in OPTIONS.items():
         assert ("-o" in options) == ("--output" in options), command
-        assert not {"--runs", "--force", "--replace", "--again", "--masks"} & {*options}, command
+        assert not {"--runs", "--force", "--replace", "--again"} & {*options}, command
         assert ("--jobs" in options) == ("--engine" in options), command  # runs at a time
         if "--threads" in options:
             assert "threads" in (options["--threads"].help or ""), command
@@ -61,7 +61,7 @@ def test_the_same_meaning_has_the_same_name() -> None:
             assert flag not in options or _kind(options[flag]) == kind, (command, flag)
     described = {flag: o.help or "" for options in OPTIONS.values() for flag, o in options.items()}
     white = {flag for flag, text in described.items() if "white =" in text}
-    assert white == {"--keep-masks", "--distractor-masks", "--objects"}
+    assert white == {"--keep-masks", "--distractor-masks", "--objects", "--mask", "--for"}
 
 
 def test_every_path_refuses_an_empty_name() -> None:

@@ -73,7 +73,7 @@ def shared(rng: np.random.Generator, images: int, skewed: bool) -> np.ndarray:
 def test_intervals_over_images_and_seeds_hold_the_truth_as_often_as_they_say(
     scenes: int, images: int, seeds: int, seed_sd: float, skewed: bool
 ) -> None:
-    rng, hits, count = np.random.default_rng(11), 0, 2000
+    rng, hits, count = np.random.default_rng(11), 0, 1200
     for _ in range(count):
         of = [
             (

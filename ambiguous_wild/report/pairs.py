@@ -115,7 +115,7 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class Pair:
+class MethodPair:
     """The difference of a method to another in one measure; NaN = not known, `state` says why."""
 
     method: str
@@ -131,7 +131,7 @@ class Pair:
 
 def compared(
     runs: Runs, names: Sequence[str], *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()
-) -> tuple[list[Pair], tuple[str, ...]]:
+) -> tuple[list[MethodPair], tuple[str, ...]]:
     """Return the differences of the first method to each other, and notes on what limits them.
 
     Args:
@@ -203,12 +203,12 @@ def _pair(
     other: str,
     *,
     fair: bool,  # the same pixels were measured by the same function
-) -> Pair:
+) -> MethodPair:
     measure = mean.columns[i].measure
     cells = [row.cells[i] for name in (first, other) for row in mean.rows if row.name == name]
     states = [cell.state for cell in cells if cell.state != "ok"]
     if states or not fair or any(cell.ranged for cell in cells):
-        return Pair(first, other, measure, states[0] if states else "missing")
+        return MethodPair(first, other, measure, states[0] if states else "missing")
     own: dict[str, float] = {}
     for scene, table in by_scene.items():
         a, b = (next(row.cells[i] for row in table.rows if row.name == name) for name in (first, other))
@@ -221,7 +221,7 @@ def _pair(
         both = [pair for scene in own if (pair := values.on(scene, measure.key, first, other)) is not None]
         on_images = _counts([d for a, b in both for d in a.mean(axis=1) - b.mean(axis=1)], measure)
     on_scenes = _counts(list(own.values()), measure)
-    return Pair(
+    return MethodPair(
         first, other, measure, "ok", over_images, over_scenes, won_scenes=on_scenes, won_images=on_images
     )
 
@@ -232,7 +232,7 @@ def _counts(differences: Sequence[float], measure: Measure) -> Counts:
     return Counts(sum(d > 0 for d in shown), sum(d == 0 for d in shown), sum(d < 0 for d in shown))
 
 
-def _reading(runs: Runs, pairs: Sequence[Pair], scenes: int) -> Iterator[str]:
+def _reading(runs: Runs, pairs: Sequence[MethodPair], scenes: int) -> Iterator[str]:
     """Yield how the table is read, and what it cannot say."""
     first, others = pairs[0].method, len({pair.other for pair in pairs})
     yield f"difference: {first} minus the method of the row; the arrow says whether more or less is better"
@@ -249,7 +249,7 @@ def _reading(runs: Runs, pairs: Sequence[Pair], scenes: int) -> Iterator[str]:
         yield f"one seed of {shortlist(alone)}: the interval over images takes its training as it is"
 
 
-def pair_table(pairs: Sequence[Pair], notes: Sequence[str]) -> Table:
+def pair_table(pairs: Sequence[MethodPair], notes: Sequence[str]) -> Table:
     """Return the differences as a table of texts: a row for each metric and method."""
     others = dict.fromkeys(pair.other for pair in pairs)
     title = f"differences of {pairs[0].method} to {shortlist(others)}"
@@ -257,21 +257,21 @@ def pair_table(pairs: Sequence[Pair], notes: Sequence[str]) -> Table:
     return replace(text_table(title, head, [_texts(pair) for pair in pairs]), notes=tuple(notes))
 
 
-def _texts(pair: Pair) -> list[str]:
+def _texts(pair: MethodPair) -> list[str]:
     name = f"{pair.other}, {pair.measure.label}{ARROWS[pair.measure.better]}"
     if pair.state != "ok":
         return [name, SHOWN[pair.state], "", "", "", ""]
     digits = pair.measure.digits
     counts = pair.won_scenes if pair.scenes.count > 1 else pair.won_images
     over = [_between(interval, digits) for interval in (pair.images, pair.scenes)]
-    return [name, f"{pair.scenes.mean:+.{digits}f}", *over, p_text(pair.p_holm), counts.text]
+    return [name, f"{pair.scenes.mean:+z.{digits}f}", *over, p_text(pair.p_holm), counts.text]
 
 
 def _between(interval: Interval, digits: int) -> str:
     """Return the interval; a dash where there are too few values for one."""
     if math.isnan(interval.low):
         return SHOWN["missing"]
-    return f"[{interval.low:.{digits}f}, {interval.high:.{digits}f}]"
+    return f"[{interval.low:z.{digits}f}, {interval.high:z.{digits}f}]"
 
 
 def p_text(p: float) -> str:
@@ -281,7 +281,7 @@ def p_text(p: float) -> str:
     return "<0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
-def pairs_csv(pairs: Sequence[Pair], notes: Sequence[str]) -> str:
+def pairs_csv(pairs: Sequence[MethodPair], notes: Sequence[str]) -> str:
     """Return CSV with a row for each metric and method; `note` is what makes methods incomparable."""
     note = "; ".join(line for line in notes if line.startswith(UNEQUAL))
     rows = (

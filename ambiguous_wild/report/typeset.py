@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -122,6 +123,7 @@ def _latex_cell(cell: TableCell, measure: Measure) -> str:
     if cell.state == "missing":
         return "--"
     text = latex_text(cell.text(measure)).replace("±", r"$\pm$").replace("inf", r"$\infty$")
+    text = re.sub(r"(?<!\w)-(?=\d)", "$-$", text)  # a minus, not a hyphen
     text += r"$^{\approx}$" if cell.tie else ""
     return text if cell.rank is None else f"\\cellcolor{{{COLORS[cell.rank - 1][0]}}}{text}"
 

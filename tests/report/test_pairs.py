@@ -136,7 +136,8 @@ def test_the_command_writes_pairs_in_every_format(tmp_path: Path) -> None:
     text = run(*words)
     assert "differences of Ours to robustsplat" in text and "robustsplat, PSNR↑" in text
     assert max(map(len, text.splitlines()[:4])) <= 80
-    assert "robustsplat, PSNR$\\uparrow$ & +" in run(*words, "--format", "latex")
+    latex = run(*words, "--format", "latex")
+    assert "robustsplat, PSNR$\\uparrow$ & +" in latex and "{[}$-$" in latex
     assert "| robustsplat, PSNR↑ | +" in run(*words, "--format", "markdown")
     assert "<td>+" in run(*words, "--format", "html")
     (row,) = csv.DictReader(io.StringIO(run(*words, "--format", "csv")))

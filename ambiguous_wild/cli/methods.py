@@ -99,7 +99,7 @@ def _show(one: dict[str, Any]) -> None:
     click.echo("\n\n".join(_filled(" ".join(text.split()), "", "") for text in paragraphs))
     click.echo()
     facts = {
-        "paper": one["paper"],
+        "paper": f"{one['paper']}, \\cite{{{one['cite']}}}" if one["cite"] else one["paper"],
         "needs": one["needs"] or "nothing beyond the core",
         **one["parts"],
         "published with": one["published_with"],

@@ -157,6 +157,11 @@ only_option = click.option(
     metavar="NAME",
     help="Only the scene of this name; repeatable.  [default: all]",
 )
+label_option = click.option(
+    "--label", "labels", multiple=True, metavar="METHOD[=NAME]",
+    help="Show METHOD as NAME; repeatable. Methods follow in the order of their labels, after those without "
+    "one.",
+)  # fmt: skip
 
 
 def device_option(help: str) -> Callable[..., Any]:

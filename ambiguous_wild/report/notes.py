@@ -13,9 +13,10 @@ import pandas as pd
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.labels import IN_FOLDER
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.result_file import NOT_BEGUN, Options
-from ambiguous_wild.harness.store import Runs, method_of, read_config, section
+from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
@@ -58,7 +59,7 @@ def notes(
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
         *_not_ranked(runs),
-        *_references(methods),
+        *_references(runs, methods),
         *_fitted(runs),
         *_unfitted(runs),
         *_missing(runs, columns),
@@ -138,8 +139,8 @@ def _not_ranked(runs: Runs) -> list[str]:
     ]
 
 
-def _references(methods: Sequence[str]) -> list[str]:
-    names = [method for method in methods if knows_truth(method_of(method))]
+def _references(runs: Runs, methods: Sequence[str]) -> list[str]:
+    names = [method for method in methods if knows_truth(runs.method_of(method))]
     return [f"references, not ranked: {shortlist(names)} (exact masks or clean photos)"] if names else []
 
 
@@ -171,13 +172,16 @@ def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
     A note without an option is the same under every table, and stands in docs/fidelity.md.
     """
     entries = all_methods()
+    shown = {runs.method_of(method): method for method in reversed(methods)}
     said: dict[str, list[str]] = {}
-    for name in dict.fromkeys(member for method in methods for member in members(method_of(method))):
+    for name in dict.fromkeys(member for method in methods for member in members(runs.method_of(method))):
         if name not in entries or "{" not in entries[name].note:
             continue
-        own = runs.runs[[name in members(method_of(method)) for method in runs.runs["method"]]]
+        own = runs.runs[[name in members(runs.method_of(method)) for method in runs.runs["method"]]]
         options = [_options_of(Path(folder), name) for folder in own["folder"]]
-        said.setdefault(entries[name].about(options), []).append(name)
+        said.setdefault(entries[name].about(options), []).append(
+            shown.get(name, name).partition(IN_FOLDER)[0]
+        )
     return [f"{', '.join(names)}: {note}" for note, names in said.items()]
 
 

@@ -74,7 +74,8 @@ def test_one_scene_is_one_block_without_spread(tmp_path: Path) -> None:
 def test_interval_over_the_images_of_a_scene(tmp_path: Path) -> None:
     table = table_of(tmp_path, fake_result("a", psnr=(10.0, 20.0, 30.0)), fake_result("b", psnr=(5.0,)))
     found = cell(table, "a", "psnr")
-    assert 10.0 <= found.low < found.value == 20.0 < found.high <= 30.0
+    half = 4.302653 * 10.0 / math.sqrt(3.0)  # Student's t of 2 degrees of freedom
+    assert found.value == 20.0 and (found.low, found.high) == pytest.approx((20.0 - half, 20.0 + half))
     assert math.isnan(cell(table, "b", "psnr").low)
 
 

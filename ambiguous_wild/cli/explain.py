@@ -23,28 +23,27 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     \b
     aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64
     """
+    from ambiguous_wild.core.scene import find_view
     from ambiguous_wild.harness.replay import open_run
 
     prepare_cpu(None)
     trainer = open_run(run)
     names = [view.name for view in trainer.data.scene.train]
-    found = [names.index(photo)] if photo in names else []
-    found = found or [k for k, name in enumerate(names) if photo in (Path(name).name, Path(name).stem)]
-    if not found:
+    view = find_view(trainer.data.scene.train, photo)
+    if view is None:
         raise unknown("train photo", photo, names)
-    if len(found) > 1:
-        raise AwError(f"{photo} names several photos: {', '.join(names[k] for k in found)}; name one in full")
-    step = trainer.make_step(max(trainer.iteration, 1), found[0], downsampling=1)
+    index = names.index(view.name)
+    step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
     height, width = step.photo.shape[:2]
     if column >= width or row >= height:
         raise AwError(f"{photo} is trained at {width} x {height}: there is no pixel {column}, {row}")
     if not trainer.done:
         say(f"{run} is not finished: these are its masks after {trainer.iteration} iterations")
-    policy, own = trainer.hooks.mask, trainer.data.user_keep[found[0]]
+    policy, own = trainer.hooks.mask, trainer.data.user_keep[index]
     predicted = policy.predict(step)
     keep = trainer.combine_user_keep(step, predicted)
     kept = keep is None or bool(keep[row, column] > 0.5)
-    say(f"{names[found[0]]}, column {column}, row {row}: {'kept' if kept else 'masked'}")
+    say(f"{view.name}, column {column}, row {row}: {'kept' if kept else 'masked'}")
     if own is not None and not bool(own[row, column] > 0.5):
         say("  the capture's own mask leaves it out")
     if predicted is None:

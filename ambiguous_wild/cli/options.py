@@ -219,7 +219,8 @@ def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = 
     suffix = output.suffix.lower() if output is not None else ""
     if suffix not in suffixes:
         known = ", ".join(s for s in suffixes if s)
-        raise AwError(f"-o {output}: no format is known for {suffix}: end the name in {known}{otherwise}")
+        why = f"no format is known for {suffix}: " if suffix else ""
+        raise AwError(f"-o {output}: {why}end the name in {known}{otherwise}")
     return suffixes[suffix]
 
 

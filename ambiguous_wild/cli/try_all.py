@@ -96,7 +96,8 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     )
     page = output / "view"
     step("view", runs, "-o", page)
-    step("table", runs, "--sheet", output / "comparison.png")
+    step("table", runs)
+    step("figure", runs, "-o", output / "comparison.png", "--masks")
     longer = shlex.join(
         ["aw", "bench", "--method", ",".join(METHODS), "--scene", str(scene), "--budget", "30m"]
     )

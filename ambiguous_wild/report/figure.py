@@ -1,7 +1,7 @@
 """What a figure of runs shows: its photos, its zooms and its pictures, equal for all methods.
 
-What is not given is found by one rule: where the mean squared error of the methods differs most. Which method is
-better does not enter.
+What is not given is found by one rule: where the mean squared errors of the methods differ most. Which method
+is better does not enter.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.scene import find_view
 from ambiguous_wild.harness.labels import shown_names
-from ambiguous_wild.harness.result_file import RESTORE, RESULT, RunResult, check_render, metrics_of, read_result
+from ambiguous_wild.harness.result_file import (
+    RESTORE,
+    RESULT,
+    RunResult,
+    check_render,
+    metrics_of,
+    read_result,
+)
 from ambiguous_wild.harness.store import Runs, check_names
 from ambiguous_wild.harness.trained_models import MASKS, open_scene
 from ambiguous_wild.io.images import read_gray, read_png_rgb
@@ -44,7 +51,9 @@ class FigureRow:
     pictures: tuple[np.ndarray, ...]  # [H, W, 3] uint8; the photo first, then a picture for each method
     texts: tuple[str, ...]  # below each picture
     box: Box | None  # what is shown enlarged below
-    errors: tuple[np.ndarray, ...] = ()  # for each method [H, W] float32: |render - photo|, mean over channels
+    errors: tuple[
+        np.ndarray, ...
+    ] = ()  # for each method [H, W] float32: |render - photo|, mean over channels
 
 
 @dataclass(frozen=True)
@@ -113,15 +122,15 @@ def runs_figure(
         scenes: names of scenes; empty: all that every method has a run of.
         photos: names of test photos, and of train photos, whose masks are shown; empty: those where methods
             differ most.
-        crops: what is enlarged: one for every photo, or one for each of `photos`; None: nothing. Empty: the box
-            of each test photo in which methods differ most.
+        crops: what is enlarged: one for every photo, or one for each of `photos`; None: nothing. Empty: the
+            box of each test photo in which methods differ most.
         labels: as `harness/labels.py` takes them.
         errors: also take error maps.
         masks: also take train photos with the masks, those where the masks differ most.
 
     Raises:
-        AwError: no finished run, no scene that all methods have, a scene that differs between runs or was moved
-            or changed, an unknown photo, a crop outside of its photo, or a run that lacks its renders.
+        AwError: no finished run, no scene that all methods have, a scene that differs between runs or was
+            moved or changed, an unknown photo, a crop outside of its photo, or a run that lacks its renders.
     """
     if len(crops) > 1 and len(crops) != len(photos):
         raise AwError(
@@ -131,35 +140,27 @@ def runs_figure(
     groups, notes = _groups(runs, scenes, labels)
     rows: list[FigureRow] = []
     count = -(-ROWS // len(groups))
-    boxes = list(crops) * len(photos) if len(crops) == 1 else list(crops)
-    found: set[str] = set()
     for group in groups:
-        for k, name in enumerate(photos):
-            view = _view(group.scene, name)
-            if view is not None:
-                found.add(name)
-                box = _box(boxes[k], view) if boxes and boxes[k] is not None else None
-                rows.append(_row(group, view, box, find=not boxes, errors=errors))
+        chosen = [(k, view) for k, name in enumerate(photos) if (view := _view(group.scene, name))]
         if not photos:
-            for view in _most_different(group)[:count]:
-                box = _box(crops[0], view) if crops and crops[0] is not None else None
-                rows.append(_row(group, view, box, find=not crops, errors=errors))
+            chosen = [(0, view) for view in _most_different(group)[:count]]
+        for k, view in chosen:
+            crop = crops[min(k, len(crops) - 1)] if crops else None
+            box = None if crop is None else _box(crop, view)
+            rows.append(_row(group, view, box, find=not crops, errors=errors))
         if masks:
-            views = _most_masked(group)[:count]
-            rows += [_row(group, view, None, find=False, errors=False) for view in views]
-            notes += [] if views else [f"scene {group.scene.name}: no method has masks"]
+            masked = _most_masked(group)[:count]
+            rows += [_row(group, view, None, find=False, errors=False) for view in masked]
+            notes += [] if masked else [f"scene {group.scene.name}: no method has masks"]
     for name in photos:
-        if name not in found:
-            views = [view.name for group in groups for view in group.scene.views]
-            raise unknown("photo", name, views)
+        if not any(_view(group.scene, name) for group in groups):
+            raise unknown("photo", name, [view.name for group in groups for view in group.scene.views])
     if not rows:
-        raise AwError("no test photo to show: the scenes have none")
+        raise AwError("there is no test photo to show; --masks shows train photos")
     return RunsFigure(groups[0].methods, tuple(rows), tuple(notes))
 
 
-def _groups(
-    runs: Runs, scenes: Sequence[str], labels: Sequence[str]
-) -> tuple[list[_SceneRuns], list[str]]:
+def _groups(runs: Runs, scenes: Sequence[str], labels: Sequence[str]) -> tuple[list[_SceneRuns], list[str]]:
     """Return the runs of each scene that all methods have a finished run of, and what is left out."""
     check_names("scene", scenes, sorted(runs.runs["scene"].unique()))
     finished = runs.runs[runs.runs["status"] == "ok"]
@@ -169,17 +170,20 @@ def _groups(
         raise AwError("no finished run to show; 'aw table' lists what is there")
     first = finished.sort_values("seed").drop_duplicates(["scene", "method"])
     names = shown_names(labels, sorted(first["method"].unique()))
-    methods = {scene: set(rows["method"]) for scene, rows in first.groupby("scene")}
-    shared = sorted(str(scene) for scene, of_scene in methods.items() if of_scene == set(names))
-    if not shared:
-        has = "; ".join(f"{scene}: {', '.join(sorted(of))}" for scene, of in sorted(methods.items()))
-        raise AwError(f"no scene has a run of every method ({has}): give runs of one scene, or name it with --only")
+    owners: dict[str, list[str]] = {}
+    for scene, method in zip(first["scene"].astype(str), first["method"].astype(str)):
+        owners.setdefault(scene, []).append(method)
+    lacking = {scene: sorted(set(names) - set(owners[scene])) for scene in sorted(owners)}
+    if all(lacking.values()):
+        has = "; ".join(f"{scene}: {', '.join(sorted(owners[scene]))}" for scene in lacking)
+        raise AwError(
+            f"no scene has a run of every method ({has}): give runs of one scene, or name it with --only"
+        )
     notes = [
-        f"scene {scene} is left out: no run of {shortlist(sorted(set(names) - of_scene))}"
-        for scene, of_scene in sorted(methods.items()) if scene not in shared
-    ]  # fmt: skip
+        f"scene {scene} is left out: no run of {shortlist(lack)}" for scene, lack in lacking.items() if lack
+    ]
     groups = []
-    for scene in shared:
+    for scene in (scene for scene, lack in lacking.items() if not lack):
         rows = first[first["scene"] == scene].set_index("method").loc[list(names)]
         if rows["scene_hash"].nunique() > 1:
             raise AwError(f"scene {scene!r} differs between these runs: run them again on one")
@@ -240,9 +244,7 @@ def _row(group: _SceneRuns, view: View, box: Box | None, *, find: bool, errors: 
         masks = group.masked(view)
         shown = [photo if mask is None else tint(photo, mask, MASKED) for mask in masks]
         texts = ["no mask" if mask is None else f"{100 * mask.mean():.0f} % masked" for mask in masks]
-        return FigureRow(
-            group.scene.name, view.name, True, (photo, *shown), ("train photo", *texts), box
-        )
+        return FigureRow(group.scene.name, view.name, True, (photo, *shown), ("train photo", *texts), box)
     renders = group.renders(view)
     texts = [f"{value:.2f} dB" for value in (group.psnr(k, view) for k in range(len(renders)))]
     if find:
@@ -261,8 +263,8 @@ def most_different_box(errors: Sequence[np.ndarray], first_column: int = 0) -> B
     """Find the box in which the mean squared errors of methods differ most, from the largest to the smallest.
 
     Args:
-        errors: for each method [H, W] its squared error, at least one. Of one method alone, its error itself is
-            what counts; so it is where methods do not differ at all.
+        errors: for each method [H, W] its squared error, at least one. Of one method alone, and where no
+            method differs, the error itself counts.
         first_column: columns before it are not measured.
 
     Returns:

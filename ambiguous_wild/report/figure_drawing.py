@@ -100,15 +100,17 @@ def write_figure(figure: RunsFigure, path: Path, *, width: float | None = None) 
         figure: the figure.
         path: the file.
         width: inches; None: one column of text for up to three columns of pictures, else the whole width.
-            A figure that would be higher than a page becomes narrower.
+            A figure that would be higher than a page is drawn narrower.
 
     Returns:
         Width and height in inches.
     """
-    layout = _layout(figure, width)
-    over = layout.height(figure.rows) / layout.px(TEXT_HEIGHT)
-    if over > 1.0:
-        layout = _layout(figure, width, shrink=over)
+    layout, shrink = _layout(figure, width), 1.0
+    while (over := layout.height(figure.rows) / layout.px(TEXT_HEIGHT)) > 1.0:
+        shrink, cell = shrink * over, layout.cell / layout.dpi
+        layout = _layout(figure, width, shrink)
+        if layout.cell / layout.dpi >= cell:  # the narrowest that can be read
+            break
     drawing = _Drawing(figure, layout)
     drawing.draw()
     save_as(drawing.figure, path)
@@ -131,7 +133,7 @@ def _layout(figure: RunsFigure, width: float | None, shrink: float = 1.0) -> _La
     captions = [text for row in figure.rows for text in row.texts]
     return _Layout(
         dpi, round(cell * dpi), round(GAP * dpi), round(ROW_GAP * dpi), round(strip * dpi), head, size,
-        _size_that_fits(captions, cell, CAPTION),
+        _size_that_fits(captions, cell, min(size, CAPTION)),
     )  # fmt: skip
 
 
@@ -176,6 +178,7 @@ class _Drawing:
         self.width, self.height = layout.width(), layout.height(figure.rows)
         self.figure = Figure(figsize=(self.width / layout.dpi, self.height / layout.dpi), dpi=layout.dpi)
         self.top_error = _round_up(figure.rows)
+        self.first_errors = next((row for row in figure.rows if row.errors), None)
 
     def draw(self) -> None:
         layout, rows = self.layout, self.content.rows
@@ -210,9 +213,9 @@ class _Drawing:
             self._text(x + layout.cell / 2, below, text, layout.caption_size)
             if row.errors:
                 below += layout.line
-                if column == 0:
+                if column == 0 and row is self.first_errors:  # all error maps have one scale
                     self._scale(x, below, full)
-                else:
+                elif column > 0:
                     colours = ramp(row.errors[column - 1], 0.0, self.top_error)
                     self._picture(colours, x, below + layout.gap, full)
 
@@ -239,7 +242,9 @@ class _Drawing:
         from matplotlib.patches import Rectangle
 
         axes.add_patch(
-            Rectangle((left, top), wide, high, fill=False, edgecolor=BOX, linewidth=OUTLINE, joinstyle="miter")
+            Rectangle(
+                (left, top), wide, high, fill=False, edgecolor=BOX, linewidth=OUTLINE, joinstyle="miter"
+            )
         )
 
     def _scale(self, x: int, y: int, high: int) -> None:

@@ -28,10 +28,14 @@ NONE = "none"
     help="Enlarge this part: px of the photo, or shares if none is above 1; none: nothing. Once, or after "
     "each --photo.  [default: where the methods differ most]",
 )  # fmt: skip
-@click.option("--errors", is_flag=True, help="Also show error maps: |render - photo|, mean over RGB.")
-@click.option("--masks", is_flag=True, help="Also show train photos, with what each method masks in red.")
 @click.option(
-    "--width", type=FiniteFloat(min=1, max=50), metavar="INCHES",
+    "--with-errors", "errors", is_flag=True, help="Also show error maps: |render - photo|, mean over RGB."
+)
+@click.option(
+    "--with-masks", "masks", is_flag=True, help="Also show train photos, with what each method masks in red."
+)
+@click.option(
+    "--inches", "width", type=FiniteFloat(min=1, max=50), metavar="WIDTH",
     help="Width of the figure.  [default: 3.3 for up to two methods, else 7]",
 )  # fmt: skip
 @only_option
@@ -55,8 +59,8 @@ def command(
 
     \b
     aw figure runs -o figure.pdf
-    aw figure runs -o figure.pdf --photo IMG_7.png --crop 120,80,100,75 --errors
-    aw figure runs -o figure.png --only yard --masks --label refinesplat=Ours
+    aw figure runs -o figure.pdf --photo IMG_7.png --crop 120,80,100,75 --with-errors
+    aw figure runs -o figure.png --only yard --with-masks --label refinesplat=Ours
     """
     style_of(output, SUFFIXES)
     boxes = [_crop(text) for text in crops]

@@ -97,7 +97,7 @@ def command(ctx: click.Context, source: Path, output: Path, budget: str, threads
     page = output / "view"
     step("view", runs, "-o", page)
     step("table", runs)
-    step("figure", runs, "-o", output / "comparison.png", "--masks")
+    step("figure", runs, "-o", output / "comparison.png", "--with-masks")
     longer = shlex.join(
         ["aw", "bench", "--method", ",".join(METHODS), "--scene", str(scene), "--budget", "30m"]
     )

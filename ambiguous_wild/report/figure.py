@@ -156,7 +156,7 @@ def runs_figure(
         if not any(_view(group.scene, name) for group in groups):
             raise unknown("photo", name, [view.name for group in groups for view in group.scene.views])
     if not rows:
-        raise AwError("there is no test photo to show; --masks shows train photos")
+        raise AwError("there is no test photo to show; --with-masks shows train photos")
     return RunsFigure(groups[0].methods, tuple(rows), tuple(notes))
 
 
@@ -246,7 +246,8 @@ def _row(group: _SceneRuns, view: View, box: Box | None, *, find: bool, errors: 
         texts = ["no mask" if mask is None else f"{100 * mask.mean():.0f} % masked" for mask in masks]
         return FigureRow(group.scene.name, view.name, True, (photo, *shown), ("train photo", *texts), box)
     renders = group.renders(view)
-    texts = [f"{value:.2f} dB" for value in (group.psnr(k, view) for k in range(len(renders)))]
+    values = [group.psnr(k, view) for k in range(len(renders))]
+    texts = ["no PSNR" if math.isnan(value) else f"{value:.2f} dB" for value in values]
     if find:
         squared = [_difference(render, photo, 2) for render in renders]
         box = most_different_box(squared, group.first_column(view))

@@ -105,7 +105,7 @@ MISTAKES = [
     ("figure empty -o figure.pdf", "no run in empty"),
     ("figure runs -o figure.pdf --only yrd", "unknown scene 'yrd': did you mean 'yard'?"),
     ("figure runs -o figure.pdf --label mine=Ours", "unknown method 'mine'"),
-    ("figure runs -o figure.pdf --width 0", "--width"),
+    ("figure runs -o figure.pdf --inches 0", "--inches"),
     *((f"figure runs -o figure.pdf --crop {crop}", "write X,Y,W,H with the upper left corner first")
       for crop in ("1,2,3", "a,b,c,d", "1,2,nan,4", "nothing")),
     ("figure runs -o figure.pdf --crop none --crop none", "--crop is given 2 times and --photo 0 times"),

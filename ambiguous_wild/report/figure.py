@@ -163,13 +163,14 @@ def runs_figure(
 def _groups(runs: Runs, scenes: Sequence[str], labels: Sequence[str]) -> tuple[list[_SceneRuns], list[str]]:
     """Return the runs of each scene that all methods have a finished run of, and what is left out."""
     check_names("scene", scenes, sorted(runs.runs["scene"].unique()))
-    finished = runs.runs[runs.runs["status"] == "ok"]
-    if scenes:
-        finished = finished[finished["scene"].isin(scenes)]
+    asked = runs.runs[runs.runs["scene"].isin(scenes)] if scenes else runs.runs
+    finished = asked[asked["status"] == "ok"]
     if finished.empty:
         raise AwError("no finished run to show; 'aw table' lists what is there")
     first = finished.sort_values("seed").drop_duplicates(["scene", "method"])
-    names = shown_names(labels, sorted(first["method"].unique()))
+    names = shown_names(labels, sorted(asked["method"].unique()))
+    unfinished = sorted(set(names) - set(first["method"]))
+    names = {method: name for method, name in names.items() if method not in unfinished}
     owners: dict[str, list[str]] = {}
     for scene, method in zip(first["scene"].astype(str), first["method"].astype(str)):
         owners.setdefault(scene, []).append(method)
@@ -179,7 +180,8 @@ def _groups(runs: Runs, scenes: Sequence[str], labels: Sequence[str]) -> tuple[l
         raise AwError(
             f"no scene has a run of every method ({has}): give runs of one scene, or name it with --only"
         )
-    notes = [
+    notes = [f"{method} is left out: it has no finished run" for method in unfinished]
+    notes += [
         f"scene {scene} is left out: no run of {shortlist(lack)}" for scene, lack in lacking.items() if lack
     ]
     groups = []

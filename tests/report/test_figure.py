@@ -21,6 +21,7 @@ from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.report.figure import Box, RunsFigure, in_words, most_different_box, runs_figure
 from ambiguous_wild.report.figure_drawing import COLUMN, TEXT_HEIGHT, TEXT_WIDTH, fitted, write_figure
 from tests.command_line import aw
+from tests.harness.fake_runs import failed, save
 from tests.report.board_runs import change_result, own_scene, write_run
 from tests.shared import made_once
 from tests.tiny_scene import HEIGHT, WIDTH
@@ -134,6 +135,16 @@ def test_scenes_are_groups_of_rows_and_need_every_method(runs: Path) -> None:
     with pytest.raises(AwError, match=r"of every method \(porch: mine; yard: 3dgs\): give runs of one scene"):
         of(runs, "mine/porch", "3dgs/yard")
     assert of(runs, "3dgs", scenes=["yard"], masks=True).notes == ("scene yard: no method has masks",)
+
+
+def test_a_method_whose_runs_failed_is_named(runs: Path, tmp_path: Path) -> None:
+    save(tmp_path, failed("robustsplat", "porch"))
+    figure = runs_figure(read_runs(runs / "3dgs", tmp_path), labels=["robustsplat=Robust", "3dgs=3DGS"])
+    assert figure.methods == ("3DGS",) and figure.notes == (
+        "robustsplat is left out: it has no finished run",
+    )
+    with pytest.raises(AwError, match="no finished run to show"):
+        runs_figure(read_runs(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -85,11 +85,11 @@ def made_anew(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
     """Return whether an earlier run in the folder is replaced: always, or where the method's file changed."""
     if overwrite != "changed":
         return overwrite == "always"
-    keys = _different_keys(flatten(read_config(folder)), flatten(dict(config)))
+    keys = different_keys(flatten(read_config(folder)), flatten(dict(config)))
     return "source" in keys and all(key == "source" or key.startswith("options.") for key in keys)
 
 
-def _different_keys(before: Flat, now: Flat) -> list[str]:
+def different_keys(before: Flat, now: Flat) -> list[str]:
     """Return the keys that decide the result and differ, the method's file ("source") first."""
     ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
     keys = [k for k in before.keys() | now.keys() if before.get(k) != now.get(k) and k not in ignored]
@@ -209,7 +209,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     if before.get("config_hash") == cell.identity:
         return
     now = flatten(dict(cell.config))
-    keys = _different_keys(before, now)
+    keys = different_keys(before, now)
     changes = ", ".join(_describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
     how = "changed" if made_anew(folder, "changed", cell.config) else "always"
     raise AwError(

@@ -66,8 +66,8 @@ def command(
     boxes = [_crop(text) for text in crops]
     from ambiguous_wild.harness.store import read_runs
     from ambiguous_wild.io.files import check_output
-    from ambiguous_wild.report.figure import in_words, runs_figure
     from ambiguous_wild.report.figure_drawing import fitted, write_figure
+    from ambiguous_wild.report.figure_rows import in_words, runs_figure
 
     check_output(output)
     figure = runs_figure(

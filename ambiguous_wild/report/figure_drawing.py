@@ -19,7 +19,7 @@ import numpy as np
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.palette import CATEGORIES, plot_colour, ramp
 from ambiguous_wild.report.cost_plots import save_as
-from ambiguous_wild.report.figure import PHOTO, FigureRow, RunsFigure, cut
+from ambiguous_wild.report.figure_rows import PHOTO, FigureRow, RunsFigure, cut
 
 # Inches of a paper: a column of text, the width of both, and the height that leaves room for a caption.
 COLUMN, TEXT_WIDTH, TEXT_HEIGHT = 3.3, 7.0, 8.5

@@ -18,8 +18,8 @@ from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.palette import MASKED
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.report.figure import Box, RunsFigure, in_words, most_different_box, runs_figure
 from ambiguous_wild.report.figure_drawing import COLUMN, TEXT_HEIGHT, TEXT_WIDTH, fitted, write_figure
+from ambiguous_wild.report.figure_rows import Box, RunsFigure, in_words, most_different_box, runs_figure
 from tests.command_line import aw
 from tests.harness.fake_runs import failed, save
 from tests.report.board_runs import change_result, own_scene, write_run

@@ -15,6 +15,7 @@ from ambiguous_wild.cli.options import (
     PathName,
     command_line,
     json_option,
+    label_option,
     only_option,
 )
 from ambiguous_wild.core.errors import AwError
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     help="A test PSNR to reach; repeatable.  [default: 3, 1 and 0.5 dB below the best of each scene]",
 )  # fmt: skip
 @only_option
+@label_option
 @click.option(
     "--with-setup",
     is_flag=True,
@@ -50,6 +52,7 @@ def command(
     output: Path,
     targets: tuple[float, ...],
     scenes: tuple[str, ...],
+    labels: tuple[str, ...],
     with_setup: bool,
     recommended: tuple[Path, str] | None,
     as_json: bool,
@@ -70,7 +73,7 @@ def command(
     from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text, write_report
     from ambiguous_wild.report.cost_runs import read_cost_runs
 
-    cost_runs = read_cost_runs(runs, scenes=scenes)
+    cost_runs = read_cost_runs(runs, scenes=scenes, labels=labels)
     if recommended is not None:
         _recommend(cost_runs, *recommended, as_json)
         return

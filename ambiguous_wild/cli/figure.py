@@ -71,7 +71,7 @@ def command(
 
     check_output(output)
     figure = runs_figure(
-        read_runs(*runs), scenes=scenes, photos=photos, crops=boxes, labels=labels, errors=errors, masks=masks
+        read_runs(*runs, labels=labels), scenes=scenes, photos=photos, crops=boxes, errors=errors, masks=masks
     )
     if not photos:
         figure = fitted(figure, width)

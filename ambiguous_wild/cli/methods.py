@@ -90,7 +90,7 @@ def _show(one: dict[str, Any]) -> None:
     click.echo(one["about"] or one["summary"])
     click.echo()
     facts = {
-        "paper": one["paper"],
+        "paper": f"{one['paper']}, \\cite{{{one['cite']}}}" if one["cite"] else one["paper"],
         "needs": one["needs"] or "nothing beyond the core",
         **one["parts"],
         "published with": one["published_with"],

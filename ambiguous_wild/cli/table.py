@@ -17,6 +17,7 @@ from ambiguous_wild.cli.options import (
     PathName,
     command_line,
     json_option,
+    label_option,
     metric_file_option,
     only_option,
     reported_option,
@@ -35,7 +36,7 @@ SUFFIXES = {
     ".txt": "text", ".md": "markdown", ".csv": "csv", ".tex": "latex", ".html": "html", "": "text"
 }  # fmt: skip
 AUDIT_SUFFIXES = {".txt": "text", ".md": "markdown", ".csv": "csv", ".json": "json", "": "text"}
-LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
+LAYOUTS = ("blocks", "paper", "means", "ablation")
 
 
 @click.command(name="table")
@@ -46,7 +47,7 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
 @click.option(
     "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,
     help="blocks: a table per scene; paper: scenes side by side; means: datasets side by side; "
-    "memory: MB per scene; ablation: RUNS is the output of 'aw ablate'.",
+    "ablation: RUNS is the output of 'aw ablate'.",
 )  # fmt: skip
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
 @click.option(
@@ -56,6 +57,11 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
     help="Only this column; repeatable. all: every column, however wide.  [default: those that fit, in text]",
 )
 @only_option
+@label_option
+@click.option(
+    "--compare", metavar="METHOD,METHOD",
+    help="Differences of the first method to each other one, with intervals, p, wins and losses.",
+)  # fmt: skip
 @click.option(
     "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
     help="Group these scenes as dataset NAME; repeatable.  [default: as in the papers' tables]",
@@ -68,6 +74,8 @@ def table_command(
     output: Path | None,
     metrics: tuple[str, ...],
     scenes: tuple[str, ...],
+    labels: tuple[str, ...],
+    compare: str | None,
     datasets: tuple[str, ...],
     reported: Path | bool | None,
 ) -> None:
@@ -81,7 +89,8 @@ def table_command(
     aw table runs
     aw table runs runs-masked                     several folders in one table
     aw table runs --layout paper -o table.tex
-    aw table runs --layout means --reported -o means.html
+    aw table runs --label 3dgs=3DGS --label mine=Ours -o table.tex
+    aw table runs --compare mine,robustsplat      is the difference more than chance?
     aw table runs --format tidy -o results.csv    one row per method, scene, seed, image and metric
     """
     if output is not None and output.suffix.lower() not in SUFFIXES and output.exists():
@@ -92,26 +101,29 @@ def table_command(
         raise AwError("--metric all names every column: leave the other --metric out")
     metrics = () if everything else metrics
     if style == "tidy":
-        if layout != "blocks" or datasets or reported:
+        if layout != "blocks" or datasets or reported or compare:
             raise AwError(
-                "--format tidy goes with --metric, --only and -o alone: it is every number there is"
+                "--format tidy goes with --metric, --only, --label and -o alone: it is every number there is"
             )
-        _write_tidy(_read(runs), output, metrics, scenes)
+        _write_tidy(_read(runs, labels), output, metrics, scenes)
         return
+    if compare is not None and layout != "blocks":
+        raise AwError(f"--compare does not go with --layout {layout}: it is a table of its own")
     if layout in ("blocks", "ablation"):
         refused = {"--dataset": datasets, "--reported": reported}
         if layout == "ablation":
             if len(runs) > 1:
                 raise AwError("--layout ablation shows one folder, the output of 'aw ablate': give RUNS once")
-            refused |= {"--only": scenes}
+            refused |= {"--only": scenes, "--label": labels}
         for flag, value in refused.items():
             if value:
-                raise AwError(
-                    f"{flag} does not go with --layout {layout}: give --layout paper, means or memory"
-                )
-    loaded = None if layout == "ablation" else _read(runs)
+                raise AwError(f"{flag} does not go with --layout {layout}: give --layout paper or means")
+    loaded = None if layout == "ablation" else _read(runs, labels)
     named_style = None if style == "text" else style
     made_by = "command: " + command_line(style=named_style, output=None, metrics=metrics)
+    if compare is not None and loaded is not None:
+        _write_pairs(loaded, compare, style, output, metrics, scenes, made_by)
+        return
     tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported)
     blocks = layout == "blocks" and style != "html"
     width = _width(everything or (blocks and bool(metrics)), output) if style == "text" else None
@@ -130,10 +142,10 @@ def _put(text: str, summary: str, output: Path | None) -> None:
     click.echo(f"wrote {output}: {summary}", err=True)
 
 
-def _read(runs: Sequence[Path]) -> Runs:
+def _read(runs: Sequence[Path], labels: Sequence[str]) -> Runs:
     from ambiguous_wild.harness.store import read_runs
 
-    return read_runs(*runs)
+    return read_runs(*runs, labels=labels)
 
 
 def _width(everything: bool, output: Path | None) -> int | None:
@@ -157,6 +169,29 @@ def _write_tidy(loaded: Runs, output: Path | None, metrics: Sequence[str], scene
     for run in loaded.incomplete:
         click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
     _put(text, f"{len(frame)} rows", output)
+
+
+def _write_pairs(
+    loaded: Runs,
+    compare: str,
+    style: str,
+    output: Path | None,
+    metrics: Sequence[str],
+    scenes: Sequence[str],
+    made_by: str,
+) -> None:
+    from ambiguous_wild.report.pairs import compared, names_of, pair_table, pairs_csv
+    from ambiguous_wild.report.plain_formats import divided
+
+    pairs, notes = compared(loaded, names_of(compare, loaded), metrics=metrics, scenes=scenes)
+    table = pair_table(pairs, notes).with_notes(made_by)
+    width = _width(False, output) if style == "text" else None
+    if style == "csv":
+        _echo_notes([table], made_by)
+        text = pairs_csv(pairs, notes)
+    else:
+        text = _written([table] if width is None else divided(table, width), style, color=False)
+    _put(text, counted(len(pairs), "difference"), output)
 
 
 def _formatted(
@@ -220,13 +255,10 @@ def _layouts(
     numbers = read_reported(reported if isinstance(reported, Path) else None) if reported else []
     if not datasets:
         datasets = datasets_of(numbers or read_reported(), sorted(set(loaded.runs["scene"])))
-    if layout == "memory":
-        metrics = metrics or papers.MEMORY
     if layout == "means":
         tables = papers.means(loaded, metrics=metrics, scenes=scenes, datasets=datasets)
     else:
-        subject = "memory" if layout == "memory" else ""
-        tables = papers.paper(loaded, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
+        tables = papers.paper(loaded, metrics=metrics, scenes=scenes, datasets=datasets)
     return [with_reported(one, numbers) for one in tables] if numbers else tables
 
 

@@ -16,6 +16,7 @@ from ambiguous_wild.cli.options import (
     PathName,
     device_option,
     json_option,
+    label_option,
     plugin_option,
     say,
     scene_folder_option,
@@ -57,6 +58,7 @@ class HostPort(click.ParamType):
     help="Folder of the page; with --live, of the run (default then: runs).",
 )  # fmt: skip
 @scene_folder_option
+@label_option
 @click.option(
     "--max-gaussians", type=click.IntRange(4),
     help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note. With "
@@ -85,6 +87,7 @@ def view_command(
     runs: tuple[Path, ...],
     output: Path,
     scene_folder: Path | None,
+    labels: tuple[str, ...],
     max_gaussians: int | None,
     title: str | None,
     live: Path | None,
@@ -132,6 +135,7 @@ def view_command(
         scene_folder=scene_folder,
         most_gaussians=max_gaussians or MAX_GAUSSIANS,
         title=title,
+        labels=labels,
         say=say,
     )
     size = f"{page.bytes / 1e6:.1f} MB, of which models {page.models_bytes / 1e6:.1f} MB"
@@ -164,6 +168,7 @@ def view_command(
     help="Also write this GIF, 640 px wide: the whole path in four seconds.",
 )
 @scene_folder_option
+@label_option
 @plugin_option
 @threads_option
 def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: Any) -> None:

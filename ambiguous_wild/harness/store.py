@@ -7,7 +7,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.core.errors import counted, unknown
 from ambiguous_wild.harness.command_lines import length_text
+from ambiguous_wild.harness.labels import IN_FOLDER, shown_names
 from ambiguous_wild.harness.measures import MASK_LABELS, MEASURES, Metric, measure, users_metrics
 from ambiguous_wild.harness.result_file import (
     CONFIG,
@@ -43,7 +44,6 @@ TEXT_OF_RUNS = (
     "options_hash", "training", "unrecorded", "timing", "timing_reason", "timing_kernel", "hardware",
     "effects", "length", "features", "test_photos", "start", "metric_functions",
 )  # fmt: skip
-IN_FOLDER = " in "  # between a method and its folder, where several folders hold runs of it
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
 ReadConfig = dict[str, Any]
@@ -74,27 +74,44 @@ class Runs:
         device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason, timing_kernel,
         hardware, and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
+    methods: the name under which a method is shown (the column "method" everywhere) -> the method, with its
+        folder where it is of one of several; in the order of rows.
     """
 
     images: pd.DataFrame
     runs: pd.DataFrame
     missing: pd.DataFrame
     incomplete: tuple[Incomplete, ...] = ()
+    methods: dict[str, str] = field(default_factory=dict)
+
+    def method_of(self, shown: str) -> str:
+        """Return the method that is shown under a name, without its folder."""
+        return self.methods.get(shown, shown).partition(IN_FOLDER)[0]
+
+    def rows(self) -> list[str]:
+        """Return the names of the methods that have a finished or failed run, in the order of rows."""
+        present, order = set(self.runs["method"]), list(self.methods)
+        return [name for name in order if name in present] or sorted(present)
 
     def __repr__(self) -> str:
         counts = [counted(self.runs[key].nunique(), key) for key in ("method", "scene")]
         return f"Runs({counted(len(self.runs), 'run')} of {' on '.join(counts)})"
 
 
-def read_runs(*folders: Path | str) -> Runs:
+def read_runs(*folders: Path | str, labels: Sequence[str] = ()) -> Runs:
     """Read every result below folders of runs, at any depth.
 
     A run is a folder with config.yaml, metrics.json or failed.json in it. A run without a result (still
     running, or stopped) or with a damaged one is listed under `incomplete`, not dropped. If two folders have
     a method for the same scene and seed, it is called "METHOD in FOLDER".
 
+    Args:
+        folders: folders of runs, or run folders.
+        labels: names and order of methods, see `labels.shown_names`.
+
     Raises:
-        AwError: no such folder, no run in it, or two results in it for the same method, scene and seed.
+        AwError: no such folder, no run in it, two results in it for the same method, scene and seed, or a
+            wrong label.
     """
     known: set[Path] = set()  # runs of a folder given before, as one may be inside another
     read = [(Path(folder), *_read_folder(Path(folder), known)) for folder in folders]
@@ -103,11 +120,15 @@ def read_runs(*folders: Path | str) -> Runs:
     results: list[FolderResult] = []
     incomplete: list[Incomplete] = []
     for root, members, begun in read:
-        labels = {method: f"{method}{IN_FOLDER}{root}" for method in shared}
+        apart = {method: f"{method}{IN_FOLDER}{root}" for method in shared}
         for run, result in members:
-            result["method"] = labels.get(result["method"], result["method"])
+            result["method"] = apart.get(result["method"], result["method"])
             results.append((run, result))
-        incomplete += [replace(run, method=labels.get(run.method, run.method)) for run in begun]
+        incomplete += [replace(run, method=apart.get(run.method, run.method)) for run in begun]
+    shown = shown_names(labels, [*(r["method"] for _, r in results), *(run.method for run in incomplete)])
+    for _, result in results:
+        result["method"] = shown[result["method"]]
+    incomplete = [replace(run, method=shown[run.method]) for run in incomplete]
     starts: dict[str, str] = {}  # hash of a file -> its first name: the same file may have several
     for _, result in results:
         if hashed := start_hash(result["facts"]):
@@ -120,12 +141,8 @@ def read_runs(*folders: Path | str) -> Runs:
         ),
         missing=_frame(_missing_rows(results), ["scene", "method", "seed", "metric", "reason"]),
         incomplete=tuple(incomplete),
+        methods={name: method for method, name in shown.items()},
     )
-
-
-def method_of(label: str) -> str:
-    """Return the method that a row of `read_runs` is of, without the folder."""
-    return label.partition(IN_FOLDER)[0]
 
 
 def _read_folder(root: Path, known: set[Path]) -> tuple[list[FolderResult], list[Incomplete]]:

@@ -13,6 +13,7 @@ from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
+from ambiguous_wild.harness.labels import shown_names
 from ambiguous_wild.harness.result_file import CONFIG, MODEL, RESULT, check_model, metrics_of, read_result
 from ambiguous_wild.harness.store import ReadConfig, read_config, run_folders, section
 from ambiguous_wild.io.files import write_text
@@ -49,7 +50,11 @@ class SceneModels:
 
 
 def read_models(
-    paths: Sequence[Path], *, scene: str | None = None, scene_folder: Path | None = None
+    paths: Sequence[Path],
+    *,
+    scene: str | None = None,
+    scene_folder: Path | None = None,
+    labels: Sequence[str] = (),
 ) -> SceneModels:
     """Read the models of the runs below some folders and of splat files, and their scene.
 
@@ -58,18 +63,20 @@ def read_models(
         scene: name of the scene to show, if the runs are of several.
         scene_folder: where the scene lies; None = where the runs say. For splat files alone, None gives a
             scene without photos.
+        labels: names and order of methods, see `labels.shown_names`.
 
     Raises:
-        AwError: no run, no model in any, runs of several scenes, or a scene that has been moved.
+        AwError: no run, no model in any, runs of several scenes, a wrong label, or a scene that was moved.
     """
     files, notes = read_files(paths)
     folders = [path for path in paths if not path.is_file()]
     if files and not folders:
+        shown_names(labels, ())  # files have no method
         opened = scene_around(files[0]) if scene_folder is None else load_scene(scene_folder)
         if scene_folder is None:
             notes.append(f"no --scene: the cameras are on a circle around {files[0].ply.name}, y down")
         return SceneModels(opened, tuple(model.within(opened.transform) for model in files), tuple(notes))
-    trained, more = find_models(folders if files else paths)
+    trained, more = find_models(folders if files else paths, labels)
     notes += more
     names = sorted({t.scene for t in trained})
     if scene is not None:
@@ -104,10 +111,11 @@ def read_files(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
     return models, [note for _, note in read if note]
 
 
-def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
+def find_models(paths: Sequence[Path], labels: Sequence[str] = ()) -> tuple[list[TrainedModel], list[str]]:
     """Find the finished runs that have a model, in the order of their paths; write a line on each other run.
 
-    Labels distinguish runs of the same method by seed, then by folder.
+    `labels` name and order the methods, see `labels.shown_names`. The models' labels distinguish runs of the
+    same method by seed, then by folder.
 
     Raises:
         AwError: no such folder, or no run with a model in any of them.
@@ -135,6 +143,10 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
         if scene := next((path for path in paths if (path / "scene.json").exists()), None):
             why = f": {scene} is a scene, which 'aw bench --method NAME --scene {scene} -o runs' trains"
         raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
+    if labels:
+        shown = shown_names(labels, [t.model.label for t in trained])
+        trained.sort(key=lambda t: list(shown).index(t.model.label))
+        trained = [replace(t, model=replace(t.model, label=shown[t.model.label])) for t in trained]
     return _with_labels(trained), notes
 
 
@@ -247,6 +259,7 @@ def view_runs(
     scene_folder: Path | None = None,
     most_gaussians: int = MAX_GAUSSIANS,
     title: str | None = None,
+    labels: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Page:
     """Write OUTPUT/index.html with the models of runs.
@@ -258,12 +271,13 @@ def view_runs(
         scene_folder: where the scene lies; None = where the runs say.
         most_gaussians: a larger model is reduced to this number, with a note on the page.
         title: title of the page; None = the scene's name.
+        labels: names and order of methods, see `labels.shown_names`.
         say: gets a line about each step.
 
     Raises:
         AwError: no run with a model, several scenes, no scene, or another page in the folder.
     """
-    shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    shown = read_models(paths, scene=scene, scene_folder=scene_folder, labels=labels)
     check_page_folder(output)
     text, models_bytes = page_text(
         shown.scene,

@@ -65,13 +65,13 @@ class Curve:
 
 
 def curves_of(runs: Sequence[CostRun]) -> list[Curve]:
-    """Gather runs into curves, sorted by name, then from the shortest training."""
+    """Gather runs into curves, in the order of methods, then by name and from the shortest training."""
     named = grouped(zip(_names(runs), runs), lambda item: (item[0], item[1].length))
     curves = [
         Curve(name, items[0][1].method, length, tuple(run for _, run in items))
         for (name, length), items in named.items()
     ]
-    return sorted(curves, key=lambda curve: (curve.name, curve.trained_s, curve.length))
+    return sorted(curves, key=lambda curve: (curve.runs[0].place, curve.name, curve.trained_s, curve.length))
 
 
 def _names(runs: Sequence[CostRun]) -> list[str]:
@@ -85,7 +85,8 @@ def _names(runs: Sequence[CostRun]) -> list[str]:
     names = []
     for run in runs:
         effects = f"+ {run.asked}" if run.asked else "plain"
-        parts = [run.method, effects] if len(asked[run.method]) > 1 else [run.method]
+        name = run.shown or run.method
+        parts = [name, effects] if len(asked[run.method]) > 1 else [name]
         varied = (f"{key}={value}" for key, value in run.options if len(values[run.method, key]) > 1)
         names.append(" ".join([*parts, *varied]))
     return names

@@ -17,7 +17,6 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.scene import find_view
-from ambiguous_wild.harness.labels import shown_names
 from ambiguous_wild.harness.result_file import (
     RESTORE,
     RESULT,
@@ -111,7 +110,6 @@ def runs_figure(
     scenes: Sequence[str] = (),
     photos: Sequence[str] = (),
     crops: Sequence[Crop | None] = (),
-    labels: Sequence[str] = (),
     errors: bool = False,
     masks: bool = False,
 ) -> RunsFigure:
@@ -124,7 +122,6 @@ def runs_figure(
             differ most.
         crops: what is enlarged: one for every photo, or one for each of `photos`; None: nothing. Empty: the
             box of each test photo in which methods differ most.
-        labels: as `harness/labels.py` takes them.
         errors: also take error maps.
         masks: also take train photos with the masks, those where the masks differ most.
 
@@ -137,7 +134,7 @@ def runs_figure(
             f"--crop is given {len(crops)} times and --photo {len(photos)} times: give one --crop for every "
             "photo, or one after each --photo"
         )
-    groups, notes = _groups(runs, scenes, labels)
+    groups, notes = _groups(runs, scenes)
     rows: list[FigureRow] = []
     count = -(-ROWS // len(groups))
     for group in groups:
@@ -160,7 +157,7 @@ def runs_figure(
     return RunsFigure(groups[0].methods, tuple(rows), tuple(notes))
 
 
-def _groups(runs: Runs, scenes: Sequence[str], labels: Sequence[str]) -> tuple[list[_SceneRuns], list[str]]:
+def _groups(runs: Runs, scenes: Sequence[str]) -> tuple[list[_SceneRuns], list[str]]:
     """Return the runs of each scene that all methods have a finished run of, and what is left out."""
     check_names("scene", scenes, sorted(runs.runs["scene"].unique()))
     asked = runs.runs[runs.runs["scene"].isin(scenes)] if scenes else runs.runs
@@ -168,13 +165,13 @@ def _groups(runs: Runs, scenes: Sequence[str], labels: Sequence[str]) -> tuple[l
     if finished.empty:
         raise AwError("no finished run to show; 'aw table' lists what is there")
     first = finished.sort_values("seed").drop_duplicates(["scene", "method"])
-    names = shown_names(labels, sorted(asked["method"].unique()))
-    unfinished = sorted(set(names) - set(first["method"]))
-    names = {method: name for method, name in names.items() if method not in unfinished}
+    finished_methods = set(first["method"])
+    methods = tuple(method for method in runs.rows() if method in finished_methods)
+    unfinished = sorted(set(asked["method"]) - finished_methods)
     owners: dict[str, list[str]] = {}
     for scene, method in zip(first["scene"].astype(str), first["method"].astype(str)):
         owners.setdefault(scene, []).append(method)
-    lacking = {scene: sorted(set(names) - set(owners[scene])) for scene in sorted(owners)}
+    lacking = {scene: sorted(set(methods) - set(owners[scene])) for scene in sorted(owners)}
     if all(lacking.values()):
         has = "; ".join(f"{scene}: {', '.join(sorted(owners[scene]))}" for scene in lacking)
         raise AwError(
@@ -186,12 +183,12 @@ def _groups(runs: Runs, scenes: Sequence[str], labels: Sequence[str]) -> tuple[l
     ]
     groups = []
     for scene in (scene for scene, lack in lacking.items() if not lack):
-        rows = first[first["scene"] == scene].set_index("method").loc[list(names)]
+        rows = first[first["scene"] == scene].set_index("method").loc[list(methods)]
         if rows["scene_hash"].nunique() > 1:
             raise AwError(f"scene {scene!r} differs between these runs: run them again on one")
         folders = tuple(Path(str(folder)) for folder in rows["folder"])
         results = tuple(read_result(folder / RESULT) for folder in folders)
-        groups.append(_SceneRuns(open_scene(folders[0]), folders, results, tuple(names.values())))
+        groups.append(_SceneRuns(open_scene(folders[0]), folders, results, methods))
     return groups, notes
 
 

@@ -169,6 +169,7 @@ def video_runs(
     gif_width: int = 640,
     scene: str | None = None,
     scene_folder: Path | None = None,
+    labels: Sequence[str] = (),
     threads: int | None = None,
     say: Callable[[str], None] = lambda text: None,
     tick: Tick = lambda done, total: None,
@@ -186,6 +187,7 @@ def video_runs(
         gif_seconds, gif_width: length and width in px of the animation.
         scene: name of the scene to show, if the runs are of several.
         scene_folder: where the scene lies; None = where the runs say.
+        labels: names and order of methods, see `labels.shown_names`.
         threads: threads of the kernels; None = all cores.
         say: gets notes about the models.
         tick: called with (frames done, frames).
@@ -200,7 +202,7 @@ def video_runs(
     frames = round(seconds * fps)
     if frames < 2:
         raise AwError(f"{seconds:g} seconds at {fps:g} frames per second are fewer than two frames")
-    shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    shown = read_models(paths, scene=scene, scene_folder=scene_folder, labels=labels)
     for wanted in (output, *([gif] if gif else [])):
         check_output(wanted)
     for note in shown.notes:

@@ -12,9 +12,10 @@ import pandas as pd
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.labels import IN_FOLDER
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.result_file import Options
-from ambiguous_wild.harness.store import Runs, method_of, read_config, section
+from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
@@ -56,7 +57,7 @@ def notes(
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
         *_not_ranked(runs),
-        *_references(methods),
+        *_references(runs, methods),
         *_fitted(runs),
         *_unfitted(runs),
         *_missing(runs, columns),
@@ -124,8 +125,8 @@ def _not_ranked(runs: Runs) -> list[str]:
     ]
 
 
-def _references(methods: Sequence[str]) -> list[str]:
-    names = [method for method in methods if knows_truth(method_of(method))]
+def _references(runs: Runs, methods: Sequence[str]) -> list[str]:
+    names = [method for method in methods if knows_truth(runs.method_of(method))]
     return [f"references, not ranked: {shortlist(names)} (exact masks or clean photos)"] if names else []
 
 
@@ -154,13 +155,14 @@ def _unfitted(runs: Runs) -> list[str]:
 def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
     """Return the note of each method, and of each donor of a graft, with the options of its runs."""
     entries = all_methods()
+    shown = {runs.method_of(method): method for method in reversed(methods)}
     lines = []
-    for name in dict.fromkeys(member for method in methods for member in members(method_of(method))):
+    for name in dict.fromkeys(member for method in methods for member in members(runs.method_of(method))):
         if name not in entries or not entries[name].note:
             continue
-        own = runs.runs[[name in members(method_of(method)) for method in runs.runs["method"]]]
+        own = runs.runs[[name in members(runs.method_of(method)) for method in runs.runs["method"]]]
         options = [_options_of(Path(folder), name) for folder in own["folder"]]
-        lines.append(f"{name}: {entries[name].about(options)}")
+        lines.append(f"{shown.get(name, name).partition(IN_FOLDER)[0]}: {entries[name].about(options)}")
     return lines
 
 

@@ -265,7 +265,7 @@ def _limits(table: Table) -> str:
 def to_wide_csv(tables: Sequence[Table]) -> str:
     """Return CSV with one row per scene and method, for tables with the same columns; means have no scene.
 
-    Every column has the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 % bootstrap
+    Every column has the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 %
     interval over the test images of one scene, and `_tied`, "yes" if not significantly below the best. The
     last column is `note`, as in `to_long_csv`.
     """

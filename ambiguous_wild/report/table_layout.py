@@ -41,7 +41,7 @@ class TableCell:
 
     value: float = math.nan
     spread: float = math.nan  # sample deviation over seeds; NaN for one seed
-    low: float = math.nan  # 95 % bootstrap interval over the images of one scene
+    low: float = math.nan  # 95 % interval over the images of one scene
     high: float = math.nan
     rank: int | None = None  # 1, 2, 3 or None
     ranged: bool = False  # a time that cannot be compared: the range from `low` to `high` is shown
@@ -75,6 +75,7 @@ class Row:
     kind: Kind = "measured"
     note: str = ""  # the meaning of the row, if its name does not say it
     runs: int = 0  # finished runs behind it
+    cite: str = ""  # key of the paper, cited in LaTeX
     ranked: bool = True  # False: a run behind it is unfinished, or the method knows the truth
 
 
@@ -120,8 +121,7 @@ class Table:
         lines = []
         if any(cell.tie for cell in self.cells):
             lines.append(
-                f"{TIE}: not significantly different from the best (paired bootstrap over the test images, "
-                "95 %)"
+                f"{TIE}: not significantly different from the best (paired t interval over test images, 95 %)"
             )
         shown = [e for row in self.rows for c, e in zip(self.columns, row.cells) if c.measure.quality]
         if any(not math.isnan(cell.spread) for cell in shown):

@@ -80,11 +80,12 @@ def _tabular(table: Table) -> list[str]:
             lines += ["\\midrule", f"{head}{{\\emph{{reported, not measured here}}}} \\\\"]
             before = row.kind
         cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
-        lines.append(" & ".join([latex_text(row.name), *cells]) + r" \\")
+        cited = f"~\\cite{{{row.cite}}}" if row.cite else ""
+        lines.append(" & ".join([latex_text(row.name) + cited, *cells]) + r" \\")
     # these notes are printed, as they limit what a rank means; the others are comments
     below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
     if not table.title and any(cell.tie for cell in table.cells):  # a bare tabular has no caption
-        below.append(f"{TIE}: not significantly different from the best (paired bootstrap, 95 %).")
+        below.append(f"{TIE}: not significantly different from the best (paired t interval, 95 %).")
     width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
     printed = [f"{width}{{\\footnotesize {latex_text(note)}}} \\\\" for note in below]
     return [*lines, "\\bottomrule", *printed, "\\end{tabular}}"]
@@ -96,7 +97,7 @@ def _caption(table: Table) -> str:
         first, second, third = (f"\\colorbox{{{c}}}{{{rank}}}" for (c, _), rank in zip(COLORS, RANKS))
         text += f" {first}, {second} and {third} of each column."
     if any(cell.tie for cell in table.cells):
-        text += " $\\approx$: not significantly different from the best (paired bootstrap, 95\\,\\%)."
+        text += " $\\approx$: not significantly different from the best (paired t interval, 95\\,\\%)."
     if any("\u00b1" in rest for rest in table.legend):
         text += f" $\\pm$: sample standard deviation over {table.spread_over}."
     if table.contradicts:

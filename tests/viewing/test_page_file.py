@@ -116,6 +116,14 @@ def test_the_same_runs_give_the_same_bytes(runs: Path, tmp_path: Path) -> None:
     assert note.startswith(HOSTILE) and "drawn as plain 3DGS" in note
 
 
+def test_models_are_named_and_ordered_by_labels(runs: Path, tmp_path: Path) -> None:
+    assert aw("view", runs, "-o", tmp_path, "--label", "3dgs=Ours & co").returncode == 0
+    named = [model["label"] for model in facts((tmp_path / "index.html").read_text())["models"]]
+    assert named == [HOSTILE, "Ours & co"]
+    wrong = aw("view", runs, "-o", tmp_path / "w", "--label", "gone=Ours")
+    assert wrong.returncode == 2 and "unknown method 'gone'" in wrong.stderr
+
+
 def test_another_page_is_not_replaced(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text("mine")
     done = aw("view", runs, "-o", tmp_path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,8 +65,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(tmp_path_factory, "figure-runs", make)
 
 
-def of(runs: Path, *folders: str, **asked: Any) -> RunsFigure:
-    return runs_figure(read_runs(*(runs / name for name in folders or METHODS)), **asked)
+def of(runs: Path, *folders: str, labels: Sequence[str] = (), **asked: Any) -> RunsFigure:
+    return runs_figure(read_runs(*(runs / name for name in folders or METHODS), labels=labels), **asked)
 
 
 def test_photo_and_zoom_are_where_methods_differ_most(runs: Path) -> None:
@@ -139,10 +140,9 @@ def test_scenes_are_groups_of_rows_and_need_every_method(runs: Path) -> None:
 
 def test_a_method_whose_runs_failed_is_named(runs: Path, tmp_path: Path) -> None:
     save(tmp_path, failed("robustsplat", "porch"))
-    figure = runs_figure(read_runs(runs / "3dgs", tmp_path), labels=["robustsplat=Robust", "3dgs=3DGS"])
-    assert figure.methods == ("3DGS",) and figure.notes == (
-        "robustsplat is left out: it has no finished run",
-    )
+    labels = ["robustsplat=Robust", "3dgs=3DGS"]
+    figure = runs_figure(read_runs(runs / "3dgs", tmp_path, labels=labels))
+    assert figure.methods == ("3DGS",) and figure.notes == ("Robust is left out: it has no finished run",)
     with pytest.raises(AwError, match="no finished run to show"):
         runs_figure(read_runs(tmp_path))
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import (
     PathName,
@@ -20,20 +22,23 @@ from ambiguous_wild.cli.options import (
     training_options,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
+from ambiguous_wild.cli.study_file import Study, decisive, is_plan, read_study, write_study
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.benchmark import Engine, bench
 from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
+    from ambiguous_wild.harness.cell import Cell, CellReport
     from ambiguous_wild.report.suite import PreparedSuite
 
 SUITES = ("ambiguous-wild", "on-the-go", "robustnerf", "photo-tourism", "drone")
 # Settings that are given by --set, and the range of each; None: its type says all.
 RARE: dict[str, dict[str, Any]] = {
     "train": {"probes": (0, 100), "checkpoint_every_s": (0.01, math.inf), "on_nonfinite": None},
-    "engine": {"retries": (0, 1000), "memory_per_cell": (0, math.inf), "transfer_limit": (0.001, math.inf)},
-}
+    "engine": {"retries": (0, 1000), "cpus_per_cell": (1e-4, math.inf), "gpus_per_cell": (0, math.inf),
+               "memory_per_cell": (0, math.inf), "transfer": None, "transfer_limit": (0.001, math.inf)},
+}  # fmt: skip
 LONGEST_S = 366 * 24 * 3600.0
 _UNITS = {"s": 1, "sec": 1, "second": 1, "m": 60, "min": 60, "minute": 60, "h": 3600, "hour": 3600}
 
@@ -55,6 +60,7 @@ def parse_budget(text: str) -> float:
 
 
 @click.command(name="bench", cls=SectionedCommand)
+@click.argument("study", required=False, is_eager=True, type=PathName(), callback=read_study)
 @click.option(
     "--method",
     "methods",
@@ -141,7 +147,10 @@ def parse_budget(text: str) -> float:
 )
 @engine_options
 @json_option
+@click.pass_context
 def command(
+    ctx: click.Context,
+    study: Study | None,
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
     suite_name: str | None,
@@ -161,10 +170,15 @@ def command(
 
     \b
     aw bench --method 3dgs,refinesplat --scene scene -o runs
+    aw bench runs/study.yaml --seed 0 --seed 1
     aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.mask_every=8
     aw bench --method 3dgs,refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw bench --method 3dgs,robustsplat --mask refinesplat --scene scene -o runs
     aw bench --suite on-the-go --scene datasets/on-the-go -o runs
+
+    STUDY is a file with options by their names, as every command writes it into the folder of its runs
+    (study.yaml), or the config.yaml of a run, to make that run again. An option that is given replaces the
+    file's, --set adds to its settings.
 
     A run is one method on one scene with one seed. --jobs 4 trains four runs at a time, --engine ray as many
     as a cluster has room for.
@@ -179,11 +193,23 @@ def command(
       train.checkpoint_every_s=60  seconds between checkpoints
       train.on_nonfinite=stop      at a NaN; rollback: leave that photo out
       engine.retries=3             of a run whose process or node was lost
+      engine.cpus_per_cell=1       with Ray: CPUs per run, also its threads; --threads if it is given
+      engine.gpus_per_cell=1       with Ray on cuda: GPUs per run; with 0.5 two runs share one
       engine.memory_per_cell=GB    with Ray: memory per run
+      engine.transfer=store        with Ray: send scenes and runs; shared: both on shared storage
       engine.transfer_limit=4000   with Ray: MB of the largest scene or run
     """
     if iterations is not None and budgets:
-        raise AwError("--iterations and --budget exclude each other: a run is as long as one of them says")
+        typed = {name for name in ("iterations", "budgets") if _typed_in(ctx, name)}
+        if study is None or len(typed) != 1:
+            raise AwError(
+                "--iterations and --budget exclude each other: a run is as long as one of them says"
+            )
+        iterations, budgets = (iterations, ()) if "iterations" in typed else (None, budgets)
+    if study is not None:
+        study.check_method(bool(given["plugins"]) or _typed_in(ctx, "methods"))
+        settings = (*study.settings, *settings) if _typed_in(ctx, "settings") else settings
+    recorded = {**ctx.params, "iterations": iterations, "budgets": budgets, "settings": settings}
     seconds = [parse_budget(budget) for budget in budgets]
     prepared = None
     if suite_name is not None:
@@ -217,13 +243,50 @@ def command(
         train=train,  # type: ignore[arg-type]
         protocol=protocol,  # type: ignore[arg-type]
         engine=Engine(**engine, **rare["engine"]),
-        callbacks=ProgressBar(),
+        callbacks=_Recorded(ctx, recorded, study, output),
         **given,
     )
     if prepared is not None and not as_json:
         for folder in report.folders:
             _print_tables(prepared, folder)
     finish(report, as_json)
+
+
+def _typed_in(ctx: click.Context, name: str) -> bool:
+    """Whether the parameter stands on the command line; it is not a study's, nor a default."""
+    return ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
+
+
+class _Recorded(ProgressBar):
+    """Also writes the options of the command beside its runs, when the first run begins."""
+
+    def __init__(
+        self, ctx: click.Context, values: Mapping[str, Any], study: Study | None, output: Path
+    ) -> None:
+        super().__init__()
+        self.ctx, self.values, self.study, self.output = ctx, values, study, output
+        self.written = False
+
+    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
+        super().planned(cells, one_by_one)
+        if self.study is not None:
+            self.study.report_changes(cells)
+            if not self.study.run and not any(_typed_in(self.ctx, name) for name in decisive(self.ctx)):
+                self.study.report_others(cells, self.output)
+
+    def started(self, cell: Cell, folder: Path) -> None:
+        self._write()
+        super().started(cell, folder)
+
+    def ended(self, cell: Cell, report: CellReport) -> None:
+        self._write()  # with Ray nothing tells that a run begins
+        super().ended(cell, report)
+
+    def _write(self) -> None:
+        if not self.written:
+            self.written = True
+            if path := write_study(self.ctx, self.values, self.output):
+                say(f"wrote {path}: 'aw bench {shlex.quote(str(path))}' makes these runs again")
 
 
 def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], list[str]]:
@@ -268,7 +331,7 @@ def plan_among(effects: Sequence[str]) -> tuple[list[str], Path | None]:
     Raises:
         AwError: two plans, or a plan and "auto".
     """
-    plans = [text for text in effects if Path(text).suffix or len(Path(text).parts) > 1]
+    plans = [text for text in effects if is_plan(text)]
     if plans and (len(plans) > 1 or "auto" in effects):
         raise AwError(f"--effects {plans[0]} is a plan, and auto or another plan stands beside it: give one")
     wanted = ["auto" if text in plans else text for text in effects]

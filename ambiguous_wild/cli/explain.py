@@ -41,6 +41,7 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     \b
     aw explain runs/scene/refinesplat/seed0 IMG_0012.jpg 120 64
     """
+    from ambiguous_wild.core.scene import find_view
     from ambiguous_wild.harness.evaluate import explained_keep
     from ambiguous_wild.harness.replay import open_run
     from ambiguous_wild.harness.store import read_config
@@ -48,13 +49,11 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     prepare_cpu(None)
     trainer, method = open_run(run), read_config(run).get("method")
     names = [view.name for view in trainer.data.scene.train]
-    found = [names.index(photo)] if photo in names else []
-    found = found or [k for k, name in enumerate(names) if photo in (Path(name).name, Path(name).stem)]
-    if not found:
+    view = find_view(trainer.data.scene.train, photo)
+    if view is None:
         raise unknown("train photo", photo, names)
-    if len(found) > 1:
-        raise AwError(f"{photo} names several photos: {', '.join(names[k] for k in found)}; name one in full")
-    step = trainer.make_step(max(trainer.iteration, 1), found[0], downsampling=1)
+    index = names.index(view.name)
+    step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
     height, width = step.photo.shape[:2]
     if column >= width or row >= height:
         raise AwError(f"{photo} is trained at {width} x {height}: there is no pixel {column}, {row}")
@@ -64,7 +63,7 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     if keep is None:
         sentence = f"kept: {method} masks nothing in this photo, or had not begun to"
     say(sentence or f"{'kept' if kept else 'masked'} by {method}, which gives no reasons")
-    say(f"  {names[found[0]]}, column {column}, row {row}")
+    say(f"  {view.name}, column {column}, row {row}")
     if keep is not None:
         for line in trainer.hooks.mask.explain(step, column, row):
             say(f"  {line}")

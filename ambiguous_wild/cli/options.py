@@ -249,12 +249,6 @@ engine_options = _all(  # fields of `Engine`
                  help="Runs at a time on this machine; they share cores.  [default: 1; on cuda one per GPU]"),
     click.option("--address",
                  help="Ray: auto, HOST:PORT, ray://HOST:10001.  [default: $RAY_ADDRESS, else this machine]"),
-    click.option("--cpus-per-cell", type=FiniteFloat(min=0, min_open=True),
-                 help="Ray: CPUs per run, also its threads.  [default: --threads, else 1]"),
-    click.option("--gpus-per-cell", type=FiniteFloat(min=0),
-                 help="Ray: GPUs per run; with 0.5 two runs share one.  [default: 1 on cuda]"),
-    click.option("--transfer", type=click.Choice(["shared", "store"]), default="shared", show_default=True,
-                 help="Ray: shared: -o and scenes are on shared storage; store: they are sent through Ray."),
 )  # fmt: skip
 
 
@@ -319,7 +313,8 @@ def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = 
     suffix = output.suffix.lower() if output is not None else ""
     if suffix not in suffixes:
         known = ", ".join(s for s in suffixes if s)
-        raise AwError(f"-o {output}: no format is known for {suffix}: end the name in {known}{otherwise}")
+        why = f"no format is known for {suffix}: " if suffix else ""
+        raise AwError(f"-o {output}: {why}end the name in {known}{otherwise}")
     return suffixes[suffix]
 
 

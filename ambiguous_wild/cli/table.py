@@ -38,7 +38,6 @@ SUFFIXES = {
     ".txt": "text", ".md": "markdown", ".csv": "csv", ".tex": "latex", ".html": "html", "": "text"
 }  # fmt: skip
 AUDIT_SUFFIXES = {".txt": "text", ".md": "markdown", ".csv": "csv", ".json": "json", "": "text"}
-SHEETS = (".png", ".jpg")
 LAYOUTS = ("blocks", "paper", "means", "ablation")
 
 
@@ -73,11 +72,6 @@ LAYOUTS = ("blocks", "paper", "means", "ablation")
     help="Group these scenes as dataset NAME; repeatable.  [default: as in the papers' tables]",
 )  # fmt: skip
 @reported_option("those of the package")
-@click.option(
-    "--sheet",
-    type=PathName(dir_okay=False),
-    help="Also write this PNG or JPG: test renders side by side, and what each method masks.",
-)
 def table_command(
     runs: tuple[Path, ...],
     style: str | None,
@@ -89,7 +83,6 @@ def table_command(
     compare: str | None,
     datasets: tuple[str, ...],
     reported: Path | bool | None,
-    sheet: Path | None,
 ) -> None:
     """Compare the runs below the folders RUNS: quality, cost and masks, method by method.
 
@@ -112,10 +105,8 @@ def table_command(
     if everything and len(metrics) > 1:
         raise AwError("--metric all names every column: leave the other --metric out")
     metrics = () if everything else metrics
-    if sheet is not None and sheet.suffix.lower() not in SHEETS:
-        raise AwError(f"--sheet {sheet}: it is a picture, give a name that ends in .png or .jpg")
     if style == "tidy":
-        if layout != "blocks" or datasets or reported or sheet or compare:
+        if layout != "blocks" or datasets or reported or compare:
             raise AwError(
                 "--format tidy goes with --metric, --only, --label and -o alone: it is every number there is"
             )
@@ -128,18 +119,13 @@ def table_command(
         if layout == "ablation":
             if len(runs) > 1:
                 raise AwError("--layout ablation shows one folder, the output of 'aw ablate': give RUNS once")
-            refused |= {"--only": scenes, "--label": labels, "--sheet": sheet}
+            refused |= {"--only": scenes, "--label": labels}
         for flag, value in refused.items():
             if value:
                 raise AwError(f"{flag} does not go with --layout {layout}: give --layout paper or means")
     loaded = None if layout == "ablation" else _read(runs, labels)
-    if sheet is not None and loaded is not None:
-        from ambiguous_wild.harness.sheets import write_sheet
-
-        shown = write_sheet(loaded, sheet, scene=scenes[0] if scenes else None)
-        say(f"wrote {sheet}: {shown} methods side by side")
     named_style = None if style == "text" else style
-    made_by = "command: " + command_line(style=named_style, output=None, sheet=None, metrics=metrics)
+    made_by = "command: " + command_line(style=named_style, output=None, metrics=metrics)
     if compare is not None and loaded is not None:
         _write_pairs(loaded, compare, style, output, metrics, scenes, made_by)
         return

@@ -90,7 +90,8 @@ def command(
     _train(methods, scene, runs, plan, output / "view", seconds - (time.monotonic() - begin), threads)
     step("view", runs, "-o", output / "view")
     if "," in methods:
-        step("table", runs, "--sheet", output / "comparison.png")
+        step("table", runs)
+        step("figure", runs, "-o", output / "comparison.png", "--with-masks")
     say("")
     say(f"{_minutes(time.monotonic() - begin)}. What you have now, and what you can do with it:")
     for line in next_steps(source, output, seconds, runs):

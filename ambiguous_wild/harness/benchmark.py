@@ -305,12 +305,11 @@ def find_methods(
 ) -> dict[str, MethodEntry]:
     """Return the methods, with the parts they take, by the name that finds them again in another process.
 
-    A misspelt name is an error before torch is imported. "a,b" are two methods, except in a graft with two
-    places (a@mask=b,density=c) and in the name of a file that exists.
+    A misspelt name is an error before torch is imported.
     """
     from ambiguous_wild.methods.entry import second_pass_name, trained_once
     from ambiguous_wild.methods.graft import graft_name
-    from ambiguous_wild.methods.references import MASKS, reference_file
+    from ambiguous_wild.methods.references import MASKS
     from ambiguous_wild.methods.registry import get_method, load_plugin
 
     for plugin in plugins:
@@ -319,14 +318,25 @@ def find_methods(
     if (mask := donors.get("mask")) and Path(mask).is_dir():
         donors["mask"] = MASKS + mask
     names = []
-    for text in methods:
-        file = reference_file(text)
-        is_file = file is not None and file.exists()
-        for name in [text] if is_file else [part.strip() for part in _BETWEEN_METHODS.split(text)]:
-            once = trained_once(name)
-            names.append(second_pass_name(graft_name(once, donors), passes if once == name else 2))
+    for name in (one for text in methods for one in split_methods(text)):
+        once = trained_once(name)
+        names.append(second_pass_name(graft_name(once, donors), passes if once == name else 2))
     entries = [(name, get_method(name)) for name in names]
     return {name if entry.given_as else entry.name: entry for name, entry in entries}
+
+
+def split_methods(text: str, folder: Path = Path()) -> list[str]:
+    """Return the methods in a text: "a,b" are two, except in a graft with two places (a@mask=b,density=c).
+
+    Args:
+        text: names with commas, or a reference whose file exists and has a comma in its name.
+        folder: the folder that paths in the text are relative to.
+    """
+    from ambiguous_wild.methods.references import reference_file
+
+    file = reference_file(text)
+    is_file = file is not None and (folder / file).exists()
+    return [text] if is_file else [part.strip() for part in _BETWEEN_METHODS.split(text)]
 
 
 def _check_effects(

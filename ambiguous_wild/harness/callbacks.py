@@ -16,9 +16,11 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.trainer import Trainer
 
 _RAY_ONLY = {  # field -> option
-    "address": "--address", "cpus_per_cell": "--cpus-per-cell", "gpus_per_cell": "--gpus-per-cell",
+    "address": "--address",
+    "cpus_per_cell": "--set engine.cpus_per_cell",
+    "gpus_per_cell": "--set engine.gpus_per_cell",
     "memory_per_cell": "--set engine.memory_per_cell",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Engine:
         stray = [option for name, option in _RAY_ONLY.items() if getattr(self, name) is not None]
         if self.engine == "local" and (stray or self.transfer != "shared"):
             raise AwError(
-                f"{', '.join(stray) or '--transfer'} is for a cluster: add --engine ray, or leave it out"
+                f"{', '.join(stray) or '--set engine.transfer'} is for a cluster: add --engine ray, or leave "
+                "it out"
             )
         if self.engine == "ray":
             if importlib.util.find_spec("ray") is None:

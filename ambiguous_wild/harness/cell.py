@@ -333,7 +333,7 @@ def reproduce(cell: Cell) -> str:
         ("--corrections", cell.corrections and cell.corrections.path),
         ("--max-gaussians", train.max_gaussians),
         ("--protocol", None if cell.protocol == scene_protocol(cell.scene) else cell.protocol),
-        *(("--set", setting) for setting in _settings(method, name, cell.options)),
+        *(("--set", setting) for setting in changed_settings(method, name, cell.options)),
         *(("--plugin", plugin) for plugin in _plugins(method)),
     ]
     scene, length = str(cell.scene.root.resolve()), length_options(train.iterations, train.budget_s)
@@ -351,8 +351,14 @@ def _base(method: MethodEntry) -> MethodEntry:
     return next(same, method)
 
 
-def _settings(method: MethodEntry, name: str, options: Any) -> list[str]:
-    """Return METHOD.KEY=VALUE for every option that is not at its default."""
+def changed_settings(method: MethodEntry, name: str, options: Any) -> list[str]:
+    """Return METHOD.KEY=VALUE for every option that is not at its default.
+
+    Args:
+        method: the method, which has the defaults.
+        name: how settings name it.
+        options: its options, as their dataclass or as plain values.
+    """
     now, default = flatten(to_plain(options)), flatten(to_plain(method.options()))
     changed = {key: value for key, value in now.items() if default.get(key, ...) != value}
     settings = []

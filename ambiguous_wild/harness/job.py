@@ -167,7 +167,7 @@ def check_storage(job: Job, wait_s: float = 30.0) -> None:
         if time.monotonic() > deadline:
             raise AwError(
                 f"this node cannot see {Path(job.token).parent}: give -o a folder on storage that all "
-                "nodes share, or send scenes and results with --transfer store"
+                "nodes share, or send scenes and results with --set engine.transfer=store"
             )
         time.sleep(1.0)
 

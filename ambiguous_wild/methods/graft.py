@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.methods.entry import MethodEntry, trained_once
-from ambiguous_wild.methods.references import is_program, is_reference, reference_file
+from ambiguous_wild.methods.references import is_program, is_reference, reference_file, with_file
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.graft_checks import Member
@@ -57,6 +58,19 @@ def split_graft(name: str) -> tuple[str, str]:
         first = host.partition("@")[0]
         raise AwError(f"method {name!r}: write {first}@mask=METHOD,density=METHOD, with one @")
     return host, rest
+
+
+def with_files(name: str, moved: Callable[[Path], Path]) -> str:
+    """Return the name of a method with other paths of the files that it, or its donors, are recipes in."""
+    once = trained_once(name)
+    if is_reference(once):
+        file = reference_file(once)
+        return name if file is None else with_file(once, moved(file)) + name.removeprefix(once)
+    host, rest = split_graft(once)
+    if not rest:
+        return name
+    donors = {slot: with_files(donor, moved) for slot, donor in graft_pairs(once)}
+    return graft_name(with_files(host, moved), donors) + name.removeprefix(once)
 
 
 def refuse_parts_of_program(name: str) -> None:

@@ -23,6 +23,12 @@ GREY = "0.45"
 PANEL = (4.6, 3.4)  # inches
 DPI = 130
 MAX_COLUMNS = 3
+# Metadata by suffix: no dates, no versions.
+UNDATED: dict[str, dict[str, None]] = {
+    ".svg": {"Date": None, "Creator": None},
+    ".png": {"Software": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
 AXES = (
     ("minutes", "training time", True),
     ("model_mb", "model size (MB)", True),
@@ -54,14 +60,21 @@ def new_figure(
 
 def save(figure: Any, stem: Path) -> list[Path]:
     """Write STEM.svg and STEM.png; equal figures give equal bytes."""
+    paths = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
+    for path in paths:
+        save_as(figure, path)
+    return paths
+
+
+def save_as(figure: Any, path: Path) -> None:
+    """Write a figure as PDF, PNG or SVG, by the suffix; equal figures give equal bytes.
+
+    A PDF embeds its fonts as TrueType (type 42), which publishers ask for; in an SVG letters are outlines.
+    """
     import matplotlib
 
-    paths = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
-    with matplotlib.rc_context({"svg.hashsalt": "aw"}):
-        for path, metadata in zip(paths, ({"Date": None, "Creator": None}, {"Software": None})):
-            with atomic_path(path) as temporary:
-                figure.savefig(temporary, metadata=metadata)
-    return paths
+    with matplotlib.rc_context({"svg.hashsalt": "aw", "pdf.fonttype": 42}), atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata=UNDATED[path.suffix.lower()])
 
 
 class LineStyle(TypedDict):

@@ -9,4 +9,4 @@ ip=$(srun --nodes=1 --ntasks=1 --overlap -w "$head" hostname --ip-address | awk 
 srun --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES" \
     ray symmetric-run --address "$ip:6379" --min-nodes "$SLURM_JOB_NUM_NODES" -- \
     aw bench --method 3dgs --scene /shared/scene \
-        -o /shared/runs --engine ray --address "$ip:6379" --device cuda --cpus-per-cell 8
+        -o /shared/runs --engine ray --address "$ip:6379" --device cuda --set engine.cpus_per_cell=8

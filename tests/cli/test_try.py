@@ -24,7 +24,7 @@ def test_photos_become_a_table_and_a_page(tmp_path: Path) -> None:
     words = ("try", raw, "-o", out, "--budget", "20s", "--threads", "1")
     done = aw(*words)
     assert done.returncode == 0, done.stderr
-    wanted = ["screen", "build-scene", "plan", "bench", "view", "table"]
+    wanted = ["screen", "build-scene", "plan", "bench", "view", "table", "figure"]
     assert _commands(done.stderr) == wanted
     assert (out / "view/index.html").is_file() and (out / "comparison.png").is_file()
     assert "3dgs" in done.stdout and "refinesplat" in done.stdout

@@ -171,7 +171,7 @@ def test_what_differs_where_it_runs_is_refused(cell, tmp_path):
     changed = [replace(s, content=s.content + b"\nenvironment: {A: b}\n") for s in job.sources]
     registry.registered.clear()
     assert "would be another run" in jobs.run_job(replace(job, sources=tuple(changed))).error
-    with pytest.raises(AwError, match=r"cannot see .*--transfer store"):
+    with pytest.raises(AwError, match=r"cannot see .*--set engine.transfer=store"):
         jobs.check_storage(replace(job, token=str(tmp_path / "absent")), wait_s=0.0)
 
 
@@ -209,8 +209,9 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     ("words", "message"),
     [
         (["--address", "auto"], "--address is for a cluster: add --engine ray"),
-        (["--gpus-per-cell", "1", "--cpus-per-cell", "2"], "--cpus-per-cell, --gpus-per-cell is for"),
-        (["--transfer", "store"], "--transfer is for a cluster"),
+        (["--set", "engine.gpus_per_cell=1", "--set", "engine.cpus_per_cell=2"],
+         "--set engine.cpus_per_cell, --set engine.gpus_per_cell is for"),
+        (["--set", "engine.transfer=store"], "--set engine.transfer is for a cluster"),
         (["--jobs", "0"], "--jobs"),
         (["--set", "engine.retries=-1"], "setting retries is at least 0"),
         (["--set", "engine.memory_per_cell=4"], "--set engine.memory_per_cell is for a cluster"),

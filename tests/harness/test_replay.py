@@ -163,7 +163,7 @@ def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
 def test_what_cannot_be_explained_is_named(masked, words, message):
     photo = sorted((masked / "masks").rglob("*.png"))[0].stem
     done = CliRunner().invoke(cli, ["explain", str(masked), *(word.format(photo=photo) for word in words)])
-    assert done.exception is not None and message in str(done.exception)
+    assert done.exit_code != 0 and message in f"{done.exception} {' '.join(done.output.split())}"
     with pytest.raises(AwError, match="is no run of 'aw bench'"):
         open_run(masked.parent)
 

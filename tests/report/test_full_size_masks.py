@@ -11,9 +11,9 @@ from PIL import Image
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.harness.grid import plan_cells, run_cells
-from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import read_gray, read_png_rgb, upright
-from ambiguous_wild.io.mask_files import MASK_STYLES
+from ambiguous_wild.io.images import orientation, read_gray, read_mask, read_png_rgb, upright
+from ambiguous_wild.io.mask_files import MASK_STYLES, OWN_STYLE
+from ambiguous_wild.io.original_photos import OriginalPhoto
 from ambiguous_wild.report import full_size_masks, inpainting
 from ambiguous_wild.report.full_size_masks import full_size, masks_of_run, write_full_size_masks
 from ambiguous_wild.report.inpainting import Inpainting
@@ -89,24 +89,25 @@ def test_a_mask_follows_the_edge_of_the_photo(monkeypatch):
     assert np.array_equal(~full_size(keep, photo, None), along)  # the strips leave no seams
 
 
-def test_a_photo_that_lies_on_its_side_gets_a_mask_that_does_too(case, tmp_path):
-    upright_mask = tmp_path / "upright"
-    write_full_size_masks(case / "runs", upright_mask)
-    path = case / "raw/train/p05.jpg"
+@pytest.mark.parametrize("turn", range(1, 9))
+def test_masks_and_photos_are_written_as_the_file_is_turned(turn, tmp_path):
+    shown = np.zeros((60, 80, 3), np.uint8)
+    shown[:20, :30] = 255
     exif = Image.Exif()
-    exif[0x0112] = 6  # shown turned by 90 degrees to the right
-    Image.fromarray(np.rot90(read_png_rgb(path))).save(path, quality=100, subsampling=0, exif=exif)
-    record = json.loads((case / "scene/scene.json").read_text())
-    for photo in record["inputs"]["photos"]:
-        if photo[0] == "train/p05.jpg":
-            photo[3] = sha256_file(path)
-    record["photos"]["p05.png"]["sha256"] = sha256_file(path)
-    (case / "scene/scene.json").write_text(json.dumps(record))
-    write_full_size_masks(case / "runs", tmp_path / "masks")
-    with Image.open(tmp_path / "masks/train/p05.png") as mask:
-        assert mask.size == (HEIGHT, WIDTH) and mask.getexif()[0x0112] == 6
-        turned = upright(np.asarray(mask), 6)
-    assert iou(turned == 0, read_gray(upright_mask / "train/p05.png") == 0) > 0.98
+    exif[0x0112] = turn
+    stored = upright(shown, {6: 8, 8: 6}.get(turn, turn))
+    Image.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "a.jpg", quality=95, exif=exif)
+    photo = OriginalPhoto("a.jpg", "")
+    opened = full_size_masks._CapturePhotos(tmp_path, ()).open(photo)
+    assert opened.pixels.shape == shown.shape
+    full_size_masks._write_mask(tmp_path / "a.png", opened, opened.pixels[..., 0] < 128, OWN_STYLE)
+    mask = read_mask(tmp_path / "a.png")
+    assert mask.shape == stored.shape[:2] and orientation(tmp_path / "a.png") == turn
+    wrong = (upright(mask, turn) == 0) != (shown[..., 0] == 255)
+    assert wrong.mean() < 0.01
+    full_size_masks._write_photo(tmp_path / "clean", tmp_path / "a.jpg", photo, opened, opened.pixels)
+    assert orientation(tmp_path / "clean/a.jpg") == turn
+    assert np.abs(read_png_rgb(tmp_path / "clean/a.jpg").astype(int) - stored).mean() < 2
 
 
 def test_the_render_takes_the_place_of_what_is_masked(made, tmp_path, monkeypatch):

@@ -244,6 +244,8 @@ def _reading(runs: Runs, pairs: Sequence[MethodPair], scenes: int) -> Iterator[s
         yield "one scene says nothing of other scenes: no p, and no interval over scenes"
     counted_unit = "scenes" if scenes > 1 else "test images"
     yield f"w/t/l: {counted_unit} on which {first} is better, equal as printed, and worse"
+    if any(pair.state != "ok" for pair in pairs):
+        yield "not compared: results are missing, failed or measured otherwise (below); --only chooses scenes"
     seeds = runs.runs.groupby(["method", "scene"])["seed"].nunique().groupby("method").min()
     if alone := [name for name in runs.rows() if seeds[name] < 2]:
         yield f"one seed of {shortlist(alone)}: the interval over images takes its training as it is"

@@ -95,6 +95,7 @@ def test_what_is_missing_or_measured_differently_is_not_compared(tmp_path: Path)
     runs = read_runs(save(tmp_path / "lost", *lost, failed("robustsplat", "s2", 1)))
     pairs, notes = compared(runs, ["mine", "3dgs", "robustsplat"], metrics=["psnr"])
     assert [pair.state for pair in pairs] == ["missing", "failed"]
+    assert any("--only chooses scenes" in note for note in notes)
     assert any("no result: 3dgs on s1" in n for n in notes) and any("failed: robustsplat" in n for n in notes)
     other = fake_result("3dgs", "s0", psnr=(20.0,) * 5)
     runs = read_runs(save(tmp_path / "other", *[r for r in many(1) if r["method"] != "3dgs"], other))

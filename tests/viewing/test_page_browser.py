@@ -260,7 +260,7 @@ def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
     place = "camera.position.set(...[1, 2, 3].map((x, i) => x + DATA.middle[i] - 4 * (i === 2)))"
     browser.run(f"home(), {place}, controls.update(), choose({{ mode: 'cut', right: PHOTO, masks: false }})")
     eye = facts(browser, "camera.position.toArray()")
-    write("training: 2 iterations", 0.2)
+    write("training: 2 iterations", 1000)
     browser.run("state.path = []")
     loaded = "typeof DATA === 'object' && Boolean(controls) && DATA.training === "
     browser.until(f"{loaded}'training: 2 iterations'")
@@ -273,6 +273,7 @@ def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
     ]
     assert np.allclose(facts(browser, "camera.position.toArray()"), eye, atol=1e-3)
     write("", 0)  # the last page
+    browser.run("DATA.reload_s = 0.2")
     browser.until(f"{loaded}''")
     settle(browser)
     assert browser.run("state.mode") == "cut" and browser.run("$('training').offsetHeight") == 0

@@ -167,10 +167,8 @@ def test_masks_are_corrected_by_hand(masked: Browser, removed: Path) -> None:
     # they are drawn, and survive a reload
     caption = "$('photo').querySelector('figcaption').textContent"
     assert "orange: masked by hand" in masked.run(caption)
-    masked.run("location.reload()")
-    masked.until(
-        "document.readyState === 'complete' && typeof corrections === 'object' && corrections.size === 1"
-    )
+    masked.run("window.before = 1; location.reload()")
+    masked.until("!window.before && typeof corrections === 'object' && corrections.size === 1")
     settle(masked)
     assert (corrections(masked)[TRAIN[1]] == both).all() and masked.run("unsaved()")
     press(masked, spot(masked, 50.5 / WIDTH, 10.5 / HEIGHT))

@@ -34,6 +34,9 @@ FRAMES = 60  # taken from a video
 SCENE_S = (3.0, 1.2)
 AFTER_S = (6.0, 0.3)  # measuring, masks and the page, for each method; and for each photo
 SHORTEST_S = 30.0  # of training, for each method
+# An iteration of refinesplat under a budget, in iterations of 3dgs with this many Gaussians for each pixel
+OF_3DGS, GAUSSIANS = 1.3, 0.4
+GOOD, SHARP = 3000, 10_000  # iterations from which most of a scene is clear, and fine texture is
 # A run is continued if the new budget is at least this much larger, else it is finished or kept.
 LARGER = 1.3
 
@@ -137,7 +140,8 @@ def _train(
     if before is not None and budget_s < LARGER * before:
         budget_s = before
     camera = opened.train[0].camera
-    say(_bought(budget_s, len(opened.train), camera.width * camera.height))
+    say("")
+    say(_bought(budget_s, camera.width * camera.height))
     words = ["bench", "--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
     print_command(*words, "--effects", plan, "--overwrite", "longer", "-o", runs)
     growing = GrowingPage(page, runs)
@@ -200,8 +204,19 @@ def _minutes(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
-def _bought(budget_s: float, photos: int, pixels: int) -> str:
-    """Return what a budget buys on this machine."""
+def _bought(budget_s: float, pixels: int) -> str:
+    """Return what a budget buys on this machine, and which one would give a sharp splat."""
     from ambiguous_wild.harness.timing import expected_s, slowness
 
-    return f"{budget_s:.0f} s {photos} {pixels} {expected_s(1, pixels, pixels) * slowness()}"
+    one_s = OF_3DGS * expected_s(1, pixels, round(GAUSSIANS * pixels)) * slowness()
+    iterations = budget_s / one_s
+    text = f"{_minutes(budget_s)} of training: about {_rounded(iterations)} iterations here"
+    if iterations >= SHARP:
+        return f"{text}, which gives a sharp splat"
+    grade = "a sketch" if iterations < GOOD else "a soft splat"
+    enough = SHARP * one_s / 60 + 2
+    return f"{text}, which gives {grade}; --budget {5 * -(-enough // 5):.0f}m gives a sharp one"
+
+
+def _rounded(count: float) -> str:
+    return f"{round(count, -2 if count >= 1000 else -1):,.0f}"

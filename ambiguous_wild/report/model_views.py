@@ -14,10 +14,12 @@ from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.harness.benchmark import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
+from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.evaluate import keep_maps
 from ambiguous_wild.harness.trained_models import (
     find_models,
     open_scene,
+    page_title,
     read_files,
     read_models,
     training_model,
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
 FOLDER = "export"  # in a run folder
 FIRST_PAGE_S = 10.0  # of training until the first page of a run that is trained
 LONGEST_PAUSE_S = 60.0  # of training between two pages
+GAUSSIANS_WHILE_TRAINING = 60_000  # of a model in such a page, which is to be written within a second or two
 
 
 def export_runs(
@@ -322,7 +325,15 @@ class GrowingPage:
         models = [training_model(self._trainer, self._label, masks)]
         with suppress(AwError):  # no run has ended yet
             models = [t.model for t in find_models([self.runs])[0] if t.model.label != self._label] + models
-        text, _ = page_text(scene, models, title=scene.name, training=state, reload_s=reload_s)
+        text, _ = page_text(
+            scene,
+            models,
+            title=page_title(scene),
+            mixed=mixed_tests(scene),
+            most_gaussians=GAUSSIANS_WHILE_TRAINING,
+            training=state,
+            reload_s=reload_s,
+        )
         write_text(self.folder / PAGE, text)
         self._cost_s = time.monotonic() - begin
 

@@ -1,0 +1,52 @@
+"""The page of a run that is trained: written on the way, and once more where the run is stopped."""
+
+from __future__ import annotations
+
+import json
+import re
+
+from ambiguous_wild import bench
+from ambiguous_wild.harness.callbacks import Callbacks
+from ambiguous_wild.report import model_views
+from ambiguous_wild.report.model_views import GrowingPage
+
+
+class Pages(Callbacks):
+    """Keeps every page that is written."""
+
+    def __init__(self, page):
+        self.page, self.written = page, []
+
+    def started(self, cell, folder):
+        self.page.begin(cell.method.name)
+
+    def tick(self, trainer):
+        if self.page.tick(trainer):
+            self.written.append((trainer.iteration, data_of(self.page)))
+
+
+def data_of(page):
+    text = (page.folder / "index.html").read_text()
+    return json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.S)[1])
+
+
+def test_a_page_grows_with_its_run_and_shows_those_that_ended(scene, finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(model_views, "FIRST_PAGE_S", 0.0)
+    monkeypatch.setattr(model_views, "LONGEST_PAUSE_S", 0.0)
+    pages = Pages(GrowingPage(tmp_path / "view", finished))
+    words = {"output": tmp_path / "runs", "effects": "none", "device": "cpu", "threads": 1, "pictures": False}
+    bench("refinesplat", scene, iterations=5, callbacks=pages, **words)
+    assert [iteration for iteration, _ in pages.written] == [1, 2, 3, 4]  # the last is that of the result
+    for iteration, data in pages.written:
+        assert [model["label"] for model in data["models"]] == ["3dgs", "refinesplat"]
+        assert data["training"].startswith(f"{iteration} iterations in ")
+        assert data["reload_s"] > 0
+    assert pages.page.end()
+    data = data_of(pages.page)
+    assert data["training"].startswith("stopped: 5 iterations") and data["reload_s"] == 0
+
+
+def test_no_page_is_written_of_a_run_that_has_not_begun(tmp_path):
+    page = GrowingPage(tmp_path / "view", tmp_path / "runs")
+    page.begin("refinesplat")
+    assert not page.end() and not (tmp_path / "view").exists()

@@ -40,7 +40,7 @@ def test_a_page_grows_with_its_run_and_shows_those_that_ended(scene, finished, t
     for iteration, data in pages.written:
         assert [model["label"] for model in data["models"]] == ["3dgs", "refinesplat"]
         assert data["training"].startswith(f"{iteration} iterations in ")
-        assert data["reload_s"] > 0
+        assert data["reload_s"] > 0 or iteration == 1  # when the time to write a page is not known yet
     assert pages.page.end()
     data = data_of(pages.page)
     assert data["training"].startswith("stopped: 5 iterations") and data["reload_s"] == 0

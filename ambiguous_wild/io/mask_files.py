@@ -43,7 +43,7 @@ MASK_STYLES = {
     # rchelp.capturingreality.com/en-US/tools/imglayers.htm: DSC_0001.jpg.mask.png; tools/mask.htm: masks are
     # alpha channels, where white is what is seen. LichtFeld reads these files with white = used
     # (MrNeRF/LichtFeld-Studio#551).
-    "realityscan": MaskStyle("{name}.mask.png", "put them beside the photos before you add these"),
+    "realityscan": MaskStyle("{name}.mask.png", "put the masks beside the photos, then add both"),
     # jawset.com/docs/d/Postshot+User+Guide/Interface/Training+Configuration: the same base file name; "Remove
     # Occluders: the active (white) regions of the mask images will be ignored".
     "postshot": MaskStyle("{stem}.png", "Image Masks, Mask Mode: Remove Occluders", left_out=255),

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import CommandGroup, PathName, json_option, reported_option, title_option
+from ambiguous_wild.cli.options import (
+    CommandGroup,
+    PathName,
+    json_option,
+    label_option,
+    reported_option,
+    title_option,
+)
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.terminal import say
 
@@ -124,6 +131,7 @@ def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder of the page.")
 @reported_option("BOARD/reported or those of the package")
 @title_option("Leaderboard")
+@label_option
 @click.option(
     "--models",
     multiple=True,

@@ -151,6 +151,8 @@ def compared(
     by_scene = {table.columns[0].scene: table for table in tables if table.columns[0].scene}
     apart = [scene for scene in by_scene if scene in scenes_apart(runs)]
     unranked = incomparable(runs.runs, columns) | metric_versions(runs.runs).keys()
+    # where test photos may hold distractors, a model gains by drawing them
+    unranked |= {c.measure.key for table in tables for c in table.columns if c.doubtful}
     values, pairs = PairedValues(runs), []
     for i, measure in enumerate(columns):
         fair = not apart and measure.key not in unranked

@@ -18,6 +18,7 @@ from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.report import papers
 from ambiguous_wild.report.pairs import Counts, compared, names_of, p_text, pair_table
 from tests.harness.fake_runs import failed, fake_result, save
+from tests.report.test_notes import ghosts
 
 GAIN = {"mine": 1.0, "robustsplat": 0.6, "3dgs": 0.0}
 
@@ -51,6 +52,17 @@ def test_intervals_and_p_are_those_of_scipy(tmp_path: Path) -> None:
         other.scenes.p, pair.p_holm
     )
     assert pair.images.low < pair.scenes.mean < pair.images.high and pair.images.count == 30
+
+
+def test_photos_with_distractors_compare_nobody(tmp_path: Path) -> None:
+    """The model with the ghosts has more PSNR; over the pixels that other photos show alike it has less."""
+    runs = [r for s in range(3) for r in ghosts(scene=f"s{s}")]
+    pairs, notes = compared(read_runs(save(tmp_path, *runs)), ["a", "3dgs"])
+    states = {pair.measure.key: pair.state for pair in pairs}
+    assert states == {"psnr": "missing", "psnr_consistent": "ok", "ssim": "missing"}
+    (fair,) = [pair for pair in pairs if pair.state == "ok"]
+    assert fair.scenes.mean == pytest.approx(4.0)
+    assert any("gains by it" in note for note in notes)
 
 
 def test_one_scene_has_an_interval_over_images_and_no_p(tmp_path: Path) -> None:

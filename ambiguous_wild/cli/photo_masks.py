@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import click
@@ -24,7 +25,7 @@ WORK = "-work"  # added to the name of -o: the folder of the scene and the run
     "--inpaint", type=PathName(), metavar="FOLDER",
     help="Also write the photos with the model's render in place of the distractors.",
 )  # fmt: skip
-@click.option("--budget", default="10m", show_default=True, help="Training time, of PHOTOS: 90s, 10m, 1.5h.")
+@click.option("--budget", default="10m", show_default=True, help="Time for PHOTOS: 90s, 10m, 1.5h.")
 @threads_option
 @click.pass_context
 def command(
@@ -84,26 +85,19 @@ def _cores(threads: int | None) -> list[str]:
 def _trained(ctx: click.Context, photos: Path, output: Path, budget: str, threads: int | None) -> Path:
     """Build a scene of all photos, train refinesplat on it, and return the run."""
     from ambiguous_wild.cli.bench import parse_budget
+    from ambiguous_wild.cli.try_all import train_within
     from ambiguous_wild.harness.store import run_folders
 
-    parse_budget(budget)  # a typing error is said before the scene is built
+    begin, seconds = time.monotonic(), parse_budget(budget)
     work = output.with_name(output.name + WORK)
-    scene, runs = work / "scene", work / "runs"
+    scene, runs, plan = work / "scene", work / "runs", work / "plan.json"
     own_step(
         ctx, "build-scene", photos, "-o", scene, "--no-test", "--name", scene_name(photos), *_cores(threads)
     )
-    own_step(
-        ctx,
-        "bench",
-        "--method",
-        "refinesplat",
-        "--scene",
-        scene,
-        "--budget",
-        budget,
-        "-o",
-        runs,
-        *_cores(threads),
+    if not plan.exists():
+        own_step(ctx, "plan", scene, "--no-probe", "-o", plan)
+    train_within(
+        "refinesplat", scene, runs, plan, work / "view", seconds - (time.monotonic() - begin), threads
     )
     say(f"scene and run stay in {work}")
     return next(run_folders(runs))

@@ -231,8 +231,9 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
 
 
 def may_continue(key: str) -> bool:
-    """Return whether a run can go on with another value of this setting: its length, its corrections."""
-    return key in ("train.iterations", "train.budget_s", "continued") or key.startswith("corrections.")
+    """Return whether a run can go on with another value of this setting: its length, size or corrections."""
+    of_length = ("train.iterations", "train.budget_s", "train.max_gaussians", "continued")
+    return key in of_length or key.startswith("corrections.")
 
 
 def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = None) -> CellReport:

@@ -10,7 +10,7 @@ import pytest
 
 from ambiguous_wild.cli.try_all import SHORTEST_S
 from ambiguous_wild.harness.result_file import read_result
-from ambiguous_wild.harness.store import known_budget_s
+from ambiguous_wild.harness.store import known_budget
 from tests.builder.capture_maker import write_capture
 from tests.command_line import aw
 
@@ -31,7 +31,7 @@ def test_photos_become_a_page_that_a_larger_budget_continues(tmp_path: Path) -> 
     assert f"look at it while it trains: {page}" in done.stderr
     assert f"splat of refinesplat: {run / 'point_cloud.ply'}" in done.stderr
     assert "loads itself" not in page.read_text() and '"reload_s": 0.0' in page.read_text()
-    assert known_budget_s(out / "runs") == SHORTEST_S and "a sketch" in done.stderr
+    assert known_budget(out / "runs")[0] == SHORTEST_S and "a sketch" in done.stderr
     reached = read_result(run / "metrics.json")["cost"]["iterations"]
     again = aw(*words, "--budget", "20s")
     assert again.returncode == 0 and again.stderr.count("finished before, kept") == 1

@@ -110,6 +110,9 @@ def next_steps(source: Path, output: Path, seconds: float, runs: Path) -> list[s
             lines.append(f"  as SPZ, SOG and glTF, for other viewers: aw export {shlex.quote(str(run))}")
         if (run / "masks").is_dir():
             lines.append(f"masks of {run.parent.name}, white = static: {run / 'masks'}")
+            lines.append(
+                f"  of each photo at its full size, for other tools: aw masks {shlex.quote(str(run))}"
+            )
     words = ["aw", "try", str(source), "-o", str(output), "--budget", f"{3 * seconds / 60:.0f}m"]
     lines.append(f"sharper, the same model trained on: {shlex.join(words)}")
     lines.append(f"PSNR, time and size: aw table {shlex.quote(str(runs))}")

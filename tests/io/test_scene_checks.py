@@ -134,7 +134,7 @@ EXEMPT = {
     "build-scene raw": "calls build_scene()",
     "ambiguity-report --run": RUNS,
     "bench --start": "a splat file",
-    "masks source": "its steps are commands of this table; of a run: its scene was asked before it was trained",
+    "masks source": "its steps are commands of this table; the scene of a run was asked before",
     "export-scene --masks": RUNS,
     "figure runs": RUNS,
     "statement runs": RUNS,

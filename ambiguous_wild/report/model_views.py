@@ -308,7 +308,7 @@ class GrowingPage:
             return False
         pause_s = min(max(now, FIRST_PAGE_S), LONGEST_PAUSE_S)
         self._due = now + pause_s
-        self._write(f"{_state(trainer)}; this page shows the next state by itself", pause_s + self._cost_s)
+        self._write(_state(trainer), pause_s + self._cost_s)
         return True
 
     def end(self) -> bool:

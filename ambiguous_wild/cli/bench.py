@@ -22,7 +22,7 @@ from ambiguous_wild.cli.options import (
     training_options,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
-from ambiguous_wild.cli.study_file import Study, decisive, is_plan, read_study, write_study
+from ambiguous_wild.cli.study_file import StudyFile, decisive, is_plan, read_study, write_study
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.benchmark import Engine, bench
@@ -59,7 +59,7 @@ def parse_budget(text: str) -> float:
 
 
 @click.command(name="bench")
-@click.argument("study", required=False, is_eager=True, type=PathName(), callback=read_study)
+@click.argument("study", required=False, is_eager=True, callback=read_study)
 @click.option(
     "--method",
     "methods",
@@ -142,7 +142,7 @@ def parse_budget(text: str) -> float:
 @click.pass_context
 def command(
     ctx: click.Context,
-    study: Study | None,
+    study: StudyFile | None,
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
     suite_name: str | None,
@@ -253,7 +253,7 @@ class _Recorded(ProgressBar):
     """Also writes the options of the command beside its runs, when the first run begins."""
 
     def __init__(
-        self, ctx: click.Context, values: Mapping[str, Any], study: Study | None, output: Path
+        self, ctx: click.Context, values: Mapping[str, Any], study: StudyFile | None, output: Path
     ) -> None:
         super().__init__()
         self.ctx, self.values, self.study, self.output = ctx, values, study, output

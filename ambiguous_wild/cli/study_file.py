@@ -119,7 +119,9 @@ def _texts(ctx: click.Context, data: Mapping[Any, Any], path: Path) -> dict[str,
         option = options[key]
         where = f"{path}: {key}"
         if key == "set" and isinstance(value, dict):
-            value = [f"{name}={_word(inner, f'{where}: {name}')}" for name, inner in value.items()]
+            value = [
+                f"{name}={_word(inner, f'{where}: {name}', lists=True)}" for name, inner in value.items()
+            ]
         if option.is_flag:
             if not isinstance(value, bool):
                 raise AwError(f"{where}: write true or false, not {quoted(value)}")
@@ -148,15 +150,15 @@ def decisive(ctx: click.Context) -> list[str]:
     return [str(option.name) for key, option in _options(ctx).items() if key not in NOT_READ | NOT_WRITTEN]
 
 
-def _word(value: Any, where: str) -> str:
+def _word(value: Any, where: str, *, lists: bool = False) -> str:
     """Return a plain value as a word of the command line.
 
     Raises:
         AwError: a mapping, nothing, or a text that no command line can hold.
     """
-    items = value if isinstance(value, list) else [value]
+    items = value if isinstance(value, list) and lists else [value]
     if not all(isinstance(item, str | int | float) for item in items):
-        raise AwError(f"{where}: a text, a number, or a list of these is expected, not {quoted(value)}")
+        raise AwError(f"{where}: a text or a number is expected, not {quoted(value)}")
     text = option_text(value)
     if plain(text) != text:
         raise AwError(f"{where}: {quoted(text)} holds an invisible character: leave it out")

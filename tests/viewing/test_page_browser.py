@@ -280,7 +280,7 @@ def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
     )
     write("training: 3 iterations", 0.2)
     browser.run("location.reload()")
-    browser.until(f"{loaded}'training: 3 iterations' && {told}('next state')")
+    browser.until(f"{loaded}'training: 3 iterations' && $('training').textContent.includes('next state')")
     write("", 0)  # the last page
     browser.until(f"{loaded}''")
     settle(browser)

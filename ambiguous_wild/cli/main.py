@@ -62,6 +62,7 @@ SECTIONS = {
     "Compare": {
         "table": ("table", "Compare runs in tables: terminal, Markdown, CSV, LaTeX, HTML."),
         "figure": ("figure", "Renders side by side with zooms, for a paper: PDF, PNG, SVG."),
+        "statement": ("statement", "Write the paragraph on reproducibility of a paper, with its commands."),
         "cost": ("cost", "Accuracy against training time: tables and plots."),
         "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
     },

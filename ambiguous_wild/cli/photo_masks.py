@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import click
@@ -88,7 +87,7 @@ def _trained(ctx: click.Context, photos: Path, output: Path, budget: str, thread
     from ambiguous_wild.cli.try_all import train_within
     from ambiguous_wild.harness.store import run_folders
 
-    begin, seconds = time.monotonic(), parse_budget(budget)
+    seconds = parse_budget(budget)
     work = output.with_name(output.name + WORK)
     scene, runs, plan = work / "scene", work / "runs", work / "plan.json"
     own_step(
@@ -96,8 +95,7 @@ def _trained(ctx: click.Context, photos: Path, output: Path, budget: str, thread
     )
     if not plan.exists():
         own_step(ctx, "plan", scene, "--no-probe", "-o", plan)
-    train_within(
-        "refinesplat", scene, runs, plan, work / "view", seconds - (time.monotonic() - begin), threads
-    )
+    train_within("refinesplat", scene, runs, plan, work / "view", seconds, threads)
+    own_step(ctx, "view", runs, "-o", work / "view")
     say(f"scene and run stay in {work}")
     return next(run_folders(runs))

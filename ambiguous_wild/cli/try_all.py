@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import os
-import shlex
 import sys
 import time
 from pathlib import Path
@@ -13,6 +13,7 @@ import click
 
 from ambiguous_wild.cli.options import (
     PathName,
+    command_line,
     own_step,
     prepare_cpu,
     print_command,
@@ -32,13 +33,12 @@ if TYPE_CHECKING:
 FRAMES = 60  # taken from a video
 # 'aw screen' and 'aw build-scene' on two idle cores: seconds for any scene, and for each photo
 SCENE_S = (3.0, 1.2)
-AFTER_S = (6.0, 0.3)  # measuring, masks and the page, for each method; and for each photo
+# set-up, pages, measuring and masks: seconds for each method, and for each photo
+AROUND_S = (14.0, 1.2)
 SHORTEST_S = 30.0  # of training, for each method
-OF_3DGS = 1.3  # an iteration of refinesplat under a budget, in iterations of 3dgs
-FULL_GROWTH, LEAST_GROWTH = 5000, 0.3  # iterations of a run with one Gaussian a pixel; least share of it
+REFINESPLAT_TIME = 1.6  # of an iteration under a budget, in that of 3dgs
+FULL_GROWTH, LEAST_GROWTH = 8000, 0.3  # iterations of a run with one Gaussian a pixel; least share of it
 GOOD, SHARP = 3000, 10_000  # iterations from which most of a scene is clear, and fine texture is
-# A run is continued if the new budget is at least this much larger, else it is finished or kept.
-LARGER = 1.3
 
 
 @click.command("try")
@@ -90,33 +90,20 @@ def command(
         step("screen", photos, *cores)
     step("build-scene", photos, "-o", scene, "--name", scene_name(source), *cores)
     step("plan", scene, "--no-probe", "-o", plan, done=plan)
-    train_within(methods, scene, runs, plan, output / "view", seconds - (time.monotonic() - begin), threads)
+    several = train_within(methods, scene, runs, plan, output / "view", seconds, threads) > 1
     step("view", runs, "-o", output / "view")
-    if "," in methods:
+    if several:
         step("table", runs)
         step("figure", runs, "-o", output / "comparison.png", "--with-masks")
+    from ambiguous_wild.harness.trained_models import next_steps, read_models
+
     say("")
     say(f"{_minutes(time.monotonic() - begin)}. What you have now, and what you can do with it:")
-    for line in next_steps(source, output, seconds, runs):
-        say(f"  {line}")
-
-
-def next_steps(source: Path, output: Path, seconds: float, runs: Path) -> list[str]:
-    """Return lines on what lies where, and the commands that go on from there."""
-    lines = [f"page, opens in any browser: {output / 'view' / 'index.html'}"]
-    for run in sorted(runs.glob("*/*/seed0")):
-        if (run / "point_cloud.ply").is_file():
-            lines.append(f"splat of {run.parent.name}: {run / 'point_cloud.ply'}")
-            lines.append(f"  as SPZ, SOG and glTF, for other viewers: aw export {shlex.quote(str(run))}")
-        if (run / "masks").is_dir():
-            lines.append(f"masks of {run.parent.name}, white = static: {run / 'masks'}")
-            lines.append(
-                f"  of each photo at its full size, for other tools: aw masks {shlex.quote(str(run))}"
-            )
-    words = ["aw", "try", str(source), "-o", str(output), "--budget", f"{3 * seconds / 60:.0f}m"]
-    lines.append(f"sharper, the same model trained on: {shlex.join(words)}")
-    lines.append(f"PSNR, time and size: aw table {shlex.quote(str(runs))}")
-    return lines
+    say(f"  page for any browser: {output / 'view' / 'index.html'}")
+    for line in next_steps(read_models([runs])):
+        say(f"  {line.replace('`', '')}")
+    longer = command_line(budget=f"{math.ceil(3 * seconds)}s" if seconds < 60 else f"{3 * seconds / 60:.0f}m")
+    say(f"  to train the same model longer: {longer}")
 
 
 def train_within(
@@ -125,18 +112,21 @@ def train_within(
     runs: Path,
     plan: Path,
     page: Path,
-    left_s: float,
+    seconds: float,
     threads: int | None,
-) -> None:
-    """Train methods in equal shares of some seconds, of which measuring takes a part; write a page on the way.
+) -> int:
+    """Train methods in equal shares of a budget for everything, and write a page on the way.
 
-    A run that was trained before goes on if the time is larger than it had.
+    What was trained before goes on if the budget is larger than it was. The same budget gives the same length,
+    because the time to build the scene is that of scene.json.
+
+    Returns:
+        number of methods.
 
     Raises:
         AwError: a run failed.
     """
     from ambiguous_wild.harness.benchmark import bench, split_methods
-    from ambiguous_wild.harness.store import known_budget
     from ambiguous_wild.harness.timing import expected_s, slowness
     from ambiguous_wild.io.scene_folder import load_scene
     from ambiguous_wild.report.model_views import GrowingPage
@@ -144,26 +134,19 @@ def train_within(
     prepare_cpu(threads)
     opened = load_scene(scene, verify=False, check=False)
     names = split_methods(methods)
-    budget_s = left_s / len(names) - AFTER_S[0] - AFTER_S[1] * len(opened.views) / len(names)
-    budget_s = float(round(max(budget_s, SHORTEST_S)))
-    before = known_budget(runs) if runs.is_dir() else None
-    same = before is not None and budget_s < LARGER * before[0]
-    if before is not None and same:
-        budget_s = before[0]
+    built_s = sum(own_json(scene / "scene.json").get("seconds", {}).values())
+    left_s = seconds - built_s - AROUND_S[1] * len(opened.views)
+    budget_s = float(round(max(left_s / len(names) - AROUND_S[0], SHORTEST_S)))
     camera = opened.train[0].camera
     pixels = camera.width * camera.height
-    one_s = OF_3DGS * expected_s(1, pixels, round(0.4 * pixels)) * slowness()
-    iterations = budget_s / one_s
+    one_s = REFINESPLAT_TIME * expected_s(1, pixels, pixels // 2)  # on the reference machine
     # More Gaussians than so short a run can train cost iterations: monstree in 100 s had 21.09 dB with 103 000
     # in 1531 iterations, and 21.56 dB with 60 000 in 2190.
-    most: int | None = 1000 * round(1e-3 * pixels * min(max(iterations / FULL_GROWTH, LEAST_GROWTH), 1.0))
-    if before is not None and same:
-        most = before[1]
+    most = 1000 * round(1e-3 * pixels * min(max(budget_s / one_s / FULL_GROWTH, LEAST_GROWTH), 1.0))
     say("")
-    say(_bought(budget_s, iterations))
+    say(_budget_line(budget_s, budget_s / (one_s * slowness()), len(names)))
     words = ["bench", "--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
-    words += ["--max-gaussians", str(most)] if most else []
-    words += ["--effects", str(plan), "--overwrite", "longer", "-o", str(runs)]
+    words += ["--max-gaussians", str(most), "--effects", str(plan), "--overwrite", "longer", "-o", str(runs)]
     print_command(*words)
     growing = GrowingPage(page, runs)
     try:
@@ -183,7 +166,9 @@ def train_within(
             say(f"the page shows the model as it is now: {page / 'index.html'}")
         raise
     if report.failed:
+        growing.end()
         raise AwError(report.failed[0].error)
+    return len(names)
 
 
 class _ProgressAndPage(ProgressBar):
@@ -217,7 +202,7 @@ def _announced(source: Path, scene: Path, seconds: float) -> str:
         if not count:
             raise AwError(f"{source} holds no photos: give a folder of photos, or a video")
     scene_s = 0.0 if (scene / "scene.json").exists() else SCENE_S[0] + SCENE_S[1] * count
-    total = max(seconds, scene_s + SHORTEST_S + AFTER_S[0] + AFTER_S[1] * count)
+    total = max(seconds, scene_s + SHORTEST_S + AROUND_S[0] + AROUND_S[1] * count)
     built = f", of which {_minutes(scene_s)} for the scene" if scene_s else ""
     return f"{counted(count, 'photo')}: about {_minutes(total)}{built}"
 
@@ -226,13 +211,14 @@ def _minutes(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
-def _bought(budget_s: float, iterations: float) -> str:
+def _budget_line(budget_s: float, iterations: float, methods: int) -> str:
     """Return what a budget buys on this machine, and which one would give a sharp splat."""
-    text = f"{_minutes(budget_s)} of training: about {_rounded(iterations)} iterations here"
+    each = " for each method" if methods > 1 else ""
+    text = f"{_minutes(budget_s)} of training{each}: about {_rounded(iterations)} iterations here"
     if iterations >= SHARP:
         return f"{text}, which gives a sharp splat"
     grade = "a sketch" if iterations < GOOD else "a soft splat"
-    enough = SHARP / iterations * budget_s / 60 + 2
+    enough = methods * SHARP / iterations * budget_s / 60 + 2
     return f"{text}, which gives {grade}; --budget {5 * -(-enough // 5):.0f}m gives a sharp one"
 
 

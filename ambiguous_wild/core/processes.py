@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _CLONE = str(Path(__file__).parents[2])
@@ -19,6 +21,36 @@ def python_command(code: str, *words: str) -> list[str]:
     that folder a clone that is not installed would not be found either, so it is added as the last one.
     """
     return [sys.executable, "-P", "-c", f"import sys; sys.path.append({_CLONE!r})\n{code}", *words]
+
+
+def git_commit(folder: Path) -> str | None:
+    """Return the commit of the repository that a folder lies in; None without git, or outside of one."""
+    return _git(folder, "rev-parse", "HEAD")
+
+
+def own_commit() -> str:
+    """Return the commit of this package, with "+changes" where its files differ from it; else "".
+
+    Known in a clone, and after an installation from a repository's address.
+    """
+    clone = Path(_CLONE)
+    if (clone / ".git").exists():  # the folder above may be a repository of the user's
+        changes = _git(
+            clone, "status", "--porcelain", "--untracked-files=no", "--", str(Path(__file__).parents[1])
+        )
+        return (git_commit(clone) or "") + ("+changes" if changes else "")
+    with suppress(importlib.metadata.PackageNotFoundError, ValueError, AttributeError):
+        record = importlib.metadata.distribution("ambiguous-wild").read_text("direct_url.json")
+        return str(json.loads(record or "{}").get("vcs_info", {}).get("commit_id", ""))
+    return ""
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    try:
+        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from ambiguous_wild.core import UNMOVED, Scene
 from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.core.errors import installed
 from ambiguous_wild.core.machine import usable_cores
+from ambiguous_wild.core.processes import own_commit
 from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
 from ambiguous_wild.harness.command_lines import bench_command, length_options, length_text, option_text
 from ambiguous_wild.harness.measures import ImageRow, records
@@ -73,6 +74,8 @@ def environment(device: str) -> Environment:
         "device": device,
         "packages": {name: installed(name) for name in PACKAGES},
     }
+    if revision := commit():
+        facts["commit"] = revision
     if device.startswith("cuda"):
         from ambiguous_wild.splat.gsplat_seam import max_alpha
 
@@ -314,6 +317,12 @@ def code_hash() -> str:
     root = Path(ambiguous_wild.__file__).parent
     sources = sorted(p for p in root.rglob("*.py") if "__pycache__" not in p.parts)
     return config_hash([[p.relative_to(root).as_posix(), sha256_file(p)] for p in sources])
+
+
+@cache
+def commit() -> str:
+    """Return the commit of the package, see `own_commit`; asked once a process."""
+    return own_commit()
 
 
 def reproduce(cell: Cell) -> str:

@@ -60,6 +60,8 @@ def as_continued(cell: Cell, folder: Path) -> Cell:
         )
     state = checkpoint.load(saved)
     iteration = int(state["iteration"])
+    if keys == ["train.max_gaussians"]:
+        return cell  # of the same length: another run, which is refused
     if cell.train.share_done(iteration, float(state["elapsed_s"])) >= 1.0 and is_finished(folder):
         if any(key.startswith("corrections.") for key in keys):
             raise AwError(

@@ -104,7 +104,7 @@ def photo_consistency(scene: Scene) -> dict[str, np.ndarray] | str:
     for view in scene.test:
         inverse = inverse_depth(view.camera, xyz)
         if inverse is None:
-            return f"too few sparse points lie in test view {view.name}"
+            continue
         world, photo = world_points(view.camera, inverse), _small(view, inverse.shape)
         looking, agreeing = np.zeros((2, *inverse.shape), np.float32)
         for k in [k for k in _nearest(view.camera, cameras) if k in photos][:COMPARED]:
@@ -116,7 +116,7 @@ def photo_consistency(scene: Scene) -> dict[str, np.ndarray] | str:
         most = cv2.erode(cv2.medianBlur(agree.astype(np.uint8), 5), np.ones((3, 3), np.uint8))
         size = (view.camera.width, view.camera.height)
         consistent[view.name] = cv2.resize(most, size, interpolation=cv2.INTER_NEAREST) > 0
-    return consistent
+    return consistent or "too few sparse points lie in the test views"
 
 
 def _shown(

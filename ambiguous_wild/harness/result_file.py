@@ -122,6 +122,7 @@ class Environment(TypedDict, total=False):
     """Versions and hardware, as in env.json."""
 
     ambiguous_wild: str
+    commit: str  # of a clone, with "+changes" where files differ from it; absent where it is not known
     python: str
     platform: str
     cpu: str

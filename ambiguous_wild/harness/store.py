@@ -303,20 +303,6 @@ def section(config: ReadConfig, name: str) -> ReadConfig:
     return part if isinstance(part, dict) else {}
 
 
-def known_budget(root: Path) -> tuple[float, int | None] | None:
-    """Return the largest training budget in s of the runs below a folder, and the limit of its Gaussians.
-
-    None without a run that has a budget.
-    """
-    trained = [section(read_config(run), "train") for run in run_folders(root)]
-    budgets = [t for t in trained if isinstance(t.get("budget_s"), int | float)]
-    if not budgets:
-        return None
-    longest = max(budgets, key=lambda t: float(t["budget_s"]))
-    most = longest.get("max_gaussians")
-    return float(longest["budget_s"]), most if isinstance(most, int) else None
-
-
 def _method_and_scene(run: Path) -> tuple[str, str]:
     """Return method and scene of a run without a result: from its settings, else from its path."""
     config, method_folder = read_config(run), run.absolute().parent

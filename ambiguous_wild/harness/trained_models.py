@@ -273,6 +273,8 @@ def next_steps(shown: SceneModels) -> list[str]:
         place = str(_from_here(run.resolve(), runs))
         if model.masks is not None:
             steps.append(f"masks of {model.label}, white = static: `{place}/{MASKS}`")
+            full = shlex.join(["aw", "masks", place, "-o", "masks"])
+            steps.append(f"masks of the photos at full size, for other tools: `{full}`")
         export = shlex.join(["aw", "export", place])
         steps.append(f"splat file of {model.label}: `{place}/{MODEL}`; as SPZ, SOG and glTF: `{export}`")
         if run == shown.runs[-1]:

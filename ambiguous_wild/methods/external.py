@@ -14,7 +14,6 @@ import re
 import shlex
 import shutil
 import string
-import subprocess
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from ambiguous_wild.core import AwError, View
 from ambiguous_wild.core.config import Facts, config_hash, from_plain, to_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.names import check_name
+from ambiguous_wild.core.processes import git_commit
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.files import own_json, sha256_file, write_json
 from ambiguous_wild.methods.entry import MethodEntry, NoOptions
@@ -263,7 +263,7 @@ class CommandProgram:
     def _facts(self) -> Facts:
         """Return the program's revision, and the settings of the run that its commands do not pass."""
         not_passed = sorted({"seed", "iterations"} - self._used())
-        return {"revision": _revision(self.cwd), "not_told": not_passed}
+        return {"revision": git_commit(self.cwd), "not_told": not_passed}
 
     def _pattern(self, template: str, values: dict[str, object], view: View, index: int) -> str:
         stem = str(PurePosixPath(view.name).with_suffix(""))
@@ -288,17 +288,6 @@ def _read(state: Path) -> dict[str, float]:
     return {
         k: float(data[k]) for k in ("train_s", "render_s", "resumed") if isinstance(data.get(k), (int, float))
     }
-
-
-def _revision(folder: Path) -> str | None:
-    """Return the commit of the program's repository; None if it is in none."""
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,15 @@ def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -
     Raises:
         AwError: it would hold invisible characters: control characters, line breaks, text-direction marks.
     """
+    text = " && ".join([*before, shlex.join(command_words(config, recorded))])
+    hidden = hidden_in(text)
+    if hidden is not None:
+        raise AwError(f"config.yaml holds the invisible character {hidden!a}: run again without it")
+    return text
+
+
+def command_words(config: RunConfig, recorded: str = "") -> list[str]:
+    """Return the words of the command, "aw", "bench", then options with a value each, unchecked."""
     train = config["train"]
     words: list[object] = ["aw", "bench", *_method(config, recorded)]
     words += ["--scene", config["scene"].get("name"), "--seed", train["seed"]]
@@ -97,11 +106,7 @@ def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -
     for key, value in _changed(config).items():
         words += ["--set", f"{key}={value}"]
     words += ["--device", config.get("device", "cpu"), "-o", "runs"]
-    text = " && ".join([*before, shlex.join(str(w) for w in words)])
-    hidden = hidden_in(text)
-    if hidden is not None:
-        raise AwError(f"config.yaml holds the invisible character {hidden!a}: run again without it")
-    return text
+    return [str(word) for word in words]
 
 
 def _method(config: RunConfig, recorded: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -50,9 +51,11 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.trainer import Trainer
 
 
+LOG = logging.getLogger(__name__)
 FOLDER = "export"  # in a run folder
 FIRST_PAGE_S = 10.0  # of training until the first page of a run that is trained
 LONGEST_PAUSE_S = 60.0  # of training between two pages
+LEAST_PAUSE = 10.0  # least pause, in times that a page takes
 GAUSSIANS_WHILE_TRAINING = 60_000  # of a model in such a page, which is to be written within a second or two
 
 
@@ -293,22 +296,27 @@ class GrowingPage:
         check_page_folder(folder)
         self.folder, self.runs = folder, runs
         self._trainer: Trainer | None = None
-        self._label = ""
+        self._label = self._next_label = ""
+        self._cost_s = 0.0  # of the last page
 
     def begin(self, label: str) -> None:
         """Call it before each run; `label` is the run's name on the page."""
-        self._trainer, self._label, self._cost_s = None, label, 0.0
+        self._next_label = label
 
     def tick(self, trainer: Trainer) -> bool:
         """Write the page if one is due, after an iteration with the clock stopped; return whether it was."""
         now = trainer.clock.now()
-        if self._trainer is None:
-            self._trainer, self._due = trainer, now + FIRST_PAGE_S
+        if trainer is not self._trainer:
+            self._trainer, self._label, self._due = trainer, self._next_label, now + FIRST_PAGE_S
         if now < self._due or trainer.done:
             return False
-        pause_s = min(max(now, FIRST_PAGE_S), LONGEST_PAUSE_S)
+        pause_s = max(min(max(now, FIRST_PAGE_S), LONGEST_PAUSE_S), LEAST_PAUSE * self._cost_s)
         self._due = now + pause_s
-        self._write(_state(trainer), pause_s + self._cost_s)
+        try:
+            self._write(_state(trainer), pause_s + self._cost_s)
+        except (AwError, OSError) as error:  # no reason to end a training
+            LOG.warning("the page could not be written: %s", error)
+            return False
         return True
 
     def end(self) -> bool:

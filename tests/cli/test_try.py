@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.cli.try_all import SHORTEST_S
+from ambiguous_wild.cli.try_all import SHORTEST_S, train_within
 from ambiguous_wild.harness.result_file import read_result
-from ambiguous_wild.harness.store import known_budget
 from tests.builder.capture_maker import write_capture
 from tests.command_line import aw
 
@@ -29,9 +29,10 @@ def test_photos_become_a_page_that_a_larger_budget_continues(tmp_path: Path) -> 
     assert _commands(done.stderr) == ["screen", "build-scene", "plan", "bench", "view"]
     page, run = out / "view/index.html", out / "runs/walls/refinesplat/seed0"
     assert f"look at it while it trains: {page}" in done.stderr
-    assert f"splat of refinesplat: {run / 'point_cloud.ply'}" in done.stderr
+    assert "splat file of refinesplat: " in done.stderr and "aw masks " in done.stderr
     assert '"reload_s":0.0' in page.read_text()
-    assert known_budget(out / "runs")[0] == SHORTEST_S and "a sketch" in done.stderr
+    assert f"--budget {SHORTEST_S:g}s" in done.stderr and "a sketch" in done.stderr
+    assert f"aw try {raw} --output {out} --budget 60s --threads 1" in done.stderr
     reached = read_result(run / "metrics.json")["cost"]["iterations"]
     again = aw(*words, "--budget", "20s")
     assert again.returncode == 0 and again.stderr.count("finished before, kept") == 1
@@ -51,6 +52,40 @@ def test_two_methods_share_the_time_and_are_compared(tmp_path: Path) -> None:
     wanted = ["screen", "build-scene", "plan", "bench", "view", "table", "figure"]
     assert _commands(done.stderr) == wanted and (out / "comparison.png").is_file()
     assert "3dgs" in done.stdout and "refinesplat" in done.stdout
+
+
+class Made(Exception):
+    pass
+
+
+def budgets(monkeypatch: pytest.MonkeyPatch, scene: Path, methods: str, seconds: float) -> dict[str, Any]:
+    """What `train_within` asks of `bench`."""
+    asked: dict[str, Any] = {}
+
+    def bench(names: list[str], of: Path, **words: Any) -> None:
+        asked.update(words, names=names)
+        raise Made
+
+    monkeypatch.setattr("ambiguous_wild.harness.benchmark.bench", bench)
+    with pytest.raises(Made):
+        out = scene.parent / "nothing"
+        train_within(methods, scene, out / "runs", out / "plan.json", out / "view", seconds, 1)
+    return asked
+
+
+def test_the_same_budget_gives_the_same_length_and_methods_share_it(
+    monkeypatch: pytest.MonkeyPatch, scene: Path
+) -> None:
+    first, again = (budgets(monkeypatch, scene, "refinesplat", 300.0) for _ in range(2))
+    assert first["budgets_s"] == again["budgets_s"] and first["train"] == again["train"]
+    assert 200 < first["budgets_s"][0] < 300 and first["overwrite"] == "longer"
+    both = budgets(monkeypatch, scene, "3dgs,refinesplat", 300.0)
+    assert both["names"] == ["3dgs", "refinesplat"]
+    assert both["budgets_s"][0] < first["budgets_s"][0] / 2
+    longer = budgets(monkeypatch, scene, "refinesplat", 900.0)
+    assert longer["budgets_s"][0] == first["budgets_s"][0] + 600.0
+    assert longer["train"]["max_gaussians"] >= first["train"]["max_gaussians"]
+    assert budgets(monkeypatch, scene, "refinesplat", 1.0)["budgets_s"] == [SHORTEST_S]
 
 
 def test_a_video_is_captured_once(tmp_path: Path) -> None:

@@ -71,6 +71,8 @@ def test_a_shorter_run_goes_on_and_says_so(scene, tmp_path):
         run(scene, out, iterations=11)
     with pytest.raises(AwError, match="was continued from a shorter run"):
         verify(folder, None)
+    with pytest.raises(AwError, match=r"train.max_gaussians was None, is 500"):
+        run(scene, out, iterations=11, overwrite="longer", train={"max_gaussians": 500, "probes": 0})
     with pytest.raises(AwError, match="effects was"):  # other settings are no continuation
         run(scene, out, iterations=20, overwrite="longer", effects="exposure")
 

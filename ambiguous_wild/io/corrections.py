@@ -85,7 +85,7 @@ class CorrectionsFile:
         picture = png_of(text, MAX_SIDE, MAX_SIDE)
         if picture is None:
             raise AwError(
-                f"{where} is no sound PNG of up to {MAX_SIDE} px; save it in the page of 'aw view' again"
+                f"{where} is no whole PNG of up to {MAX_SIDE} px; save it in the page of 'aw view' again"
             )
         height, width = picture.shape
         if abs(height * camera.width - width * camera.height) > 2 * max(camera.width, camera.height):

@@ -278,10 +278,11 @@ def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
     browser.until(
         f"{loaded}'training: 2 iterations' && $('training').textContent.includes('waits no longer')"
     )
-    write("training: 3 iterations", 0.2)
+    write("training: 3 iterations", 1000)
     browser.run("location.reload()")
-    browser.until(f"{loaded}'training: 3 iterations' && {told}('next state')")
+    browser.until(f"{loaded}'training: 3 iterations' && $('training').textContent.includes('next state')")
     write("", 0)  # the last page
+    browser.run("DATA.reload_s = 0.2")
     browser.until(f"{loaded}''")
     settle(browser)
     assert browser.run("state.mode") == "cut" and browser.run("$('training').offsetHeight") == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -84,8 +85,8 @@ def _originals(info: Mapping[str, Any]) -> list[OriginalPhoto]:
 
 def _camera(record: Mapping[str, Any]) -> ModelCamera:
     model, params = str(record["model"]), tuple(float(value) for value in record["params"])
-    if len(params) != MODELS[model][1]:
-        raise ValueError(f"{len(params)} parameters of {model}")
+    if len(params) != MODELS[model][1] or not all(map(math.isfinite, params)):
+        raise ValueError(f"parameters {params} of {model}")
     return ModelCamera(1, model, *_size(record), params)
 
 

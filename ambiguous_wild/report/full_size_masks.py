@@ -219,7 +219,7 @@ def write_full_size_masks(
 def inpainted_names(photos: Iterable[str]) -> dict[str, str]:
     """Return the path of each photo once it is inpainted: what is neither JPEG nor PNG becomes PNG.
 
-    Of a.tif that is a.png, or a.tif.png where another photo has this name.
+    a.tif becomes a.png, or a.tif.png where another photo has that name.
     """
     names = {photo: photo for photo in photos}
     taken = {spelling_key(photo) for photo in names}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -9,6 +10,7 @@ from typing import Any
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.colmap_records import MODELS, ModelCamera
+from ambiguous_wild.io.images import MAX_PIXELS
 
 AGAIN = "build it again with 'aw build-scene PHOTOS -o SCENE --overwrite'"
 
@@ -64,7 +66,7 @@ def _originals(info: Mapping[str, Any]) -> list[OriginalPhoto]:
             _inside(source),
             photo["sha256"],
             _inside(name) if camera is not None else "",
-            (int(photo["width"]), int(photo["height"])),
+            _size(photo),
             int(photo["exif"].get("orientation", 1)),
             camera,
             "" if camera is not None else reasons.get(source, "no pose"),
@@ -83,9 +85,16 @@ def _originals(info: Mapping[str, Any]) -> list[OriginalPhoto]:
 
 def _camera(record: Mapping[str, Any]) -> ModelCamera:
     model, params = str(record["model"]), tuple(float(value) for value in record["params"])
-    if len(params) != MODELS[model][1]:
-        raise ValueError(f"{len(params)} parameters of {model}")
-    return ModelCamera(1, model, int(record["width"]), int(record["height"]), params)
+    if len(params) != MODELS[model][1] or not all(map(math.isfinite, params)):
+        raise ValueError(f"parameters {params} of {model}")
+    return ModelCamera(1, model, *_size(record), params)
+
+
+def _size(record: Mapping[str, Any]) -> tuple[int, int]:
+    width, height = int(record["width"]), int(record["height"])
+    if min(width, height) < 1 or width * height > MAX_PIXELS:  # maps of lenses are made at this size
+        raise ValueError(f"{width}x{height} px is the size of no photo")
+    return width, height
 
 
 def _inside(name: str) -> str:

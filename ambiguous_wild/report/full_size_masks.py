@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 
+from ambiguous_wild.builder.collect import collect, largest_photo
+from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.builder.screen import read_capture, without_copies
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.machine import photo_threads
+from ambiguous_wild.core.names import spelling_key
 from ambiguous_wild.harness.result_file import RESULT, read_result
 from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.harness.trained_models import MASKS, open_scene
@@ -34,7 +39,7 @@ from ambiguous_wild.io.images import (
 from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.mask_files import MASK_FOLDERS, MASK_STYLES, OWN_STYLE, MaskStyle, mask_names
 from ambiguous_wild.io.original_photos import AGAIN, OriginalPhoto, capture_folder, is_built, original_photos
-from ambiguous_wild.io.photos import read_photo
+from ambiguous_wild.io.photos import is_photo, read_photo
 from ambiguous_wild.report.inpainting import Inpainting
 
 RADIUS = 3.0  # of the filter, in pixels of the mask
@@ -44,6 +49,7 @@ UNTRAINED = "the run was not trained on it"
 _BACK = {6: 8, 8: 6}  # EXIF orientations that another one undoes; the others undo themselves
 _ORIENTATION = 0x0112  # EXIF
 _QUALITY = 95  # of JPEGs
+_JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,7 @@ class FullSizeMasks:
     white: dict[str, str]  # photo in which nothing is masked -> why
     unread: dict[str, str]  # photo without a mask -> why
     inpainted: int
+    copied: int  # photos in which nothing is masked, copied to the inpainted ones
     left_out: dict[str, str]  # photo that was not inpainted -> why
     note: str = ""  # which photos the masks fit, where these are not the originals
 
@@ -101,8 +108,7 @@ class _CapturePhotos:
         if not self.original:
             return _Opened(read_png_rgb(path), tag=orientation(path))
         opened, pixels = read_photo(path)
-        turn = opened.exif.orientation if any(note.startswith("turned") for note in opened.notes) else 1
-        return _Opened(pixels, turn, turn)
+        return _Opened(pixels, opened.turned, opened.turned)
 
     def check_unchanged(self) -> None:
         """Raise AwError where files are gone, or differ from those that the scene was built from."""
@@ -118,6 +124,31 @@ class _CapturePhotos:
                 f"{len(wrong)} of {len(self.photos)} photos in {self.root} have changed since the scene was "
                 f"built: {shortlist(wrong, 3)}; restore them, or build and train again"
             )
+
+
+def check_before_training(
+    photos: Path, work: Path, output: Path, *, tool: str | None, inpaint: Path | None, jobs: int
+) -> None:
+    """Raise AwError where the masks of a capture could not be written after a scene is built and trained.
+
+    Args:
+        photos: folder of the capture.
+        work: folder that the scene and the run are to lie in.
+        output, tool, inpaint: as in `write_full_size_masks`.
+        jobs: threads.
+    """
+    capture = collect(photos, jobs)
+    _check_places(output, inpaint, {f"the scene and the run {work}": work}, capture.root)
+    style = OWN_STYLE if tool is None else MASK_STYLES[tool]
+    names = [photo.source for photo in capture.sources]
+    try:
+        mask_names(names, style)
+    except AwError:
+        # Of a photo in two formats the builder uses one, which only the pixels tell.
+        threads = min(jobs, photo_threads(largest_photo(capture)))
+        read = read_capture(capture, lambda *_: None, strict=False, jobs=threads, bar=Bar())
+        unused = {row["source"] for row in read.skipped} - without_copies(capture)[1].keys()
+        mask_names([name for name in names if name not in unused], style)
 
 
 def write_full_size_masks(
@@ -147,17 +178,15 @@ def write_full_size_masks(
     style = OWN_STYLE if tool is None else MASK_STYLES[tool]
     run, scene, paths = masks_of_run(folder)
     there = _photos_of(scene)
-    for place in (output, *([inpaint] if inpaint else [])):
-        _check_place(place, {f"the run {run}": run, f"the scene {scene.root}": scene.root}, there.root)
-    if inpaint and inpaint.resolve() == output.resolve():
-        raise AwError(f"--inpaint {inpaint} is the folder of the masks: give another one")
+    _check_places(output, inpaint, {f"the run {run}": run, f"the scene {scene.root}": scene.root}, there.root)
     keeps = {name: read_keep_map(path) for name, path in paths.items()}
     there.check_unchanged()
     names = mask_names([photo.source for photo in there.photos if photo.size != (0, 0)], style)
     views = {view.name: view for view in scene.train}
     fill = Inpainting(run, scene, keeps) if inpaint else None
-    done = FullSizeMasks(output, style, len(names), {}, {}, 0, {}, there.note)
-    drawn = 0
+    files = inpainted_names(photo.source for photo in there.photos)
+    done = FullSizeMasks(output, style, len(names), {}, {}, 0, 0, {}, there.note)
+    drawn = copied = 0
     with atomic_dir(output, replace=False) as masks, _folder(inpaint) as pictures:
         for number, photo in enumerate(there.photos, 1):
             view, path = views.get(photo.name), there.root / photo.source
@@ -178,25 +207,43 @@ def write_full_size_masks(
                 elif keep.all():
                     (pictures / photo.source).parent.mkdir(parents=True, exist_ok=True)
                     shutil.copyfile(path, pictures / photo.source)
+                    copied += 1
                 else:
-                    _write_photo(pictures, path, photo, opened, fill.draw(view, opened.pixels, keep, lens))
+                    pixels = fill.draw(view, opened.pixels, keep, lens)
+                    _write_photo(pictures / files[photo.source], path, opened, pixels)
                     drawn += 1
             tick(number, len(there.photos))
-    return FullSizeMasks(**{**vars(done), "inpainted": drawn})
+    return replace(done, inpainted=drawn, copied=copied)
+
+
+def inpainted_names(photos: Iterable[str]) -> dict[str, str]:
+    """Return the path of each photo once it is inpainted: what is neither JPEG nor PNG becomes PNG.
+
+    a.tif becomes a.png, or a.tif.png where another photo has that name.
+    """
+    names = {photo: photo for photo in photos}
+    taken = {spelling_key(photo) for photo in names}
+    for photo in names:
+        pure = PurePosixPath(photo)
+        if pure.suffix.lower() in (*_JPEG, ".png"):
+            continue
+        names[photo], longer = str(pure.with_suffix(".png")), photo
+        while spelling_key(names[photo]) in taken:
+            names[photo] = longer = f"{longer}.png"
+        taken.add(spelling_key(names[photo]))
+    return names
 
 
 def full_size(
     keep: np.ndarray,  # [h, w] in {0, 1}, 1 = static, of the undistorted and reduced photo
     photo: np.ndarray,  # [H, W, 3] uint8, as it was taken
     lens: Lens | None,  # None: the photo was not undistorted
-    *,
-    follow_edges: bool = True,
 ) -> np.ndarray:  # [H, W] bool
     """Return the mask of a photo at its own size, along its edges."""
     size = photo.shape[1], photo.shape[0]
     soft = np.asarray(keep, np.float32)
     large = cv2.resize(soft, size, interpolation=cv2.INTER_LINEAR) if lens is None else lens.distort(soft)
-    if not follow_edges or keep.min() == keep.max():
+    if keep.min() == keep.max():
         return large >= 0.5
     radius = max(1, round(RADIUS * max(size) / max(keep.shape)))
     guided, rows = np.empty_like(large), max(1, _STRIP // size[0])
@@ -297,9 +344,12 @@ def _photos_of(scene: Scene) -> _CapturePhotos:
     folder = "images"
     if not (scene.root / folder).is_dir():
         folder = f"images_{scene.info['loaded_factor']}"
+    files = (path for path in sorted((scene.root / folder).rglob("*")) if path.is_file() and is_photo(path))
+    by_name = {path.relative_to(scene.root / folder).as_posix(): path for path in files}
+    by_stem = {str(PurePosixPath(name).with_suffix("")): path for name, path in by_name.items()}
     inside = []
-    for view in scene.views:
-        path = next((scene.root / folder / Path(view.name).parent).glob(f"{Path(view.name).stem}.*"), None)
+    for view in scene.views:  # at another factor the file may have another suffix
+        path = by_name.get(view.name) or by_stem.get(str(PurePosixPath(view.name).with_suffix("")))
         if path is None:
             raise AwError(f"{scene.root / folder} has no photo {view.name}: restore it")
         name = path.relative_to(scene.root / folder).as_posix()
@@ -312,10 +362,17 @@ def _photos_of(scene: Scene) -> _CapturePhotos:
     )
 
 
-def _check_place(place: Path, outside: dict[str, Path], photos: Path) -> None:
-    # A folder called masks is never taken for photos, and tools look for it beside them.
-    among = {} if place.name.lower() in MASK_FOLDERS else {f"the photos {photos}": photos}
-    check_output(place, outside=outside | among, new=True)
+def _check_places(output: Path, inpaint: Path | None, outside: dict[str, Path], photos: Path) -> None:
+    for place in (output, *([inpaint] if inpaint else [])):
+        # A folder called masks is never taken for photos, and tools look for it beside them.
+        among = {} if place.name.lower() in MASK_FOLDERS else {f"the photos {photos}": photos}
+        check_output(place, outside=outside | among, new=True)
+    if inpaint:
+        one, other = output.resolve(), inpaint.resolve()
+        if one.is_relative_to(other) or other.is_relative_to(one):
+            raise AwError(
+                f"--inpaint {inpaint} is, holds or lies in the folder of the masks: give another one"
+            )
 
 
 @contextlib.contextmanager
@@ -337,18 +394,14 @@ def _write_mask(path: Path, opened: _Opened, keep: np.ndarray, style: MaskStyle)
     _save(path, image, _tagged(opened.tag))
 
 
-def _write_photo(
-    folder: Path, source: Path, photo: OriginalPhoto, opened: _Opened, image: np.ndarray
-) -> None:
-    """Write an inpainted photo as JPEG with the EXIF of the original, or as PNG if that is no JPEG."""
+def _write_photo(path: Path, source: Path, opened: _Opened, image: np.ndarray) -> None:
+    """Write an inpainted photo, as JPEG with the EXIF of the original."""
     exif = _tagged(opened.tag)
-    jpeg = source.suffix.lower() in (".jpg", ".jpeg", ".jpe", ".jfif")
-    if jpeg:
+    if source.suffix.lower() in _JPEG:
         # damaged EXIF is left out
         with contextlib.suppress(Exception), pillow().open(source, formats=("JPEG",)) as file:
             exif = file.getexif()
-    path = folder / photo.source
-    _save(path if jpeg else path.with_suffix(".png"), opened.stored(image), exif)
+    _save(path, opened.stored(image), exif)
 
 
 def _tagged(turn: int) -> object | None:
@@ -363,6 +416,6 @@ def _tagged(turn: int) -> object | None:
 def _save(path: Path, image: np.ndarray, exif: object | None) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     more = {} if exif is None else {"exif": exif}
-    if path.suffix != ".png":
+    if path.suffix.lower() != ".png":
         more |= {"format": "JPEG", "quality": _QUALITY, "subsampling": 0}
     pillow().fromarray(image).save(path, **more)

@@ -40,15 +40,14 @@ class Inpainting:
         self._keeps = keeps
         self._unseen = self._unseen_shares(scene.train)
 
-    def share_unseen(self, name: str) -> float:
-        """Return the share of a photo's masked pixels whose surface no other photo shows unmasked."""
-        return self._unseen[name]
-
     def why_not(self, name: str) -> str:
         """Return why a photo is left out; empty where it is not."""
-        if self.share_unseen(name) <= UNSEEN:
+        if self._unseen[name] <= UNSEEN:
             return ""
-        return f"no other photo shows {UNSEEN:.0%} or more of what is masked, so the model cannot know it"
+        return (
+            f"more than {UNSEEN:.0%} of the masked area is visible in no other photo, so the model cannot "
+            "know it"
+        )
 
     def draw(
         self,

@@ -2,7 +2,6 @@
 
 import pytest
 
-from ambiguous_wild.cli.photo_masks import TOOLS
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.mask_files import MASK_STYLES, OWN_STYLE, find_masks, mask_names
 
@@ -26,7 +25,6 @@ def test_names_are_those_that_the_tools_document():
         "realityscan": "a.jpg.mask.png", "postshot": "a.png", "lichtfeld": "a.png", "own": "a.png",
     }  # fmt: skip
     assert [tool for tool, style in STYLES.items() if style.left_out] == ["postshot"]
-    assert set(TOOLS) == set(MASK_STYLES)
 
 
 def test_two_photos_never_share_a_mask():

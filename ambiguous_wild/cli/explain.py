@@ -50,6 +50,8 @@ def command(run: Path, photo: str, column: int, row: int) -> None:
     trainer, method = open_run(run), read_config(run).get("method")
     names = [view.name for view in trainer.data.scene.train]
     view = find_view(trainer.data.scene.train, photo)
+    if view is None and find_view(trainer.data.scene.test, photo):
+        raise AwError(f"{photo} is a test photo: only train photos have masks")
     if view is None:
         raise unknown("train photo", photo, names)
     index = names.index(view.name)

@@ -25,7 +25,7 @@ from ambiguous_wild.io.terminal import line_width, say, wrapped
 # `aw --help` imports no command.
 SECTIONS = {
     "In one go": {
-        "try": ("try_all", "Try it on your photos or video: scene, two methods, page and table in one go."),
+        "try": ("try_all", "Try it on your photos or video: scene, splat without distractors, masks, page."),
         "masks": (
             "photo_masks",
             "Masks of your photos, or of a run, in the names of COLMAP, RealityScan, ...",

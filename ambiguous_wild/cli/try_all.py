@@ -23,7 +23,7 @@ from ambiguous_wild.cli.options import (
 )
 from ambiguous_wild.cli.run_progress import ProgressBar
 from ambiguous_wild.core.errors import AwError, counted
-from ambiguous_wild.io.files import own_json
+from ambiguous_wild.io.files import check_output, own_json
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell
@@ -65,8 +65,11 @@ def command(
     aw try walk.mp4 -o out --budget 15m
     """
     from ambiguous_wild.cli.bench import parse_budget
+    from ambiguous_wild.harness.benchmark import find_methods
 
     begin, seconds = time.monotonic(), parse_budget(budget)
+    find_methods([methods], (), {}, 1)  # a misspelt name is refused before the scene is built
+    check_output(output / "scene", outside={"the photos": source})
     photos, scene, runs, plan = (output / name for name in ("photos", "scene", "runs", "plan.json"))
     video = source.is_file()
     if not video:
@@ -95,15 +98,21 @@ def command(
     if several:
         step("table", runs)
         step("figure", runs, "-o", output / "comparison.png", "--with-masks")
+    from ambiguous_wild.harness.result_file import RESULT, read_result
     from ambiguous_wild.harness.trained_models import next_steps, read_models
 
     say("")
     say(f"{_minutes(time.monotonic() - begin)}. What you have now, and what you can do with it:")
     say(f"  page for any browser: {output / 'view' / 'index.html'}")
-    for line in next_steps(read_models([runs])):
+    shown = read_models([runs])
+    for line in next_steps(shown, on_page=False):
         say(f"  {line.replace('`', '')}")
-    longer = command_line(budget=f"{math.ceil(3 * seconds)}s" if seconds < 60 else f"{3 * seconds / 60:.0f}m")
-    say(f"  to train the same model longer: {longer}")
+    iterations = min(read_result(run / RESULT)["cost"]["iterations"] for run in shown.runs)
+    if iterations < SHARP:
+        longer = command_line(budget=_enough(seconds, iterations))
+        say(
+            f"{_rounded(iterations)} iterations: {_grade(iterations)}. A sharp splat, by training it on: {longer}"
+        )
 
 
 def train_within(
@@ -197,15 +206,18 @@ def _announced(source: Path, scene: Path, seconds: float) -> str:
     from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
     count = FRAMES
+    if source.suffix.lower() in PHOTO_SUFFIXES and source.is_file():
+        raise AwError(f"{source} is one photo: give a folder of photos, or a video")
     if source.is_dir():
         names = [name for _, _, files in os.walk(source) for name in files]
         count = sum(Path(name).suffix.lower() in PHOTO_SUFFIXES for name in names)
         if not count:
             raise AwError(f"{source} holds no photos: give a folder of photos, or a video")
     scene_s = 0.0 if (scene / "scene.json").exists() else SCENE_S[0] + SCENE_S[1] * count
-    total = max(seconds, scene_s + SHORTEST_S + AROUND_S[0] + AROUND_S[1] * count)
+    least = scene_s + SHORTEST_S + AROUND_S[0] + AROUND_S[1] * count
     built = f", of which {_minutes(scene_s)} for the scene" if scene_s else ""
-    return f"{counted(count, 'photo')}: about {_minutes(total)}{built}"
+    short = f"; --budget {_minutes(seconds)} is too short" if least > seconds else ""
+    return f"{counted(count, 'photo')}: about {_minutes(max(seconds, least))}{built}{short}"
 
 
 def _minutes(seconds: float) -> str:
@@ -215,12 +227,21 @@ def _minutes(seconds: float) -> str:
 def _budget_line(budget_s: float, iterations: float, methods: int) -> str:
     """Return what a budget buys on this machine, and which one would give a sharp splat."""
     each = " for each method" if methods > 1 else ""
-    text = f"{_minutes(budget_s)} of training{each}: about {_rounded(iterations)} iterations here"
+    text = (
+        f"{_minutes(budget_s)} of training{each}: about {_rounded(iterations)} iterations here, which give "
+    )
     if iterations >= SHARP:
-        return f"{text}, which gives a sharp splat"
-    grade = "a sketch" if iterations < GOOD else "a soft splat"
-    enough = methods * SHARP / iterations * budget_s / 60 + 2
-    return f"{text}, which gives {grade}; --budget {5 * -(-enough // 5):.0f}m gives a sharp one"
+        return f"{text}{_grade(iterations)}"
+    return f"{text}{_grade(iterations)}; --budget {_enough(methods * budget_s, iterations)} gives a sharp one"
+
+
+def _grade(iterations: float) -> str:
+    return "a sharp splat" if iterations >= SHARP else "a soft splat" if iterations >= GOOD else "a sketch"
+
+
+def _enough(seconds: float, iterations: float) -> str:
+    """Return the budget for a sharp splat, where `seconds` give this number of iterations."""
+    return f"{5 * math.ceil((SHARP / iterations * seconds / 60 + 1) / 5)}m"
 
 
 def _rounded(count: float) -> str:

@@ -180,6 +180,8 @@ def find_view(views: Sequence[View], photo: str) -> View | None:
     """
     found = [view for view in views if view.name == photo]
     found = found or [v for v in views if photo in (PurePath(v.name).name, PurePath(v.name).stem)]
+    # a scene holds PNG files of photos that may have been JPEG files
+    found = found or [v for v in views if PurePath(photo).stem == PurePath(v.name).stem]
     if len(found) > 1:
         names = ", ".join(view.name for view in found)
         raise AwError(f"{photo} names several photos: {names}; name one in full")

@@ -265,12 +265,17 @@ def _from_here(path: Path, runs: Path) -> Path:
     return Path(path.name)
 
 
-def next_steps(shown: SceneModels) -> list[str]:
-    """Return where masks and splat files of runs lie, and commands for them, for the page's panel."""
+def next_steps(shown: SceneModels, *, on_page: bool = True) -> list[str]:
+    """Return where masks and splat files of runs lie, and commands for them.
+
+    `on_page`: folders of this machine are not named.
+    """
     steps: list[str] = []
     for run, model in zip(shown.runs, shown.models):
         runs = run.resolve().parents[2]
-        place = str(_from_here(run.resolve(), runs))
+        place, root = str(run), str(run.parents[2])
+        if on_page:
+            place, root = str(_from_here(run.resolve(), runs)), str(_from_here(runs, runs))
         if model.masks is not None:
             steps.append(f"masks of {model.label}, white = static: `{place}/{MASKS}`")
             full = shlex.join(["aw", "masks", place, "-o", "masks"])
@@ -278,7 +283,7 @@ def next_steps(shown: SceneModels) -> list[str]:
         export = shlex.join(["aw", "export", place])
         steps.append(f"splat file of {model.label}: `{place}/{MODEL}`; as SPZ, SOG and glTF: `{export}`")
         if run == shown.runs[-1]:
-            steps.append(f"table of the runs: `{shlex.join(['aw', 'table', str(_from_here(runs, runs))])}`")
+            steps.append(f"table of the runs: `{shlex.join(['aw', 'table', root])}`")
     return steps
 
 

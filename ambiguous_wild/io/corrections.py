@@ -21,6 +21,7 @@ from ambiguous_wild.io.untrusted import read_bytes, read_json
 CORRECTIONS = "corrections.json"
 VERSION = 1
 MAX_SIDE = 4096  # px of a picture
+LEAST_SHARE = 0.02  # of the photo's width
 MAX_BYTES = 100_000_000
 _MASKED, _STATIC = 64, 192  # codes below and above: what the resizing of a page leaves near black and white
 
@@ -76,6 +77,8 @@ class CorrectionsFile:
             )
         cameras = {view.name: view.camera for view in scene.train}
         for name in photos:
+            if name in {view.name for view in scene.test}:
+                raise AwError(f"{self.path} corrects {name}, a test photo: only train photos have masks")
             if name not in cameras:
                 raise unknown(f"train photo in {self.path}", name, list(cameras))
         return {name: self._picture(name, text, cameras[name]) for name, text in photos.items()}
@@ -88,7 +91,8 @@ class CorrectionsFile:
                 f"{where} is no whole PNG of up to {MAX_SIDE} px; save it in the page of 'aw view' again"
             )
         height, width = picture.shape
-        if abs(height * camera.width - width * camera.height) > 2 * max(camera.width, camera.height):
+        expected = width * camera.height / camera.width
+        if abs(height - expected) > 1 or width < LEAST_SHARE * camera.width:
             raise AwError(f"{where} is {width}x{height} px, the photo {camera.width}x{camera.height}")
         return picture
 

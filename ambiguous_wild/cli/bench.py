@@ -22,7 +22,7 @@ from ambiguous_wild.cli.options import (
     training_options,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
-from ambiguous_wild.cli.study_file import Study, decisive, is_plan, read_study, write_study
+from ambiguous_wild.cli.study_file import StudyFile, decisive, is_plan, read_study, write_study
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.benchmark import Engine, bench
@@ -60,7 +60,7 @@ def parse_budget(text: str) -> float:
 
 
 @click.command(name="bench", cls=SectionedCommand)
-@click.argument("study", required=False, is_eager=True, type=PathName(), callback=read_study)
+@click.argument("study", required=False, is_eager=True, callback=read_study)
 @click.option(
     "--method",
     "methods",
@@ -150,7 +150,7 @@ def parse_budget(text: str) -> float:
 @click.pass_context
 def command(
     ctx: click.Context,
-    study: Study | None,
+    study: StudyFile | None,
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
     suite_name: str | None,
@@ -193,10 +193,10 @@ def command(
       train.checkpoint_every_s=60  seconds between checkpoints
       train.on_nonfinite=stop      at a NaN; rollback: leave that photo out
       engine.retries=3             of a run whose process or node was lost
-      engine.cpus_per_cell=1       with Ray: CPUs per run, also its threads; --threads if it is given
-      engine.gpus_per_cell=1       with Ray on cuda: GPUs per run; with 0.5 two runs share one
+      engine.cpus_per_cell=1       with Ray: CPUs per run, also its threads
+      engine.gpus_per_cell=1       with Ray on cuda: GPUs per run, 0.5: two share one
       engine.memory_per_cell=GB    with Ray: memory per run
-      engine.transfer=store        with Ray: send scenes and runs; shared: both on shared storage
+      engine.transfer=store        with Ray: send scenes and runs; else shared storage
       engine.transfer_limit=4000   with Ray: MB of the largest scene or run
     """
     if iterations is not None and budgets:
@@ -261,7 +261,7 @@ class _Recorded(ProgressBar):
     """Also writes the options of the command beside its runs, when the first run begins."""
 
     def __init__(
-        self, ctx: click.Context, values: Mapping[str, Any], study: Study | None, output: Path
+        self, ctx: click.Context, values: Mapping[str, Any], study: StudyFile | None, output: Path
     ) -> None:
         super().__init__()
         self.ctx, self.values, self.study, self.output = ctx, values, study, output

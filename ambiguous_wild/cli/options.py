@@ -22,7 +22,7 @@ OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
     "Structure from motion": ("--sfm", "--matcher", "--mapper", "--camera", "--max-features", "--part"),
     "Training": ("--set", "--sweep", "--resolution", "--factor", "--max-gaussians", "--start", "--suite",
                  "--protocol", "--plugin", "--metric-file"),
-    "Ray": ("--engine", "--address", "--cpus-per-cell", "--gpus-per-cell", "--transfer"),
+    "Ray": ("--engine", "--address"),
 }  # fmt: skip
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does

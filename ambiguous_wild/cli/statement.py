@@ -24,7 +24,7 @@ def command(runs: tuple[Path, ...], output: Path | None) -> None:
     aw statement runs -o reproducibility.tex
     """
     from ambiguous_wild.io.files import write_text
-    from ambiguous_wild.report.statement import statement, to_latex, to_markdown, to_text
+    from ambiguous_wild.report.reproducibility import statement, to_latex, to_markdown, to_text
 
     style = style_of(output, SUFFIXES)
     said = statement(runs)

@@ -40,7 +40,7 @@ Values = Mapping[str, Any]  # by the name of the parameter, or of the option
 
 
 @dataclass(frozen=True)
-class Study:
+class StudyFile:
     """A file that was given to the command."""
 
     path: Path
@@ -79,24 +79,25 @@ class Study:
             )
 
 
-def read_study(ctx: click.Context, _: click.Parameter, path: Path | None) -> Study | None:
+def read_study(ctx: click.Context, _: click.Parameter, word: str | None) -> StudyFile | None:
     """Make the options of the file the defaults of the command (a callback of the argument STUDY).
 
     Raises:
         AwError: it cannot be read, has an unknown key, or a value that is none of its option's.
         click.UsageError: the word is no file of a study, but meant otherwise.
     """
-    if path is None or ctx.resilient_parsing:
+    if word is None or ctx.resilient_parsing:
         return None
+    path = Path(word)
     if path.suffix.lower() not in (".yaml", ".yml"):
-        raise click.UsageError(f"Got unexpected extra argument ({path})", ctx)
+        raise click.UsageError(f"Got unexpected extra argument ({word})", ctx)
     if not path.is_file():
         raise AwError(f"no study {path}: an 'aw bench' writes {NAME}.yaml beside its runs")
     data = plain_yaml.read_mapping(path)
     run = data if "config_hash" in data else {}
     texts = _texts(ctx, _options_of_run(path, run) if run else data, path)
     ctx.default_map = texts
-    return Study(path, tuple(texts.get("settings", ())), run)
+    return StudyFile(path, tuple(texts.get("settings", ())), run)
 
 
 def _texts(ctx: click.Context, data: Mapping[Any, Any], path: Path) -> dict[str, Any]:
@@ -118,7 +119,9 @@ def _texts(ctx: click.Context, data: Mapping[Any, Any], path: Path) -> dict[str,
         option = options[key]
         where = f"{path}: {key}"
         if key == "set" and isinstance(value, dict):
-            value = [f"{name}={_word(inner, f'{where}: {name}')}" for name, inner in value.items()]
+            value = [
+                f"{name}={_word(inner, f'{where}: {name}', lists=True)}" for name, inner in value.items()
+            ]
         if option.is_flag:
             if not isinstance(value, bool):
                 raise AwError(f"{where}: write true or false, not {quoted(value)}")
@@ -147,15 +150,15 @@ def decisive(ctx: click.Context) -> list[str]:
     return [str(option.name) for key, option in _options(ctx).items() if key not in NOT_READ | NOT_WRITTEN]
 
 
-def _word(value: Any, where: str) -> str:
+def _word(value: Any, where: str, *, lists: bool = False) -> str:
     """Return a plain value as a word of the command line.
 
     Raises:
         AwError: a mapping, nothing, or a text that no command line can hold.
     """
-    items = value if isinstance(value, list) else [value]
+    items = value if isinstance(value, list) and lists else [value]
     if not all(isinstance(item, str | int | float) for item in items):
-        raise AwError(f"{where}: a text, a number, or a list of these is expected, not {quoted(value)}")
+        raise AwError(f"{where}: a text or a number is expected, not {quoted(value)}")
     text = option_text(value)
     if plain(text) != text:
         raise AwError(f"{where}: {quoted(text)} holds an invisible character: leave it out")

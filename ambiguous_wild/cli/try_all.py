@@ -143,8 +143,9 @@ def train_within(
     # More Gaussians than so short a run can train cost iterations: monstree in 100 s had 21.09 dB with 103 000
     # in 1531 iterations, and 21.56 dB with 60 000 in 2190.
     most = 1000 * round(1e-3 * pixels * min(max(budget_s / one_s / FULL_GROWTH, LEAST_GROWTH), 1.0))
+    here_s = REFINESPLAT_TIME * expected_s(1, pixels, most) * slowness()
     say("")
-    say(_budget_line(budget_s, budget_s / (one_s * slowness()), len(names)))
+    say(_budget_line(budget_s, budget_s / here_s, len(names)))
     words = ["bench", "--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
     words += ["--max-gaussians", str(most), "--effects", str(plan), "--overwrite", "longer", "-o", str(runs)]
     print_command(*words)

@@ -44,6 +44,7 @@ from ambiguous_wild.harness.training import STOPPED, train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.corrections import CORRECTIONS
 from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
+from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
 from ambiguous_wild.methods.references import error_location
 from ambiguous_wild.splat.training_loop import Tick
@@ -57,7 +58,7 @@ EFFECTS = "effects.json"
 OURS = (
     RESULT, FAILED, TRACEBACK, CONFIG, CORRECTIONS, ENVIRONMENT, LOG_FILE, EFFECTS, FIRST_PASS, STOPPED, ROWS,
     WORK, LOGS, NONFINITE, "checkpoint", "export", "masks", "pictures", "point_cloud.ply", "renders",
-    "timeline.csv",
+    REASONS, "timeline.csv",
 )  # fmt: skip
 # Files that a run writes before there is anything worth keeping in its folder.
 _WORTHLESS = {CONFIG, CORRECTIONS, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK, LOG_FILE}

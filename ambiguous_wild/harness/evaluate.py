@@ -177,9 +177,18 @@ def explained_keep(trainer: Trainer, step: Step) -> tuple[torch.Tensor | None, M
         return keep, reasons
     outside = (own <= 0.5).cpu().numpy()
     regions = np.full(outside.shape, -1) if reasons is None else reasons.regions.astype(int) - 1
-    sentences = () if reasons is None else reasons.sentences
-    regions[outside] = len(sentences)
-    return keep, reasons_of(regions, [*sentences, "masked: the capture's own mask leaves it out"])
+    sentences = [] if reasons is None else list(reasons.sentences)
+
+    def add(where: np.ndarray, sentence: str) -> None:
+        regions[where] = len(sentences)
+        sentences.append(sentence)
+
+    add(outside, "masked: the capture's own mask leaves it out")
+    by_hand = trainer.data.by_hand[step.view] if trainer.data.by_hand else None
+    if by_hand is not None:
+        add((by_hand < 0).cpu().numpy(), "masked: by hand")
+        add((by_hand > 0).cpu().numpy(), "kept: by hand")
+    return keep, reasons_of(regions, sentences)
 
 
 def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path) -> MaskScores | None:

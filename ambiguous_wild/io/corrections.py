@@ -7,8 +7,6 @@ A picture has the aspect of its photo: 0 = distractor, 255 = static, grey = as t
 
 from __future__ import annotations
 
-import base64
-import binascii
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,14 +15,13 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.files import sha256_file, write_bytes
-from ambiguous_wild.io.images import decode, header_size
+from ambiguous_wild.io.page_parts import png_of
 from ambiguous_wild.io.untrusted import read_bytes, read_json
 
 CORRECTIONS = "corrections.json"
 VERSION = 1
 MAX_SIDE = 4096  # px of a picture
 MAX_BYTES = 100_000_000
-_URI = "data:image/png;base64,"
 _MASKED, _STATIC = 64, 192  # codes below and above: what the resizing of a page leaves near black and white
 
 
@@ -58,7 +55,7 @@ class CorrectionsFile:
         """Return the corrections [h, w] uint8 of the scene's train photos, by the photo's name.
 
         Raises:
-            AwError: the file has changed, is of another scene or damaged, or names no train photo.
+            AwError: the file has changed, is of another scene, damaged or empty, or names no train photo.
         """
         if sha256_file(self.path) != self.sha256:
             raise AwError(f"{self.path} has changed since the run was planned; bench again")
@@ -73,6 +70,10 @@ class CorrectionsFile:
                 f"{self.path} corrects scene {content.get('scene')!r}, not {scene.name!r}: give the file of "
                 "this scene"
             )
+        if not photos:
+            raise AwError(
+                f"{self.path} corrects no photo: correct a mask in the page of 'aw view', then save"
+            )
         cameras = {view.name: view.camera for view in scene.train}
         for name in photos:
             if name not in cameras:
@@ -81,18 +82,11 @@ class CorrectionsFile:
 
     def _picture(self, name: str, text: object, camera: Camera) -> np.ndarray:
         where = f"{self.path}: the correction of {name}"
-        try:
-            data = base64.b64decode(str(text).removeprefix(_URI), validate=True)
-        except (binascii.Error, ValueError):
-            data = b""
-        size = header_size(data) if data else None
-        if size is None or max(size) > MAX_SIDE:
-            raise AwError(f"{where} is no PNG of up to {MAX_SIDE} px; save it in the page of 'aw view' again")
-        import cv2
-
-        picture = decode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE, where)
+        picture = png_of(text, MAX_SIDE, MAX_SIDE)
         if picture is None:
-            raise AwError(f"{where} does not decode; save it in the page of 'aw view' again")
+            raise AwError(
+                f"{where} is no whole PNG of up to {MAX_SIDE} px; save it in the page of 'aw view' again"
+            )
         height, width = picture.shape
         if abs(height * camera.width - width * camera.height) > 2 * max(camera.width, camera.height):
             raise AwError(f"{where} is {width}x{height} px, the photo {camera.width}x{camera.height}")
@@ -115,13 +109,14 @@ def corrected(
         camera: of the photo, H x W.
 
     Returns:
-        the keep map, and where a person marked the photo as static; both [H, W] float32 or None.
+        the keep map, and what was marked by hand: 1 = static, -1 = distractor, 0 = nothing; both [H, W]
+        float32 or None.
     """
     if correction is None:
         return keep, None
     import cv2
 
     resized = cv2.resize(correction, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-    static = (resized > _STATIC).astype(np.float32)
-    own = np.ones_like(static) if keep is None else keep
-    return np.where(resized < _MASKED, np.float32(0), np.maximum(own, static)), static
+    by_hand = (resized > _STATIC).astype(np.float32) - (resized < _MASKED)
+    own = np.ones_like(by_hand) if keep is None else keep
+    return np.where(by_hand == 0, own, by_hand > 0).astype(np.float32), by_hand.astype(np.float32)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.io.files import own_json, write_json
-from ambiguous_wild.io.page_parts import data_uri
+from ambiguous_wild.io.page_parts import data_uri, png_of
 
 FILE = "reasons.json"  # in the run's folder
 WIDTH = 320  # px, largest width of a written map
 _MAX_REGIONS = 255
 _MAX_SENTENCE = 300  # characters
-_PNG = "data:image/png;base64,"
 
 
 @dataclass(frozen=True)
@@ -83,19 +80,8 @@ def read_reasons(path: Path) -> dict[str, MaskReasons]:
 
 
 def _read(row: object) -> MaskReasons | None:
-    import cv2
-
     uri, sentences = (row.get("regions"), row.get("sentences")) if isinstance(row, dict) else (None, None)
-    if not isinstance(uri, str) or not uri.startswith(_PNG) or not isinstance(sentences, list):
-        return None
-    try:
-        data = base64.b64decode(uri.removeprefix(_PNG), validate=True)
-    except binascii.Error:
-        return None
-    size = np.frombuffer(data[16:24], ">u4")  # width and height, at a fixed place in each PNG
-    if len(size) < 2 or not 0 < size[0] <= WIDTH or not 0 < size[1] <= 100 * WIDTH:
-        return None
-    regions = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if regions is None or regions.max(initial=0) > len(sentences):
+    regions = png_of(uri, WIDTH, 100 * WIDTH)
+    if regions is None or not isinstance(sentences, list) or regions.max(initial=0) > len(sentences):
         return None
     return MaskReasons(regions, tuple(str(sentence)[:_MAX_SENTENCE] for sentence in sentences))

@@ -313,9 +313,7 @@ class GrowingPage:
         pause_s = max(min(max(now, FIRST_PAGE_S), LONGEST_PAUSE_S), LEAST_PAUSE * self._cost_s)
         self._due = now + pause_s
         try:
-            self._write(
-                f"{_state(trainer)}; this page shows the next state by itself", pause_s + self._cost_s
-            )
+            self._write(_state(trainer), pause_s + self._cost_s)
         except (AwError, OSError) as error:  # no reason to end a training
             LOG.warning("the page could not be written: %s", error)
             return False

@@ -53,12 +53,12 @@ def load_train_data(
     if not scene.train:
         raise AwError(f"scene {scene.root} has no training views: check train_list.txt")
     keeps: list[Tensor | None] = []
-    marked: list[Tensor | None] = []
+    by_hand: list[Tensor | None] = []
     for view in scene.train:
         keep = load_keep(view, with_alpha="files" not in scene.info)
-        keep, static = corrected(keep, (corrections or {}).get(view.name), view.camera)
+        keep, hand = corrected(keep, (corrections or {}).get(view.name), view.camera)
         keeps.append(None if keep is None else torch.from_numpy(keep).to(device))
-        marked.append(None if static is None else torch.from_numpy(static).to(device))
+        by_hand.append(None if hand is None else torch.from_numpy(hand).to(device))
     cameras = [view.camera for view in scene.train]
     return TrainData(
         scene=scene,
@@ -68,7 +68,7 @@ def load_train_data(
         device=device,
         seed=seed,
         cache_dir=cache_dir,
-        marked_static=marked if corrections else (),
+        by_hand=by_hand if corrections else (),
     )
 
 

@@ -321,9 +321,10 @@ class Trainer:
             AwError: the policy's map is no tensor, or its values are out of range.
         """
         check_keep(keep, read=self.device_check is None)
-        static = self.data.marked_static[step.view] if self.data.marked_static else None
-        if keep is not None and static is not None:
-            keep = torch.where(shrink_keep(static, step.downsampling) > 0.5, torch.ones_like(keep), keep)
+        by_hand = self.data.by_hand[step.view] if self.data.by_hand else None
+        if keep is not None and by_hand is not None:
+            static = shrink_keep((by_hand > 0).float(), step.downsampling) > 0.5
+            keep = torch.where(static, torch.ones_like(keep), keep)
         user = self.data.user_keep[step.view]
         if user is None:
             return keep

@@ -101,7 +101,8 @@ def page_text(
         next_steps: lines of the panel "What next"; text between two ` is a command or a path.
         training: how far the training is, if it goes on, as a sentence; "" = it has ended.
         reload_s: seconds after which the page loads itself again, counted from when its models are drawn;
-            0 = never. It waits while somebody moves the camera or has something that is not saved.
+            0 = never. It waits while somebody moves the camera or has something that is not saved, and stops
+            after ten times in which `training` did not change.
         say: called with a line for each model.
 
     Raises:

@@ -45,7 +45,7 @@ MISTAKES = [
     (f"{BENCH} mine:trimmed", "write FILE.py:RECIPE, as mine.py:trimmed"),
     (f"{BENCH} 3dgs,refinsplat", "unknown method 'refinsplat': did you mean 'refinesplat'"),
     (f"{BENCH} own.py", "error: own.py is a file: add the name of a recipe in it: own.py:chroma\n"),
-    (f"{BENCH} 3dgs --overwrite perhaps", "'never', 'missing', 'changed', 'always'"),
+    (f"{BENCH} 3dgs --overwrite perhaps", "'never', 'missing', 'longer', 'changed', 'always'"),
     (f"{BENCH} 3dgs --itterations 5", "--iterations"),
     (f"{BENCH} refinesplat --set refinesplat.lamda_cr=1", "did you mean 'lambda_cr'"),
     (f"{BENCH} refinesplat --set refinesplat.lambda_dssim=nan", "finite"),

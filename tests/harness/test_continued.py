@@ -19,6 +19,7 @@ from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.job import make_cell, make_job
 from ambiguous_wild.harness.replay import open_run
 from ambiguous_wild.io.images import read_gray
+from ambiguous_wild.io.mask_reasons import read_reasons
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.report.board_verify import verify
 from ambiguous_wild.splat.pace import TrainConfig
@@ -118,6 +119,9 @@ def test_corrections_decide_what_is_masked(scene, tmp_path):
     assert report.outcomes == {"trained": 1}
     after = read_gray(folder / "masks" / name)
     assert (after[:, LEFT] == 0).all() and (after[:, RIGHT] == 255).all()
+    reasons = read_reasons(folder / "reasons.json")
+    sentences = [reasons[name].at(column, 20) for column in (4, WIDTH - 4)]
+    assert sentences == ["masked: by hand", "kept: by hand"]
     other = [read_gray(folder / "masks" / n) for n in TRAIN if n != name]
     assert all((mask == 255).any() and (mask == 0).any() for mask in other)
     # the run holds its corrections, and longer ones keep them
@@ -135,11 +139,13 @@ def test_corrections_decide_what_is_masked(scene, tmp_path):
     ("photos", "changed", "message"),
     [
         ({"nowhere.png": halves()}, {}, "nowhere.png"),
+        ({}, {}, "corrects no photo"),
         ({TRAIN[0]: halves()}, {"scene": "garden"}, "corrects scene 'garden', not 'scene'"),
         ({TRAIN[0]: halves()}, {"version": 9}, "no corrections of version 1"),
         ({TRAIN[0]: np.zeros((9, 99), np.uint8)}, {}, "is 99x9 px, the photo 64x48"),
-        ({}, {"photos": {TRAIN[0]: "data:image/png;base64,AAAA"}}, "is no PNG"),
-        ({}, {"photos": {TRAIN[0]: 3}}, "is no PNG"),
+        ({}, {"photos": {TRAIN[0]: "data:image/png;base64,AAAA"}}, "is no whole PNG"),
+        ({}, {"photos": {TRAIN[0]: 3}}, "is no whole PNG"),
+        ({}, {"photos": {TRAIN[0]: "data:image/png;base64,é"}}, "is no whole PNG"),
         ({}, {"photos": [1]}, "no corrections of version 1"),
     ],
 )

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.main import cli
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import replay as replay_module
+from ambiguous_wild.harness.cell_run import OURS
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.replay import open_run, replay
 from ambiguous_wild.harness.result_file import read_result
@@ -137,18 +138,30 @@ def test_a_pixel_is_explained(masked):
     assert ((words == "kept") == (written > 0)).all()
 
 
-def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
+def test_whatever_a_run_writes_is_replaced_with_it(masked):
+    assert {path.name for path in masked.iterdir()} <= set(OURS)
+
+
+def test_the_captures_own_mask_and_corrections_are_reasons(masked, monkeypatch):
     load = replay_module.load_train_data
 
     def with_mask(scene, **more):
         data = load(scene, **more)
         own = [torch.zeros(photo.shape[:2]) for photo in data.photos]
-        return dataclasses.replace(data, user_keep=own)
+        hand = torch.zeros_like(own[0])
+        hand[:, 1] = -1.0
+        hand[:, 2] = own[0][:, 2] = 1.0  # as `corrected` joins both
+        return dataclasses.replace(data, user_keep=[own[0]] * len(own), by_hand=[hand] * len(own))
 
     monkeypatch.setattr(replay_module, "load_train_data", with_mask)
     photo = sorted((masked / "masks").rglob("*.png"))[0].stem
-    done = CliRunner().invoke(cli, ["explain", str(masked), photo, "0", "0"])
-    assert done.output.startswith("masked: the capture's own mask leaves it out\n")
+    for column, sentence in (
+        ("0", "masked: the capture's own mask leaves it out"),
+        ("1", "masked: by hand"),
+        ("2", "kept: by hand"),
+    ):
+        done = CliRunner().invoke(cli, ["explain", str(masked), photo, column, "0"])
+        assert done.output.startswith(f"{sentence}\n"), done.output
 
 
 @pytest.mark.parametrize(

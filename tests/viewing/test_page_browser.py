@@ -272,6 +272,15 @@ def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
         False,
     ]
     assert np.allclose(facts(browser, "camera.position.toArray()"), eye, atol=1e-3)
+    # a training that was killed writes no page any more
+    browser.run("sessionStorage.setItem(KEY, JSON.stringify([DATA.training, MOST_RELOADS]))")
+    browser.run("DATA.reload_s = 0.2")
+    browser.until(
+        f"{loaded}'training: 2 iterations' && $('training').textContent.includes('waits no longer')"
+    )
+    write("training: 3 iterations", 1000)
+    browser.run("location.reload()")
+    browser.until(f"{loaded}'training: 3 iterations' && $('training').textContent.includes('next state')")
     write("", 0)  # the last page
     browser.run("DATA.reload_s = 0.2")
     browser.until(f"{loaded}''")

@@ -346,7 +346,11 @@ def test_reasons_of_a_run_come_with_its_masks_and_damaged_ones_do_not(runs: Path
     assert (image_of(stored["regions"]) == regions + 1).all()
     record = own_json(run / "reasons.json")
     cut = stored["regions"][:-40] + "!"
-    rows = [{"regions": uri, "sentences": why} for uri in ("https://x", cut)]
+    head = "data:image/png;base64,"
+    # cut within the header; no ASCII; and a bitmap that seems 32 px wide where a PNG has its width
+    wide = cv2.imencode(".bmp", np.zeros((16, 8192), np.uint8))[1].tobytes()
+    odd = [head + base64.b64encode(data).decode() for data in (bytes(18), wide)]
+    rows = [{"regions": uri, "sentences": why} for uri in ("https://x", cut, f"{head}é", *odd)]
     for damaged in (*rows, {"regions": stored["regions"], "sentences": []}, 7, None):
         write_json(run / "reasons.json", record | {"photos": {TRAIN[0]: damaged}})
         assert facts(view_runs([run], tmp_path / "page").path.read_text())["models"][0]["reasons"] == {}

@@ -148,6 +148,20 @@ def test_masks_are_corrected_by_hand(masked: Browser, removed: Path) -> None:
     masked.click("#correct")
     masked.until("$('photo').className === 'large' && !$('tools').hidden")
     settle(masked)
+    # a region that is too large, a full undo and an empty file leave nothing that blocks the page
+    masked.click("#tool-region")
+    press(masked, spot(masked, 0.5, 0.95))
+    masked.until("$('corrected').textContent.includes('use the brush')")
+    assert not masked.run("unsaved()") and corrections(masked) == {}
+    masked.click("#tool-mask")
+    press(masked, spot(masked, 0.3, 0.8))
+    masked.until("steps.length === 1 && unsaved()")
+    masked.key("z")
+    masked.until("steps.length === 0")
+    assert not masked.run("unsaved()") and corrections(masked) == {}
+    masked.run("window.files = []; save = (name, blob) => files.push([name, blob])")
+    masked.click("#save-corrections")
+    assert masked.run("files.length === 0 && $('corrected').textContent === 'nothing is corrected yet'")
     press(masked, *(spot(masked, u, 0.8) for u in (0.2, 0.5, 0.7)))
     masked.until("steps.length === 1")
     painted = corrections(masked)[TRAIN[1]]
@@ -193,6 +207,17 @@ def test_masks_are_corrected_by_hand(masked: Browser, removed: Path) -> None:
     assert not masked.run("$('next-steps').hidden")
     assert "--iterations 150 --overwrite longer --corrections corrections.json" in panel
     masked.key("Escape")
+    # what is undone after it was saved is not in the file
+    press(masked, spot(masked, 0.3, 0.8))
+    masked.until("steps.length === 1 && unsaved()")
+    masked.key("z")
+    masked.until("steps.length === 0 && !unsaved()")
+    press(masked, spot(masked, 0.3, 0.8))
+    masked.until("steps.length === 1")
+    masked.click("#save-corrections")
+    masked.key("Escape")
+    masked.key("z")
+    masked.until("steps.length === 0 && unsaved()")
     masked.key("Escape")
     masked.until("$('tools').hidden && $('photo').className === ''")
     assert masked.errors == []

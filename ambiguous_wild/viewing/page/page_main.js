@@ -3,6 +3,7 @@ let R, T, camera, controls, over, under, wanted = true, pressed = new Set();
 let drawnAt = 0; // when the page was drawn for the first time
 let lastPicture = "", drawing = false; // what is shown; whether it is not yet on the screen
 let touched = location.hash.length > 1; // whether somebody chose what is shown
+const MOST_RELOADS = 10; // without a new state: a training that was killed writes none
 const isBeside = () => state.mode === "beside";
 const panes = () => (state.mode === "single" ? [over] : [over, under]);
 const dirty = () => { wanted = true; };
@@ -336,6 +337,8 @@ function listen() {
 /** While a run trains, its page is written again and again: load it anew, unless somebody is at work in this one. */
 function keepUp() {
   let used = 0, down = false;
+  const tell = (text) => { $("training").textContent = `${DATA.training}; ${text}`; };
+  if (reloads() > MOST_RELOADS) return tell("nothing has changed for long, so this page waits no longer: reload it if the training goes on");
   for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "keydown", "wheel", "input"]) {
     window.addEventListener(kind, (event) => {
       if (kind === "pointermove" && !down) return;
@@ -347,11 +350,23 @@ function keepUp() {
   setInterval(() => {
     const now = performance.now();
     const works = down || pressed.size || (used && now - used < 5000);
-    $("training").textContent = DATA.training + (unsaved() ? "; this page is not refreshed before you save your work" : "");
+    tell(unsaved() ? "this page is not refreshed before you save your work" : "this page shows the next state by itself");
     if (!drawnAt || now - drawnAt < 1000 * DATA.reload_s || works || unsaved()) return;
     if (touched) location.replace(place());
     location.reload();
   }, 250);
+}
+
+/** How often in this window the page was loaded in one state of the training; 0 where the browser stores nothing. */
+function reloads() {
+  try {
+    const [training, times] = JSON.parse(sessionStorage.getItem(KEY) ?? "[]");
+    const count = training === DATA.training ? times + 1 : 1;
+    sessionStorage.setItem(KEY, JSON.stringify([DATA.training, count]));
+    return count;
+  } catch {
+    return 0;
+  }
 }
 
 /** Whether something would be lost with the page. */

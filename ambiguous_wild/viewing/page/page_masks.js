@@ -5,7 +5,7 @@ const BRUSH = [0.012, 0.04]; // radius, as a share of the photo's width
 const STEPS = 30; // that can be undone
 const KEY = `aw corrections: ${DATA.scene} ${location.pathname}`;
 const corrections = new Map(); // name of a photo -> canvas
-const steps = []; // [name, its pixels before the step]
+const steps = []; // [name, its pixels before the step, whether they were saved]
 let correctionsSaved = true, correctionsKept = true; // in a file; by the browser
 
 /** The shown model whose mask of this photo is painted: the right one if both have one. */
@@ -93,7 +93,7 @@ function correcting(view) {
     corrections.set(view.name, canvas);
   }
   const context = canvas.getContext("2d", { willReadFrequently: true });
-  steps.push([view.name, context.getImageData(0, 0, canvas.width, canvas.height)]);
+  steps.push([view.name, context.getImageData(0, 0, canvas.width, canvas.height), correctionsSaved]);
   if (steps.length > STEPS) steps.shift();
   correctionsSaved = false;
   return context;
@@ -142,11 +142,11 @@ async function toggleRegion(view, u, v) {
 }
 
 function undo() {
-  const [name, pixels] = steps.pop() ?? [];
+  const [name, pixels, saved] = steps.pop() ?? [];
   if (!pixels) return;
   corrections.get(name).getContext("2d").putImageData(pixels, 0, 0);
   if (pixels.data.every((value, i) => i % 4 === 3 || value === UNCHANGED)) corrections.delete(name);
-  correctionsSaved = false;
+  correctionsSaved = saved || !corrections.size; // without corrections nothing can be lost
 }
 
 const correctionsFile = () => ({
@@ -158,6 +158,7 @@ const correctionsFile = () => ({
 function saveCorrections() {
   save("corrections.json", new Blob([JSON.stringify(correctionsFile())], { type: "application/json" }));
   correctionsSaved = true;
+  for (const step of steps) step[2] = false; // the file holds more than was there before them
   keepCorrections();
 }
 
@@ -179,7 +180,7 @@ async function recallCorrections() {
       context.drawImage(await image(file.photos[view.name]), 0, 0, context.canvas.width, context.canvas.height);
     }
     steps.length = 0;
-    correctionsSaved = saved ?? true;
+    correctionsSaved = saved || !corrections.size;
   } catch {
     corrections.clear();
   }
@@ -235,6 +236,10 @@ function stepBack() {
 }
 
 function keepFile() {
+  if (!corrections.size) {
+    $("corrected").textContent = "nothing is corrected yet";
+    return;
+  }
   saveCorrections();
   nextSteps();
   openPanel("next-steps", true);

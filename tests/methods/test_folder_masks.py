@@ -64,7 +64,7 @@ def as_built(scene, lens):
 
 
 def test_only_masks_of_photos_as_they_were_taken_are_undistorted(scene, tmp_path):
-    """A circle in a corner, where the lens moves it by more than its radius."""
+    """A circle in a corner, where the lens moves it by more than a pixel of the training size."""
     camera = ModelCamera(1, "SIMPLE_RADIAL", 512, 384, (480.0, 256.0, 192.0, 0.3))
     lens, loaded = make_lens(camera), as_built(load_scene(scene), camera)
     flat = lens.pinhole.width, lens.pinhole.height
@@ -85,7 +85,7 @@ def test_only_masks_of_photos_as_they_were_taken_are_undistorted(scene, tmp_path
         mask, keep = at(size, (60, 60))
         centre = np.argwhere(keep == 0).mean(0)[::-1] + 0.5
         expected = lens.undistort_points(np.array([[60.0, 60.0]]))[0] * [WIDTH / flat[0], HEIGHT / flat[1]]
-        assert np.abs(centre - expected).max() < 1 < np.abs(expected - np.array([7.5, 7.5])).max()
+        assert np.abs(centre - expected).max() < 0.4 < 1 < np.abs(expected - np.array([7.5, 7.5])).max()
 
 
 def test_a_lens_of_no_photo_is_refused_before_its_map_is_made(scene, tmp_path):

@@ -194,9 +194,9 @@ def command(
       train.on_nonfinite=stop      at a NaN; rollback: leave that photo out
       engine.retries=3             of a run whose process or node was lost
       engine.cpus_per_cell=1       with Ray: CPUs per run, also its threads
-      engine.gpus_per_cell=1       with Ray on cuda: GPUs per run, 0.5: two share one
+      engine.gpus_per_cell=1       with Ray: GPUs per run; 0.5: two share one
       engine.memory_per_cell=GB    with Ray: memory per run
-      engine.transfer=store        with Ray: send scenes and runs; else shared storage
+      engine.transfer=store        with Ray: send scenes; shared: shared storage
       engine.transfer_limit=4000   with Ray: MB of the largest scene or run
     """
     if iterations is not None and budgets:

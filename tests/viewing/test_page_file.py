@@ -323,7 +323,7 @@ def test_the_panel_names_files_and_the_command_that_trains_on(
             "--iterations 450 --overwrite longer --corrections corrections.json"
         )
         steps = "\n".join(data["next"])
-        assert steps.count("masks of ") == 1
+        assert steps.count("masks of refinesplat") == 1 and "masks of 3dgs" not in steps
         place = f"{above}{run.relative_to(tmp_path / 'out').as_posix()}"
         assert f"`{place}/masks`" in steps and f"`aw table {above}runs`" in steps
         assert str(tmp_path) not in text

@@ -22,7 +22,7 @@ def test_photos_become_masks(tmp_path: Path) -> None:
     photos = write_capture(tmp_path / "walls", 8)
     done = aw("masks", tmp_path / "walls", "-o", tmp_path / "masks", "--budget", "10s", "--for", "colmap")
     assert done.returncode == 0, done.stderr
-    assert _commands(done.stderr) == ["build-scene", "plan", "bench", "masks"]
+    assert _commands(done.stderr) == ["build-scene", "plan", "bench", "view", "masks"]
     scene = load_scene(tmp_path / "masks-work/scene")
     assert len(scene.train) == 8 and not scene.test
     for photo in photos:

@@ -109,7 +109,7 @@ def command(
         say(f"  {line.replace('`', '')}")
     iterations = min(read_result(run / RESULT)["cost"]["iterations"] for run in shown.runs)
     if iterations < SHARP:
-        longer = command_line(budget=_enough(seconds, iterations))
+        longer = f"{command_line(budget=None)} --budget {_enough(seconds, iterations)}"
         say(
             f"{_rounded(iterations)} iterations: {_grade(iterations)}. A sharp splat, by training it on: {longer}"
         )

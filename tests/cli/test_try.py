@@ -32,7 +32,7 @@ def test_photos_become_a_page_that_a_larger_budget_continues(tmp_path: Path) -> 
     assert "splat file of refinesplat: " in done.stderr and "aw masks " in done.stderr
     assert '"reload_s":0.0' in page.read_text()
     assert f"--budget {SHORTEST_S:g}s" in done.stderr and "a sketch" in done.stderr
-    assert f"A sharp splat, by training it on: aw try {raw} --output {out} --budget " in done.stderr
+    assert f"A sharp splat, by training it on: aw try {raw} -o {out} --threads 1 --budget 5m" in done.stderr
     reached = read_result(run / "metrics.json")["cost"]["iterations"]
     again = aw(*words, "--budget", "20s")
     assert again.returncode == 0 and again.stderr.count("finished before, kept") == 1

@@ -19,7 +19,7 @@ import numpy as np
 from ambiguous_wild.builder.capture_map import CaptureMap, component_gaps, map_of_photos
 from ambiguous_wild.builder.collect import collect
 from ambiguous_wild.builder.fixed_to_camera import words_of
-from ambiguous_wild.builder.overlap_graph import GrowthForecast, Link, predict_growth
+from ambiguous_wild.builder.overlap_graph import FEW_COVISIBLE, GrowthForecast, Link, predict_growth
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
     compare_photos,
@@ -230,7 +230,7 @@ def overlap(
     """Predict how many photos will be placed, and name those that share too little with the others."""
     names, count = [photo.source for photo in photos], len(photos)
     if not growth.components:
-        finding = "no three photos share enough features: none will be placed"
+        finding = "no three photos share enough features: none will be placed" + _few_pairs(compared)
         advice = "take more photos, each sharing two thirds of the picture with the next"
         return CaptureCheck("overlap", "warning", "pixels", finding, advice, tuple(names))
     main = growth.components[0]
@@ -244,10 +244,18 @@ def overlap(
     if growth.others:
         finding += "; the others share too few features with two photos at once: "
         finding += shortlist([names[k] for k in growth.others], 3)
+    finding += _few_pairs(compared)
     pairs = [f"{names[a]} and {names[b]}" for a, b in gaps]
     advice = f"take 2 or 3 photos between {shortlist(pairs, 3)}"
     outside = tuple(names[k] for k in range(count) if k not in main)
     return CaptureCheck("overlap", "warning", "pixels", finding, advice, outside)
+
+
+def _few_pairs(compared: PhotoComparison) -> str:
+    """Return how many pairs overlap, if most photos overlap with too few others; else ""."""
+    if float(np.median(compared.covisible)) >= FEW_COVISIBLE:
+        return ""
+    return f"; most pairs share too few features ({len(compared.links)} of {compared.pairs} share enough)"
 
 
 def motion(compared: PhotoComparison) -> CaptureCheck:

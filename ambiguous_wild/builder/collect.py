@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ambiguous_wild.core.errors import AwError, counted, shortlist
+from ambiguous_wild.core.errors import AwError, counted, shortlist, similar_path
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.mask_files import MASK_FOLDERS, masks_beside_photos
@@ -125,7 +125,7 @@ def _check_roots(given: Sequence[Path | str]) -> list[Path]:
         root = Path(raw).resolve()
         if not root.is_dir():
             what = "is a file; give the folder of photos (of a video, see 'aw capture')"
-            raise AwError(f"capture {raw} {what if root.exists() else 'does not exist'}")
+            raise AwError(f"capture {raw} {what if root.exists() else 'does not exist' + similar_path(raw)}")
         if other := next((r for r in roots if r.is_relative_to(root) or root.is_relative_to(r)), None):
             raise AwError(f"{raw} and {other} are or hold the same folder; give each once")
         roots.append(root)

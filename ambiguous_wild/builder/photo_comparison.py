@@ -59,6 +59,7 @@ class PhotoComparison:
     forward: float  # share of overlapping pairs that differ by motion along the line of sight; NaN: no pair
     fixed: list[FixedArea]  # fixed to the camera; its features are not compared
     matches: Matches
+    pairs: int = 0  # compared, those without enough matches included
 
     @property
     def links(self) -> list[tuple[int, int, int]]:
@@ -162,9 +163,10 @@ def compare_photos(
     lonely = np.flatnonzero((labels != 0) | (graph.sum(axis=1) < 2)).tolist()
     more = [(min(i, j), max(i, j)) for i in lonely for j in most_similar(features, i, EXTRA_CANDIDATES)]
     more = [pair for pair in dict.fromkeys(more) if pair not in raw]
-    enter_all(more, _all_raw_matches(features, more, "comparing photos that overlap with few", bar, jobs))
+    raw |= _all_raw_matches(features, more, "comparing photos that overlap with few", bar, jobs)
+    enter_all(more, raw)
     share = float(np.mean(forward)) if forward else math.nan
-    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, fixed, confirmed(matches))
+    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, fixed, confirmed(matches), len(raw))
 
 
 def confirmed(matches: Matches) -> Matches:

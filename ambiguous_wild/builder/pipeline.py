@@ -80,6 +80,8 @@ def build_scene(
     started = time.perf_counter()
     target = Path(os.path.abspath(output))
     settings = settings or BuildSettings()
+    if settings.no_test and test_list is not None:
+        raise AwError("--no-test and --test-list exclude each other: give one of them")
     if settings.name:
         name = check_name("scene name", settings.name)
     else:
@@ -97,6 +99,7 @@ def build_scene(
             settings,
             mask_folder,
             Path(test_list).resolve() if test_list is not None else None,
+            target,
             count,
             Bar(progress),
             link=not keep_work,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 import threading
 
-import click
 from tqdm import tqdm
+
+from ambiguous_wild.io.terminal import keep_clock_running, say
 
 
 class Bar:
@@ -22,8 +23,9 @@ class Bar:
         self.finish()
         if self.enabled:
             self._bar = tqdm(total=total, desc=what, file=sys.stderr, leave=False, disable=None)
+            keep_clock_running(self._bar)
             if self._bar.disable:
-                click.echo(what, err=True)
+                say(what)
 
     def step(self, count: int = 1) -> None:
         """Advance by `count`."""
@@ -48,4 +50,4 @@ class Bar:
         """Print a line on standard error."""
         self.finish()
         if self.enabled:
-            click.echo(text, err=True)
+            say(text)

@@ -70,7 +70,7 @@ class PhotoSplit:
 
     train: list[str]
     test: list[str]
-    how: str  # "list", "folders" or "every-8"
+    how: str  # "list", "folders", "every-8" or "none"
     warnings: list[str]
 
 
@@ -145,6 +145,15 @@ class CameraFact(TypedDict):
     photos: list[str]  # names; sources in scene.json
     focal_px: float
     focal_sd_px: float | None  # standard deviation; None: unknown
+
+
+class SceneCamera(CameraFact):
+    """A camera in scene.json, with its lens: what undistorted its photos."""
+
+    model: str  # of COLMAP
+    width: int  # px
+    height: int  # px
+    params: list[float]  # px and distortion, in COLMAP's order
 
 
 class MappingResult(TypedDict):
@@ -275,7 +284,7 @@ class BuildRecord(TypedDict):
     counts: SceneCounts
     reprojection_error_px: float
     mean_track_length: float
-    cameras: list[CameraFact]
+    cameras: list[SceneCamera]
     lost: list[LostPhoto]
     skipped: list[SkippedPhoto]
     warnings: list[str]
@@ -290,6 +299,7 @@ class KeyedRecord(BuildRecord):
 
     build_key: str
     inputs: BuildInputs
+    capture: str  # folder of the photos, relative to the scene's
     seconds: dict[str, float]  # stage -> s
 
 

@@ -1,8 +1,5 @@
 """Undistort photos, masks and truth to pinhole cameras, and downsample them, each file read once.
 
-COLMAP chooses the pinhole camera (no blank pixels). Resampling is our own, because masks (nearest pixel) and
-photos (bicubic, once, without another JPEG) need the same map.
-
 Photos are downsampled antialiased and in linear light: averaging sRGB values darkens fine bright detail (a
 black and white grid becomes 128 instead of 188), so pixels are decoded (IEC 61966-2-1), resampled by Pillow
 and encoded again. Away from the border the result equals OpenImageIO's to one level, six times as fast.
@@ -14,7 +11,6 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,13 +24,11 @@ from ambiguous_wild.io.colmap_model import write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.keep_resize import smaller_keep
+from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.photos import MIN_SIDE
-from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 TRUTH_PARTS = ("distractor", "clean")
 MAX_LOST = 0.9  # share of the photo that is kept, below which a message says so
-MIN_SHARE, MAX_SHARE = 0.1, 1.1  # plausible shares of the photo that undistortion keeps
-NEGLIGIBLE_PX = 0.1  # distortion below this everywhere is ignored
 FACTORS = (1, 2, 4, 8)
 TARGET_SIDE = 480  # px; literature trains at about 504 x 378
 FILTER = Image.Resampling.BICUBIC  # antialiased: that of gsplat and NerfBaselines
@@ -50,79 +44,6 @@ def _encode_table() -> np.ndarray:
 
 # 65536 steps of linear light are finer than the narrowest step of 8-bit sRGB (1 / 3294).
 _TO_LINEAR, _TO_SRGB = _decode_table(), _encode_table()
-
-
-@dataclasses.dataclass(frozen=True)
-class Lens:
-    """A camera with distortion, the pinhole camera that replaces it, and the map between their pixels."""
-
-    camera: Any  # pycolmap.Camera
-    pinhole: ModelCamera
-    # [H, W] float32 each: source of every pixel; None: no map needed
-    map_xy: tuple[np.ndarray, np.ndarray] | None
-    share: float = 1.0  # share of the photo that the pinhole camera sees
-    shear: float = 0.0  # as in `ModelCamera`
-
-    def remap(self, image: np.ndarray, *, nearest: bool) -> np.ndarray:
-        """Resample an image [H, W] or [H, W, 3] of the distorted camera to the pinhole camera."""
-        if self.map_xy is None:
-            return image
-        how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
-        # The map may reach half a pixel beyond the border, which reflection fills.
-        return cv2.remap(image, *self.map_xy, how, borderMode=cv2.BORDER_REFLECT_101)
-
-    def undistort_points(self, xys: np.ndarray) -> np.ndarray:
-        """Map points [K, 2] px of the distorted camera to px of the pinhole camera."""
-        if not len(xys):
-            return xys
-        fx, fy, cx, cy = self.pinhole.pinhole()
-        xys = xys - self.shear * (xys[:, 1:] - self.camera.principal_point_y) * [1, 0]
-        normalised = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(xys)))
-        return normalised * [fx, fy] + [cx, cy]
-
-
-def make_lens(camera: ModelCamera) -> Lens:
-    """Choose the pinhole camera and compute the map; source: COLMAP's undistort_camera.
-
-    Where the distortion is negligible the photo stays as it is: COLMAP would shrink the camera by a pixel
-    and shift it by half a pixel, which blurs.
-    """
-    try:
-        lens = pycolmap.Camera(
-            model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-        )
-    except ValueError as error:
-        raise AwError(f"this pycolmap has no camera model {camera.model}; update it ({error})") from None
-    fx, fy = lens.focal_length_x, lens.focal_length_y
-    same = (fx, fy, lens.principal_point_x, lens.principal_point_y)
-    plain = ModelCamera(camera.camera_id, "PINHOLE", camera.width, camera.height, same)
-    grid, source = _source_pixels(lens, plain, camera.shear)
-    if np.abs(source - grid).max() < NEGLIGIBLE_PX:
-        return Lens(lens, plain, None)
-    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
-    params = tuple(float(v) for v in flat.params)
-    pinhole = ModelCamera(camera.camera_id, "PINHOLE", flat.width, flat.height, params)
-    _, source = _source_pixels(lens, pinhole, camera.shear)
-    index = (source - 0.5).astype(np.float32)  # OpenCV counts from pixel centres
-    x, y = np.concatenate([source[0], source[:, -1], source[-1, ::-1], source[::-1, 0]]).T
-    share = float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2 / (camera.width * camera.height))
-    if not MIN_SHARE < share < MAX_SHARE:
-        raise AwError(
-            f"camera {camera.camera_id} ({camera.model}, parameters {list(camera.params)}): undistorted, it "
-            f"sees {100 * share:.3g} % of its photo: check the parameters, or split the photos"
-        )
-    maps = np.ascontiguousarray(index[..., 0]), np.ascontiguousarray(index[..., 1])
-    return Lens(lens, pinhole, maps, share, camera.shear)
-
-
-def _source_pixels(lens: Any, pinhole: ModelCamera, shear: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixel centres of the pinhole camera, and where the lens sees them: [H, W, 2] px each."""
-    fx, fy, cx, cy = pinhole.pinhole()
-    grid = np.stack(np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5), axis=-1)
-    rays = np.concatenate([(grid - [cx, cy]) / [fx, fy], np.ones((*grid.shape[:2], 1))], axis=-1)
-    source = np.asarray(lens.img_from_cam(rays.reshape(-1, 3))).reshape(grid.shape)
-    source[..., 0] += shear * (source[..., 1] - lens.principal_point_y)
-    return grid, source
 
 
 def auto_factor(sizes: list[tuple[int, int]]) -> int:

@@ -28,6 +28,7 @@ from ambiguous_wild.builder.records import (
     MotionResult,
     PhotoSplit,
     ResampleResult,
+    SceneCamera,
     ScenePhoto,
     SceneRecord,
     ScreenedPhoto,
@@ -37,10 +38,11 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.builder.sfm import exif_focal
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import counted, shortlist
-from ambiguous_wild.io.colmap_records import ColmapModel
+from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.scene_folder import MAP
 
 FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
+MUCH_MISSING = 1 / 3  # of the readable photos; then the scene lacks a part of the place
 ENOUGH_PHOTOS = 20  # with fewer, most of a place is seen in one or two of them
 MIN_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
 SFM_STAGES = ("features", "matches", "mapping")
@@ -70,9 +72,8 @@ def scene_record(
     summary, factor = mapping["model"], results.resampled["factor"]
     assert summary is not None  # a build without a model has ended before
     sources = {photo.name: photo.source for photo in photos}
-    cameras: list[CameraFact] = [
-        {**camera, "photos": [sources[name] for name in camera["photos"]]} for camera in mapping["cameras"]
-    ]
+    lenses = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    cameras = [_camera(camera, lenses[camera["photos"][0]], sources) for camera in mapping["cameras"]]
     only_test, short = point_checks(model, set(split.test))
     return {
         "name": settings.name,
@@ -134,6 +135,17 @@ def scene_record(
     }
 
 
+def _camera(camera: CameraFact, lens: ModelCamera, sources: Mapping[str, str]) -> SceneCamera:
+    return {
+        **camera,
+        "photos": [sources[name] for name in camera["photos"]],
+        "model": lens.model,
+        "width": lens.width,
+        "height": lens.height,
+        "params": [float(value) for value in lens.params],
+    }
+
+
 def point_checks(model: ColmapModel, test: set[str]) -> tuple[int, int]:
     """Count the points that only test photos see (leaked) and those of track length 2 (poorly determined)."""
     points = model.points
@@ -172,6 +184,11 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
     named = f", {len(info['lost'])} left out" if info["lost"] else ""
     few = counts["registered"] < ENOUGH_PHOTOS
     ready = f"few photos, about {ENOUGH_PHOTOS} are needed for a good model" if few else "ready"
+    out = counts["readable"] - counts["registered"]
+    if out >= MUCH_MISSING * counts["readable"]:
+        ready = (
+            f"not whole: what the {out} photos left out show is missing ('aw screen' says where to take more)"
+        )
     return (
         f"registered {counts['registered']} of {counts['photos']}{named}, {points} points, "
         f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: {ready}; "
@@ -259,7 +276,7 @@ def _photo(
     }
 
 
-def _focal_warnings(cameras: Sequence[CameraFact], photos: Sequence[ScreenedPhoto]) -> list[str]:
+def _focal_warnings(cameras: Sequence[SceneCamera], photos: Sequence[ScreenedPhoto]) -> list[str]:
     """Warn of cameras whose focal length contradicts their photos' EXIF."""
     stated = {photo.source: (exif_focal(photo), max(photo.size)) for photo in photos}
     odd = []

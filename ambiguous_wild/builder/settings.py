@@ -41,6 +41,7 @@ class BuildSettings:
     max_side: int = 1600  # px; photos are reduced to this for SIFT only
     seed: int = 0  # of every random choice inside COLMAP
     masks_missing: Literal["error", "keep"] = "error"  # a photo without a mask: refuse, or use it whole
+    no_test: bool = False  # train on all photos; nothing can be measured then
     strict: bool = False  # refuse the capture if one photo cannot be read
     name: str = ""  # of the scene; empty: the output folder's name
     license: str = ""  # of the photos, as the user states it

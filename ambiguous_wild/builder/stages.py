@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -49,7 +50,7 @@ from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.motion_points import FILE
-from ambiguous_wild.io.scene_folder import MAP, TEST_EVERY, read_list
+from ambiguous_wild.io.scene_folder import ALL_TRAINED, MAP, TEST_EVERY, read_list
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ class Stages:
     settings: BuildSettings
     mask_folder: Path | None
     test_list: Path | None
+    target: Path  # the scene folder to be
     jobs: int
     bar: Bar
     link: bool  # hard-link the stages' files into the scene
@@ -125,6 +127,7 @@ class Stages:
         # Before the slow part the larger half of the photos; after it those that are registered.
         check_factor(settings.factor or 1, [side[:2] for side in sides[len(sides) // 2 :]])
         tests = read_test_list(self.test_list, photos) if self.test_list else None
+        tests = set() if settings.no_test else tests
         masks = self._masks(work, screened, photos)
         sfm = self._sfm(work, screened, photos, masks)
         mapping, matches = sfm.mapping, sfm.matches
@@ -183,6 +186,7 @@ class Stages:
             **scene_record.scene_record(settings, results, model, split),
             "build_key": self.build_key,
             "inputs": inputs,
+            "capture": _relative(capture.root, self.target),
             "seconds": {"collect": round(collect_s, 3), **work.seconds()},
         }
         truth_files = [capture.truth / n for n in ("cameras.json", "capture.json")] if capture.truth else []
@@ -332,7 +336,7 @@ def split_photos(photos: Sequence[ScreenedPhoto], registered: set[str], tests: s
     Args:
         photos: of the capture.
         registered: names of those in the model.
-        tests: names in the user's test list, or None.
+        tests: names in the user's test list; empty = train on all; None = by folders, else every 8th.
 
     Raises:
         AwError: fewer than two training photos, or a test set without a registered photo.
@@ -340,7 +344,7 @@ def split_photos(photos: Sequence[ScreenedPhoto], registered: set[str], tests: s
     inside = sorted((photo for photo in photos if photo.name in registered), key=lambda photo: photo.stem)
     warnings = []
     if tests is not None:
-        how, test = "list", [photo.name for photo in inside if photo.name in tests]
+        how, test = "list" if tests else ALL_TRAINED, [photo.name for photo in inside if photo.name in tests]
         wanted = len(tests)
     elif any(photo.side for photo in photos):
         how, test = "folders", [photo.name for photo in inside if photo.side == "test"]
@@ -413,6 +417,14 @@ def _with_nearest(line: str, by_line: dict[str, ScreenedPhoto]) -> str:
     """Quote the unknown line and add the photo whose name is nearest to it."""
     near = difflib.get_close_matches(line, by_line, n=1, cutoff=0.5)
     return f"{line!r} (did you mean {by_line[near[0]].source!r}?)" if near else repr(line)
+
+
+def _relative(folder: Path, base: Path) -> str:
+    """Return a path from the scene, so that both can be moved together; on another drive the whole path."""
+    try:
+        return Path(os.path.relpath(folder, base.resolve())).as_posix()
+    except ValueError:
+        return folder.as_posix()
 
 
 def _file_hashes(folder: Path | None) -> list[list[str]] | None:

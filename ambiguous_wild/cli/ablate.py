@@ -14,16 +14,18 @@ from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import (
     PathName,
+    SectionedCommand,
     choose_device,
     json_option,
     prepare_cpu,
     training_options,
 )
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.terminal import say
 from ambiguous_wild.methods.ablation_groups import Group
 
 
-@click.command(name="ablate")
+@click.command(name="ablate", cls=SectionedCommand)
 @click.option("--method", default="refinesplat", show_default=True, help="Method whose parts are varied.")
 @click.option("--scene", "scenes", multiple=True, type=PathName(), help="A scene folder; repeatable.")
 @click.option("--group", "groups", multiple=True, help="Only this group; repeatable.  [default: all]")
@@ -113,14 +115,14 @@ def command(
     before = earlier_groups(study, output)
     if before:
         study = plan(groups=[*groups, *before])
-        click.echo(f"with what {output} holds already: {', '.join(before)}", err=True)
+        say(f"with what {output} holds already: {', '.join(before)}")
     check_output(output / "run")
     if on == "cpu":
         prepare_cpu(threads)
     cells = study.cells
     absent = sum(1 for row in study.rows if row.missing)
     more = f", {absent} variants cannot run here" if absent else ""
-    click.echo(f"{len(study.rows)} rows: {len(cells)} runs{more}", err=True)
+    say(f"{len(study.rows)} rows: {len(cells)} runs{more}")
     progress = ProgressBar()
     progress.planned(cells, one_by_one=True)
     options = RunOptions(cache or output / ".cache", overwrite, pictures)  # type: ignore[arg-type]
@@ -129,7 +131,7 @@ def command(
     data = report(study, output, made_by=shlex.join(words))
     written = write_report(data, output)
     click.echo(json.dumps(data, indent=2) if as_json else markdown_of(data))
-    click.echo("wrote " + ", ".join(str(path) for path in written), err=True)
+    say("wrote " + ", ".join(str(path) for path in written))
     failed = [r for r in reports if r.outcome == "failed"]
     if failed:
         raise AwError(f"{len(failed)} of {len(reports)} runs failed: {failed[0].error}")

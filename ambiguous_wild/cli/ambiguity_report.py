@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from ambiguous_wild.cli.options import PathName, json_option
+from ambiguous_wild.io.terminal import say
 
 
 @click.command("ambiguity-report")
@@ -101,8 +102,8 @@ def command(
     if as_json:
         click.echo(json.dumps({**facts, "report": str(folder)}, indent=2))
         return
-    click.echo(f"{loaded.name}: {facts['class']}{ambiguity_summary.doubts(facts)}")
+    say(f"{loaded.name}: {facts['class']}{ambiguity_summary.doubts(facts)}", out=True)
     for line in ambiguity_summary.describe(facts):
-        click.echo(line)
+        say(line, out=True)
     saved = ", scores saved in scene.json" if info is not None else ""
-    click.echo(f"wrote {folder / 'index.html'} ({len(measured.photos)} photos){saved}")
+    say(f"wrote {folder / 'index.html'} ({len(measured.photos)} photos){saved}", out=True)

@@ -15,10 +15,10 @@ from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import (
     PathName,
+    SectionedCommand,
     engine_options,
     json_option,
     metric_file_option,
-    say,
     training_options,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar, finish
@@ -26,6 +26,7 @@ from ambiguous_wild.cli.study_file import StudyFile, decisive, is_plan, read_stu
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.benchmark import Engine, bench
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport
@@ -58,7 +59,7 @@ def parse_budget(text: str) -> float:
     return seconds
 
 
-@click.command(name="bench")
+@click.command(name="bench", cls=SectionedCommand)
 @click.argument("study", required=False, is_eager=True, callback=read_study)
 @click.option(
     "--method",
@@ -98,8 +99,9 @@ def parse_budget(text: str) -> float:
 )
 @click.option(
     "--mask",
-    metavar="METHOD",
-    help="Masks of another method, for all; none; motion: of moving features; or truth: exact masks.",
+    metavar="METHOD|FOLDER",
+    help="Masks of another method, for all; FOLDER: of files, white = static (docs/training.md); none; motion: of "
+    "moving features; or truth: exact masks.",
 )
 @click.option(
     "--set",
@@ -128,6 +130,12 @@ def parse_budget(text: str) -> float:
     type=PathName(dir_okay=False),
     help="Start from this splat file (PLY, compressed PLY, SPZ, SOG, glTF) or point cloud (PLY) in the scene's "
     "coordinates.  [default: the scene's points]",
+)
+@click.option(
+    "--corrections",
+    type=PathName(dir_okay=False),
+    help="Masks corrected by hand, as the page of 'aw view' saves them; --overwrite longer continues a run with "
+    "them.",
 )
 @metric_file_option
 @click.option("-o", "--output", type=PathName(), default=Path("runs"), show_default=True)
@@ -181,15 +189,15 @@ def command(
 
     \b
     Settings that few need, as --set NAME.KEY=VALUE:
-      train.probes=8               how often the test PSNR is measured while training
+      train.probes=8               measurements of the test PSNR while training
       train.checkpoint_every_s=60  seconds between checkpoints
-      train.on_nonfinite=stop      a NaN ends the run; rollback: go back and leave that photo out
-      engine.retries=3             how often a run is repeated whose process or node was lost
-      engine.cpus_per_cell=1       with Ray: CPUs per run, also its threads; --threads if it is given
-      engine.gpus_per_cell=1       with Ray on cuda: GPUs per run; with 0.5 two runs share one
+      train.on_nonfinite=stop      at a NaN; rollback: leave that photo out
+      engine.retries=3             of a run whose process or node was lost
+      engine.cpus_per_cell=1       with Ray: CPUs per run, also its threads
+      engine.gpus_per_cell=1       with Ray: GPUs per run; 0.5: two share one
       engine.memory_per_cell=GB    with Ray: memory per run
-      engine.transfer=store        with Ray: send scenes and runs; shared: -o and scenes are on shared storage
-      engine.transfer_limit=4000   with Ray: MB of the largest scene or run that is sent
+      engine.transfer=store        with Ray: send scenes; shared: shared storage
+      engine.transfer_limit=4000   with Ray: MB of the largest scene or run
     """
     if iterations is not None and budgets:
         typed = {name for name in ("iterations", "budgets") if _typed_in(ctx, name)}
@@ -335,6 +343,8 @@ def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
     from ambiguous_wild.report.suite import suite_tables
 
     try:
-        click.echo(to_text(suite_tables(prepared, folder), color=sys.stdout.isatty()), nl=False)
+        click.echo(
+            to_text(suite_tables(prepared, folder), color=sys.stdout.isatty(), width=line_width()), nl=False
+        )
     except AwError as error:  # every run failed, which `finish` reports
         say(str(error))

@@ -12,6 +12,7 @@ import click
 
 from ambiguous_wild.cli.options import (
     PathName,
+    SectionedCommand,
     json_option,
     license_option,
     name_option,
@@ -19,6 +20,7 @@ from ambiguous_wild.cli.options import (
     threads_option,
 )
 from ambiguous_wild.core.processes import python_meanwhile
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.pipeline import BuildResult
@@ -52,7 +54,7 @@ def _compiled() -> bool:
     return any(kernel_cache().rglob("*catch_up_all*.nbi"))
 
 
-@click.command("build-scene")
+@click.command("build-scene", cls=SectionedCommand)
 @click.argument("raw", type=PathName(), nargs=-1, required=True)
 @click.option("-o", "--output", required=True, type=PathName(), help="Scene folder to make.")
 @click.option(
@@ -111,6 +113,7 @@ def _compiled() -> bool:
     help="A photo without a mask: error refuses the capture, keep uses the whole photo.",
 )
 @click.option("--test-list", type=PathName(), help="File with the names of the test photos, one per line.")
+@click.option("--no-test", is_flag=True, help="Train on all photos; nothing is measured then.")
 @click.option("--strict", is_flag=True, help="Refuse the capture if one photo cannot be read.")
 @threads_option
 @seed_option("Seed of COLMAP's random choices.")
@@ -166,13 +169,13 @@ def command(
         click.echo(json.dumps(_facts(result, size, verdict), indent=2, ensure_ascii=False))
         return
     if result.up_to_date:
-        click.echo(f"{output} is up to date")
+        say(f"{output} is up to date", out=True)
     for line in scene_record.summary_lines(info):
-        click.echo(line)
+        say(line, out=True)
     if not result.up_to_date:
         spent = ", ".join(f"{stage} {s:.1f}" for stage, s in info["seconds"].items())
-        click.echo(f"{result.seconds:.1f} s ({spent}; COLMAP {100 * scene_record.sfm_share(info):.0f} %)")
-    click.echo(verdict)
+        say(f"{result.seconds:.1f} s ({spent}; COLMAP {100 * scene_record.sfm_share(info):.0f} %)", out=True)
+    say(verdict, out=True)
 
 
 def _facts(result: BuildResult, size: tuple[int, int], verdict: str) -> dict[str, object]:

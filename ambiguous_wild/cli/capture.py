@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import click
 
 from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, threads_option
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, similar_path
 from ambiguous_wild.core.machine import usable_cores
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.builder.checks import CaptureReport
@@ -65,7 +66,7 @@ def capture_command(
     elif absent.startswith("camera"):
         raise AwError(f"unknown camera {absent!r}: write 'camera' or 'camera:1', and nothing beside it")
     else:
-        raise AwError(f"{absent} does not exist: {wanted}")
+        raise AwError(f"{absent} does not exist: {wanted}{similar_path(absent)}")
     videos = facts.get("videos", [])
     if "frames_read" in facts:
         counts = facts["frames_read"], facts["frames_announced"]
@@ -74,12 +75,11 @@ def capture_command(
         total, announced = video["frames_read"], video["frames_announced"]
         if total < frames:
             name = video["source"]
-            click.echo(f"{name} has {total} frames: took all of them, fewer than --frames {frames}", err=True)
+            say(f"{name} has {total} frames: took all of them, fewer than --frames {frames}")
         if announced and total < BROKEN_BELOW * announced:
-            click.echo(
+            say(
                 f"warning: {video['source']} announces {announced} frames, {total} could be read: it may be cut "
-                "short or damaged",
-                err=True,
+                "short or damaged"
             )
     if as_json:
         click.echo(json.dumps({**facts, "capture": str(output)}, indent=2, ensure_ascii=False))
@@ -87,8 +87,8 @@ def capture_command(
     left = facts["left_out"]
     if left:
         names = ", ".join(f"{x['source']} ({x['why']})" for x in left[:3]) + (" ..." if len(left) > 3 else "")
-        click.echo("left out: " + "".join(c if c.isprintable() else "?" for c in names))
-    click.echo(f"{len(facts['photos'])} photos in {output}; next: aw screen {shlex.quote(str(output))}")
+        say(f"left out: {names}", out=True)
+    say(f"{len(facts['photos'])} photos in {output}; next: aw screen {shlex.quote(str(output))}", out=True)
 
 
 _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unknown", "yellow")}
@@ -133,12 +133,11 @@ def _print(report: CaptureReport) -> None:
     width = max(len(c.name) for c in report.checks)
     for check in report.checks:
         word, colour = _WORDS[check.state]
-        # File names may hold control characters of the terminal.
-        text = "".join(c if c.isprintable() else "?" for c in f"{check.finding}  [{check.basis}]")
-        click.echo(f"{check.name:<{width}}  {click.style(f'{word:<7}', fg=colour)}  {text}")
+        line = f"{check.name:<{width}}  {word:<7}  {check.finding} [{check.basis}]"
+        say(line, out=True, fg=colour, only=word)
         if check.advice:
-            click.echo(f"{'':<{width}}           -> {check.advice}")
+            say(f"{'':<{width}}           -> {check.advice}", out=True)
     bad = len(report.warnings)
     verdict = "all checks passed" if not bad else f"{bad} of {len(report.checks)} checks failed"
     unknown = sum(c.state == "unknown" for c in report.checks)
-    click.echo(f"{report.photos} photos: {verdict}" + (f", {unknown} unknown" if unknown else ""))
+    say(f"{report.photos} photos: {verdict}" + (f", {unknown} unknown" if unknown else ""), out=True)

@@ -15,10 +15,11 @@ from ambiguous_wild.cli.options import (
     PathName,
     command_line,
     json_option,
+    label_option,
     only_option,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import plain
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.cost_runs import CostRuns
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     help="A test PSNR to reach; repeatable.  [default: 3, 1 and 0.5 dB below the best of each scene]",
 )  # fmt: skip
 @only_option
+@label_option
 @click.option(
     "--with-setup",
     is_flag=True,
@@ -50,6 +52,7 @@ def command(
     output: Path,
     targets: tuple[float, ...],
     scenes: tuple[str, ...],
+    labels: tuple[str, ...],
     with_setup: bool,
     recommended: tuple[Path, str] | None,
     as_json: bool,
@@ -70,7 +73,7 @@ def command(
     from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text, write_report
     from ambiguous_wild.report.cost_runs import read_cost_runs
 
-    cost_runs = read_cost_runs(runs, scenes=scenes)
+    cost_runs = read_cost_runs(runs, scenes=scenes, labels=labels)
     if recommended is not None:
         _recommend(cost_runs, *recommended, as_json)
         return
@@ -81,8 +84,10 @@ def command(
     from ambiguous_wild.report.cost_plots import draw_all
 
     written += draw_all(report, output)
-    click.echo(json.dumps(plain_data(report), indent=2) if as_json else to_text(report), nl=as_json)
-    click.echo(f"wrote {', '.join(p.name for p in written)} in {output}", err=True)
+    click.echo(
+        json.dumps(plain_data(report), indent=2) if as_json else to_text(report, line_width()), nl=as_json
+    )
+    say(f"wrote {', '.join(p.name for p in written)} in {output}")
 
 
 def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> None:
@@ -97,9 +102,10 @@ def _recommend(cost_runs: CostRuns, scene: Path, budget: str, as_json: bool) -> 
     speed = speed_here(cost_runs) if cost_runs.reference else 1.0
     advice = recommend(cost_runs.runs, opened.name, seconds, speed=speed, scene_hash=scene_identity(opened))
     if not cost_runs.reference:
-        click.echo("the runs have wall times only: this machine is assumed to be as fast as theirs", err=True)
+        say("the runs have wall times only: this machine is assumed to be as fast as theirs")
     if as_json:
         facts = dataclasses.asdict(advice) | {"command": advice.command(str(scene))}
         click.echo(json.dumps(encoded(facts), indent=2))
     else:
-        click.echo("\n".join(map(plain, in_words(advice, str(scene)).splitlines())))
+        for line in in_words(advice, str(scene)).splitlines():
+            say(line, out=True)

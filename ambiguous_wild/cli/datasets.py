@@ -20,6 +20,7 @@ from ambiguous_wild.cli.options import (
 )
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.machine import usable_cores
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.datasets.write import ImportRecord
@@ -85,10 +86,10 @@ def import_command(
         click.echo(json.dumps({**extra, **facts}, indent=2, ensure_ascii=False))
         return
     if done.up_to_date:
-        click.echo(f"{output} is up to date")
+        say(f"{output} is up to date", out=True)
     for line in summary(info, done.why):
-        click.echo(line)
-    click.echo(f"next: aw bench --method refinesplat --scene {shlex.quote(str(output))} -o runs")
+        say(line, out=True)
+    say(f"next: aw bench --method refinesplat --scene {shlex.quote(str(output))} -o runs", out=True)
 
 
 def summary(info: ImportRecord, why: str) -> list[str]:
@@ -126,24 +127,26 @@ def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
         for data in public_data().values():
             size = f"{data.size_mb} MB" if data.size_mb else "size not stated"
             how = f"layout {data.layout}, {size}" if data.url else "from its page only"
-            click.echo(f"{data.name:<30} {how}, licence: {data.license}\n{'':<30} {data.note}; {data.page}")
+            say(f"{data.name:<29}  {how}, licence: {data.license}", out=True)
+            say(f"{'':<29}  {data.note}; {data.page}", out=True)
         return
     from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.datasets.fetch import fetch
 
     data = find_public(name)
-    click.echo(f"{data.name}: licence: {data.license} ({data.page})", err=True)
+    say(f"{data.name}: licence: {data.license} ({data.page})")
     with ticking(desc=name, unit="B", unit_scale=True, disable=True if as_json else None) as tick:
-        done = fetch(data, output, tick=tick, say=lambda text: click.echo(text, err=True))
+        done = fetch(data, output, tick=tick, say=say)
     if as_json:
         facts = {"archive": str(done.archive), "folder": str(done.folder) if done.folder else None}
         click.echo(json.dumps({**facts, "sha256": done.sha256, "first": done.first}, indent=2))
         return
     state = "recorded now, nothing to compare with" if done.first else "as recorded before"
-    click.echo(f"{done.archive}: sha256 {done.sha256[:16]}... ({state})")
+    say(f"{done.archive}: sha256 {done.sha256[:16]}... ({state})", out=True)
     if done.folder is not None:
-        click.echo(
-            f"unpacked into {done.folder}; next: aw import {shlex.quote(str(done.folder))}/SCENE -o SCENE"
+        say(
+            f"unpacked into {done.folder}; next: aw import {shlex.quote(str(done.folder))}/SCENE -o SCENE",
+            out=True,
         )
 
 
@@ -158,18 +161,28 @@ def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
 )
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder to make.")
 @click.option("--copy", is_flag=True, help="Copy photos instead of linking them.")
+@click.option(
+    "--masks", "run", type=PathName(), metavar="RUN", help="The masks of this run, not the scene's own."
+)
 @json_option
-def export_scene_command(scene: Path, form: str, output: Path, copy: bool, as_json: bool) -> None:
+def export_scene_command(
+    scene: Path, form: str, output: Path, copy: bool, run: Path | None, as_json: bool
+) -> None:
     """Write SCENE in another tool's layout: photos at their training size, cameras, split, points, masks."""
     from ambiguous_wild.datasets.export import export_scene
 
-    done = export_scene(scene, form, output, copy=copy)
+    masks = None
+    if run is not None:
+        from ambiguous_wild.report.full_size_masks import masks_of_run
+
+        _, _, masks = masks_of_run(run, scene)
+    done = export_scene(scene, form, output, copy=copy, masks=masks)
     if as_json:
         facts = {"folder": str(done.folder), "layout": form, "train": done.train, "test": done.test}
         click.echo(json.dumps({**facts, "left_out": list(done.left_out)}, indent=2))
         return
     lost = f"; the layout holds no {', no '.join(done.left_out)}" if done.left_out else ""
-    click.echo(f"wrote {output}: {done.train} training and {done.test} test photos as {form}{lost}")
+    say(f"wrote {output}: {done.train} training and {done.test} test photos as {form}{lost}", out=True)
 
 
 @click.command("package")
@@ -220,7 +233,7 @@ def package_command(
         from ambiguous_wild.io.files import write_text
 
         write_text(info_file, TEMPLATE)
-        click.echo(f"wrote {info_file}: fill it in, then name scenes with it")
+        say(f"wrote {info_file}: fill it in, then name scenes with it", out=True)
         return
     if not scenes or output is None:
         raise AwError("give at least one scene folder and -o DIR; 'aw package --help' shows examples")
@@ -246,15 +259,18 @@ def package_command(
         click.echo(json.dumps({**facts, "metadata_removed": done.stripped, "people": done.people}, indent=2))
         return
     size = f"{done.bytes / 1e6:.1f} MB"
-    click.echo(
-        f"wrote {output}: {len(done.scenes)} scenes, {size}, metadata taken out of {done.stripped} photos"
+    say(
+        f"wrote {output}: {len(done.scenes)} scenes, {size}, metadata taken out of {done.stripped} photos",
+        out=True,
     )
     if done.people is not None:
-        click.echo(f"a person may be seen in {len(done.people)} photos: {shortlist(done.people) or 'none'}")
-    click.echo("look for faces and number plates in every photo before release: the detectors miss most")
+        say(
+            f"a person may be seen in {len(done.people)} photos: {shortlist(done.people) or 'none'}", out=True
+        )
+    say("look for faces and number plates in every photo before release: the detectors miss most", out=True)
     if done.lacking:
-        click.echo(f"NOT FOR RELEASE: not stated: {', '.join(done.lacking)} (--info FILE)")
-    click.echo(f"check it: aw verify {shlex.quote(str(output))}")
+        say(f"NOT FOR RELEASE: not stated: {', '.join(done.lacking)} (--info FILE)", out=True)
+    say(f"check it: aw verify {shlex.quote(str(output))}", out=True)
 
 
 @click.command("verify")
@@ -273,5 +289,5 @@ def verify_command(package: Path, as_json: bool) -> None:
         click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
         return
     for warning in verified.warnings:
-        click.echo(f"warning: {warning}")
-    click.echo(f"{package} is whole: {len(verified.scenes)} scenes, {verified.files} files")
+        say(f"warning: {warning}", out=True)
+    say(f"{package} is whole: {len(verified.scenes)} scenes, {verified.files} files", out=True)

@@ -28,6 +28,7 @@ from ambiguous_wild.core.errors import AwError, install_command, installed
 from ambiguous_wild.core.machine import usable_cores, usable_memory
 from ambiguous_wild.core.processes import python_command
 from ambiguous_wild.io.images import ximgproc
+from ambiguous_wild.io.terminal import say
 from ambiguous_wild.splat import readiness
 
 TIMEOUT_S = 60
@@ -378,8 +379,9 @@ def command(as_json: bool) -> None:
         raise AwError(f"the core does not work on this machine: {names}; first run: {broken[0].fix}")
     if not as_json:
         missing = sum(c.group == "optional" and not c.ok for c in checks)
-        click.echo(
-            f"\nthe core works; {missing} optional parts are missing" if missing else "\nall parts work"
+        click.echo()
+        say(
+            f"the core works; {missing} optional parts are missing" if missing else "all parts work", out=True
         )
 
 
@@ -389,12 +391,7 @@ def _print_group(group: str, checks: list[SystemCheck]) -> None:
     click.secho(("" if group == "core" else "\n") + group, bold=True)
     width = max(len(c.name) for c in checks)
     for c in checks:
-        click.echo(f"  {_mark(c)} {c.name.ljust(width)}  {c.detail}")
+        mark, colour = ("✓", "green") if c.ok else ("✗", "red" if c.group == "core" else "yellow")
+        say(f"  {mark} {c.name.ljust(width)}  {c.detail}", out=True, fg=colour, only=mark)
         if not c.ok and c.fix:
-            click.echo(f"    {' ' * width}  → {c.fix}")
-
-
-def _mark(check: SystemCheck) -> str:
-    if check.ok:
-        return click.style("✓", fg="green")
-    return click.style("✗", fg="red" if check.group == "core" else "yellow")
+            say(f"    {' ' * width}  → {c.fix}", out=True)

@@ -11,8 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, json_option, reported_option, title_option
+from ambiguous_wild.cli.options import (
+    CommandGroup,
+    PathName,
+    json_option,
+    label_option,
+    reported_option,
+    title_option,
+)
 from ambiguous_wild.core.errors import AwError, counted
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.board_edit import AddReport
@@ -26,7 +34,7 @@ _board = click.option(
 )
 
 
-@click.group("leaderboard")
+@click.group("leaderboard", cls=CommandGroup)
 def command() -> None:
     """Leaderboard: check runs, collect them in CSV files, publish them as a page.
 
@@ -84,7 +92,7 @@ def add_command(
     counts = Counter(r.outcome for r in reports)
     outcomes = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
     dry_note = " (nothing written)" if dry_run else ""
-    click.echo(f"{counted(len(reports), 'run')}: {outcomes}{dry_note}; board {board}", err=True)
+    say(f"{counted(len(reports), 'run')}: {outcomes}{dry_note}; board {board}")
     if counts["refused"]:
         sys.exit(AwError.exit_code)
 
@@ -96,9 +104,8 @@ def _print_reports(reports: list[AddReport], as_json: bool) -> None:
         return
     for r in reports:
         if r.error:
-            click.secho(
-                f"{r.outcome}: {' '.join(r.error.split())}", fg="red" if r.outcome == "refused" else None
-            )
+            text = f"{r.outcome}: {' '.join(r.error.split())}"
+            say(text, out=True, fg="red" if r.outcome == "refused" else "")
 
 
 @command.command("remove")
@@ -115,8 +122,8 @@ def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
 
     gone = remove(board, dry=dry_run, **chosen)
     for entry in gone:
-        click.echo(f"{'would remove' if dry_run else 'removed'}: {entry.name}")
-    click.echo(f"{counted(len(gone), 'run')}; board {board}", err=True)
+        say(f"{'would remove' if dry_run else 'removed'}: {entry.name}", out=True)
+    say(f"{counted(len(gone), 'run')}; board {board}")
 
 
 @command.command("publish")
@@ -124,6 +131,7 @@ def remove_command(board: Path, dry_run: bool, **chosen: Any) -> None:
 @click.option("-o", "--output", required=True, type=PathName(), help="Folder of the page.")
 @reported_option("BOARD/reported or those of the package")
 @title_option("Leaderboard")
+@label_option
 @click.option(
     "--models",
     multiple=True,
@@ -153,7 +161,7 @@ def publish_command(
         reported=reported is not None,
         reported_from=reported if isinstance(reported, Path) else None,
         models=models,
-        say=lambda text: click.echo(text, err=True),
+        say=say,
         **options,
     )
     if as_json:
@@ -163,7 +171,7 @@ def publish_command(
         summary += f", {done.model_pages} pages with models"
     if done.reported_from is not None:
         summary += f", {done.reported} reported numbers from {done.reported_from}"
-    click.echo(f"wrote {output / 'index.html'}: {summary}", err=True)
+    say(f"wrote {output / 'index.html'}: {summary}")
 
 
 @command.command("check")
@@ -182,7 +190,7 @@ def check_command(board: Path, as_json: bool) -> None:
         click.echo(json.dumps(dataclasses.asdict(result), indent=2, ensure_ascii=False))
     else:
         for problem in result.problems:
-            click.secho(f"wrong: {problem}", fg="red")
-    click.echo(f"{result.runs} runs: {len(result.problems)} problems; board {board}", err=True)
+            say(f"wrong: {problem}", out=True, fg="red")
+    say(f"{result.runs} runs: {len(result.problems)} problems; board {board}")
     if result.problems:
         sys.exit(AwError.exit_code)

@@ -12,19 +12,24 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import click
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, disk_line, logged_to, unknown
-from ambiguous_wild.core.names import plain
+from ambiguous_wild.io.terminal import line_width, say, wrapped
 
 # Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
 # `aw --help` imports no command.
 SECTIONS = {
     "In one go": {
-        "try": ("try_all", "Try it on your photos or video: scene, two methods, page and table in one go."),
+        "try": ("try_all", "Try it on your photos or video: scene, splat without distractors, masks, page."),
+        "masks": (
+            "photo_masks",
+            "Masks of your photos, or of a run, in the names of COLMAP, RealityScan, ...",
+        ),
     },
     "Photos": {
         "simulate": (
@@ -56,6 +61,7 @@ SECTIONS = {
     },
     "Compare": {
         "table": ("table", "Compare runs in tables: terminal, Markdown, CSV, LaTeX, HTML."),
+        "figure": ("figure", "Renders side by side with zooms, for a paper: PDF, PNG, SVG."),
         "statement": ("statement", "Write the paragraph on reproducibility of a paper, with its commands."),
         "cost": ("cost", "Accuracy against training time: tables and plots."),
         "study": ("study", "Blind user study: which distractor is hard to see, which render is better."),
@@ -126,6 +132,7 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
 
     \b
     aw try photos/ -o out               all of this in one go
+    aw masks photos/ -o masks           masks of the distractors, for other tools too
     aw simulate courtyard -o raw        a simulated capture; or use your own photos
     aw build-scene raw -o scene         check, COLMAP, downsample, split
     aw bench --method 3dgs,refinesplat --scene scene -o runs
@@ -149,7 +156,11 @@ def _printed() -> logging.Handler:
 
     handler = logging.Handler()
     handler.set_name(VERBOSE)
-    handler.emit = lambda record: tqdm.write(f"  {record.getMessage()}", file=sys.stderr)  # type: ignore[method-assign]
+
+    def emit(record: logging.LogRecord) -> None:
+        tqdm.write(wrapped(f"  {record.getMessage()}", line_width(err=True)), file=sys.stderr)
+
+    handler.emit = emit  # type: ignore[method-assign]
     return handler
 
 
@@ -175,7 +186,7 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click wraps the exception that says what was kept.
         text = str(interrupt.__cause__ or interrupt) or "interrupted; run the same command again to continue"
-        click.secho(text, fg="yellow", err=True)
+        say(text, fg="yellow")
         sys.exit(130)
     except BrokenPipeError:
         # The reader closed our output (`aw table | head`); this is not an error.
@@ -203,9 +214,9 @@ def _one_line_each() -> Callable[..., None]:
     printed: set[str] = set()
 
     def show(message: Warning | str, *_: object) -> None:
-        line = "warning: " + plain(" ".join(str(message).split()))
+        line = "warning: " + " ".join(str(message).split())
         if line not in printed:
-            click.echo(line, err=True)
+            say(line)
         printed.add(line)
 
     return show
@@ -230,7 +241,11 @@ def _click_message(error: click.ClickException) -> str:
     if isinstance(error, click.UsageError) and error.ctx is not None:
         stray = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", message)
         flags = {flag for param in error.ctx.command.params for flag in param.opts}
-        if stray and {"--method", "--scene"} <= flags:
+        first = stray[1].split()[0] if stray else ""
+        comma = next((a for a, b in pairwise(sys.argv) if a.endswith(",") and b == first), "")
+        if stray and comma:
+            message += f": write {comma}{stray[1].replace(' ', '')} without a space"
+        elif stray and {"--method", "--scene"} <= flags:
             folder = Path(stray[1]).is_dir() or "/" in stray[1]
             message += f": did you mean {'--scene' if folder else '--method'} {stray[1]}?"
         message += f" (see '{error.ctx.command_path} --help')"
@@ -239,7 +254,7 @@ def _click_message(error: click.ClickException) -> str:
 
 def _fail(message: str) -> None:
     # names may hold control characters, those of files need not be UTF-8
-    click.secho("error: " + plain(" ".join(message.split())), fg="red", err=True)
+    say("error: " + " ".join(message.split()), fg="red")
     sys.exit(AwError.exit_code)
 
 

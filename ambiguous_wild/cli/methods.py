@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.cli.options import json_option, plugin_option
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.entry import MethodEntry
 
-WIDTH = 100
+WIDTH = 100  # of a line, at most
 
 
 @click.command(name="methods")
@@ -51,12 +52,18 @@ def _list(entries: Sequence[MethodEntry], as_json: bool) -> None:
         lines += [f"needs: {entry.needs or 'nothing beyond the core'}"]
         for i, line in enumerate(lines):
             name = click.style(entry.name.ljust(width), bold=True) if i == 0 else " " * width
-            click.echo(
-                textwrap.fill(line, WIDTH, initial_indent=f"{name}  ", subsequent_indent=" " * (width + 2))
-            )
-    click.echo(
-        f"\n{len(entries)} methods; 'aw methods NAME' shows one in full, 'aw methods --table' their parts"
+            click.echo(_filled(line, head=f"{name}  ", margin=" " * (width + 2)))
+    click.echo()
+    say(
+        f"{len(entries)} methods; 'aw methods NAME' shows one in full, 'aw methods --table' their parts",
+        out=True,
     )
+
+
+def _filled(text: str, head: str, margin: str) -> str:
+    """Return the text behind its head, in lines that fit the terminal."""
+    width = min(line_width() or WIDTH, WIDTH)
+    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=margin)
 
 
 def _table(entries: Sequence[MethodEntry], as_json: bool) -> None:
@@ -70,7 +77,8 @@ def _table(entries: Sequence[MethodEntry], as_json: bool) -> None:
     for row in (COLUMNS, *rows):
         line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip()
         click.echo(click.style(line, bold=row is COLUMNS))
-    click.echo("\n- as in 3DGS, or none; CPU: a statistic is needed that gsplat does not offer")
+    click.echo()
+    say("- as in 3DGS, or none; CPU: a statistic is needed that gsplat does not offer", out=True)
 
 
 def _in_full(entries: Sequence[MethodEntry], as_json: bool) -> None:
@@ -87,10 +95,11 @@ def _in_full(entries: Sequence[MethodEntry], as_json: bool) -> None:
 
 def _show(one: dict[str, Any]) -> None:
     click.echo(click.style(one["name"], bold=True) + "\n")
-    click.echo(one["about"] or one["summary"])
+    paragraphs = (one["about"] or one["summary"]).split("\n\n")
+    click.echo("\n\n".join(_filled(" ".join(text.split()), "", "") for text in paragraphs))
     click.echo()
     facts = {
-        "paper": one["paper"],
+        "paper": f"{one['paper']}, \\cite{{{one['cite']}}}" if one["cite"] else one["paper"],
         "needs": one["needs"] or "nothing beyond the core",
         **one["parts"],
         "published with": one["published_with"],
@@ -102,7 +111,7 @@ def _show(one: dict[str, Any]) -> None:
     for key, value in facts.items():
         if value:
             head = f"{key.ljust(width)}  "
-            click.echo(textwrap.fill(value, WIDTH, initial_indent=head, subsequent_indent=" " * len(head)))
+            click.echo(_filled(value, head=head, margin=" " * len(head)))
     if one["options"]:
         click.echo(click.style("\noptions", bold=True) + f" (--set {one['name']}.KEY=VALUE)")
         keys = max(len(o["key"]) + len(o["default"]) + 1 for o in one["options"])
@@ -110,10 +119,10 @@ def _show(one: dict[str, Any]) -> None:
         for option in one["options"]:
             head = f"  {option['key']}={option['default']}".ljust(keys + 4)
             indent = " " * (keys + 4)
-            click.echo(textwrap.fill(option["comment"], WIDTH, initial_indent=head, subsequent_indent=indent)
+            click.echo(_filled(option["comment"], head=head, margin=indent)
                        if option["comment"] else head.rstrip())  # fmt: skip
     if one["ablations"]:
         click.echo(click.style("\nablations", bold=True) + f" (aw ablate --method {one['name']})")
         for group in one["ablations"]:
-            click.echo(textwrap.fill(f"{group['name']}: {group['title']} ({', '.join(group['variants'])})", WIDTH,
-                                     initial_indent="  ", subsequent_indent="    "))  # fmt: skip
+            click.echo(_filled(f"{group['name']}: {group['title']} ({', '.join(group['variants'])})",
+                               head="  ", margin="    "))  # fmt: skip

@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import plain
+from ambiguous_wild.core.errors import AwError, similar_path
+from ambiguous_wild.io.terminal import say
+
+# Heading -> options, of every command that has them.
+OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
+    "Most used": ("-o", "--method", "--scene", "--group", "--budget", "--iterations", "--seed", "--effects",
+                  "--mask", "--jobs", "--overwrite", "--name", "--test-list", "--keep-masks"),
+    "Structure from motion": ("--sfm", "--matcher", "--mapper", "--camera", "--max-features", "--part"),
+    "Training": ("--set", "--sweep", "--resolution", "--factor", "--max-gaussians", "--start", "--suite",
+                 "--protocol", "--plugin", "--metric-file"),
+    "Ray": ("--engine", "--address"),
+}  # fmt: skip
+
+PHOTO_FOLDERS = ("images", "photos", "input", "rgb")  # name no scene: the folder above does
 
 
 class PathName(click.Path):
@@ -24,7 +37,13 @@ class PathName(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
             self.fail("the name is empty; write . for the current folder", param, ctx)
-        return super().convert(value, param, ctx)
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter as error:
+            hint = similar_path(value) if "does not exist" in error.message else ""
+            if not hint:
+                raise
+            self.fail(error.message.rstrip(".") + hint, param, ctx)
 
 
 class PathOrAlone(PathName):
@@ -45,6 +64,62 @@ class FiniteFloat(click.FloatRange):
 
     def _describe_range(self) -> str:
         return "" if self.min is None and self.max is None else super()._describe_range()
+
+
+class Count(click.IntRange):
+    """A whole number, also as 10k."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        thousands = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)k", value) if isinstance(value, str) else None
+        return super().convert(round(float(thousands[1]) * 1000) if thousands else value, param, ctx)
+
+
+class Format(click.Choice[str]):
+    """A format by its name, or by another name that people use for it."""
+
+    def __init__(
+        self, names: Sequence[str], also: Mapping[str, str] = {}, unsupported: Mapping[str, str] = {}
+    ) -> None:
+        super().__init__(names)
+        self.also, self.unsupported = also, unsupported
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value in self.unsupported:
+            self.fail(f"{value!r} is not supported: {self.unsupported[value]}", param, ctx)
+        return super().convert(self.also.get(value, value), param, ctx)
+
+
+class SectionedCommand(click.Command):
+    """A command of many options: its help shows them under headings, the most used ones first."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        left = [param for param in self.get_params(ctx) if isinstance(param, click.Option)]
+        for heading, flags in OPTION_SECTIONS.items():
+            under = sorted(
+                (option for option in left if option.opts[0] in flags),
+                key=lambda option: flags.index(option.opts[0]),
+            )
+            left = [option for option in left if option not in under]
+            _write_section(ctx, formatter, heading, under)
+        _write_section(ctx, formatter, "Other options", left)
+
+
+class CommandGroup(click.Group):
+    """A group whose help shows the first sentence of each command whole."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            rows = [(name, self.commands[name].get_short_help_str(limit=1000)) for name in self.commands]
+            formatter.write_dl(rows)
+
+
+def _write_section(
+    ctx: click.Context, formatter: click.HelpFormatter, heading: str, options: Sequence[click.Option]
+) -> None:
+    rows = [row for option in options if (row := option.get_help_record(ctx))]
+    if rows:
+        with formatter.section(heading):
+            formatter.write_dl(rows)
 
 
 def _load_plugins(_: click.Context, __: click.Parameter, paths: tuple[Path, ...]) -> None:
@@ -82,6 +157,11 @@ only_option = click.option(
     metavar="NAME",
     help="Only the scene of this name; repeatable.  [default: all]",
 )
+label_option = click.option(
+    "--label", "labels", multiple=True, metavar="METHOD[=NAME]",
+    help="Show METHOD as NAME; repeatable. Methods follow in the order of their labels, after those without "
+    "one.",
+)  # fmt: skip
 
 
 def device_option(help: str) -> Callable[..., Any]:
@@ -130,7 +210,7 @@ training_options = _all(
         show_default=True,
         help="Random seed; repeatable.",
     ),
-    click.option("--iterations", type=click.IntRange(1), help="Training iterations.  [default: 30000]"),
+    click.option("--iterations", type=Count(1), help="Training iterations, also as 10k.  [default: 30000]"),
     device_option("auto: the GPU if torch and gsplat can use one, else the CPU."),
     threads_option,
     click.option(
@@ -146,13 +226,13 @@ training_options = _all(
     _plugins(),  # a run in another process needs the files too
     click.option(
         "--overwrite",
-        type=click.Choice(["never", "missing", "changed", "always"]),
+        type=click.Choice(["never", "missing", "longer", "changed", "always"]),
         is_flag=False,
         flag_value="always",
         default="missing",
         show_default=True,
-        help="missing: train unfinished runs; changed: also runs whose method's file has changed; never: skip "
-        "existing folders; always, or no word: train all again.",
+        help="missing: train unfinished runs; longer: also continue shorter ones; changed: also train again where "
+        "the method's file has changed; never: skip existing folders; always, or no word: train all again.",
     ),
     click.option(
         "--cache",
@@ -194,9 +274,34 @@ def prepare_cpu(threads: int | None) -> None:
     calibration.prepare_cpu(threads, say)
 
 
-def say(text: str) -> None:
-    """Write a line on stderr, so that stdout stays clean for results; names of runs cannot break it."""
-    click.echo(plain(text), err=True)
+def print_command(*words: str | Path) -> None:
+    """Print a command of ours as one line to copy."""
+    click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)
+
+
+def own_step(ctx: click.Context, *words: str | Path) -> None:
+    """Print a command of ours and run it, for commands that consist of others.
+
+    Raises:
+        AwError: the command's.
+    """
+    print_command(*words)
+    try:
+        ctx.find_root().command.main(list(map(str, words)), prog_name="aw", standalone_mode=False)
+    except AwError as error:
+        if "--overwrite" not in str(error):
+            raise
+        raise AwError(
+            f"{error} ('aw {ctx.info_name}' has no such option: give it to the step printed above)"
+        ) from None
+
+
+def scene_name(photos: Path) -> str:
+    """Return the name of a scene of these photos: that of their folder, or of the one above images/."""
+    named = photos.resolve()
+    if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
+        named = named.parent
+    return named.stem
 
 
 def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = "") -> str:
@@ -208,7 +313,8 @@ def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = 
     suffix = output.suffix.lower() if output is not None else ""
     if suffix not in suffixes:
         known = ", ".join(s for s in suffixes if s)
-        raise AwError(f"-o {output}: no format is known for {suffix}: end the name in {known}{otherwise}")
+        why = f"no format is known for {suffix}: " if suffix else ""
+        raise AwError(f"-o {output}: {why}end the name in {known}{otherwise}")
     return suffixes[suffix]
 
 

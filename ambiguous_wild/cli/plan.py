@@ -14,11 +14,12 @@ import click
 
 from ambiguous_wild.cli.options import PathName, json_option, prepare_cpu
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan
 
-COLUMNS = 100  # of the table
+COLUMNS = 100  # of the sentences, at most
 MASKS = (
     "masks: no effect to switch on; a method makes them while it trains (aw bench --method refinesplat, or "
     "another of 'aw methods'), or you give your own (aw build-scene --keep-masks FOLDER)"
@@ -88,8 +89,8 @@ def command(
         click.echo(json.dumps({**plan.plain(), "file": str(path)}, indent=2))
         return
     for line in table(plan):
-        click.echo(line)
-    click.echo(f"wrote {path}")
+        say(line, out=True)
+    say(f"wrote {path}", out=True)
 
 
 def _check_overwrite(path: Path, probe: bool) -> None:
@@ -109,7 +110,8 @@ def _check_overwrite(path: Path, probe: bool) -> None:
 
 
 def table(plan: EffectsPlan) -> list[str]:
-    """Return the plan as lines of at most `COLUMNS` characters: a table, and a sentence for each effect."""
+    """Return the plan as lines: a table, and a sentence for each effect."""
+    columns = min(line_width() or COLUMNS, COLUMNS)
     head = ("effect", "decision", "found", "limit", "gain on held-back pixels", "ms/iteration")
     rows = [head, *(_row(d) for d in plan.decisions)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
@@ -117,9 +119,9 @@ def table(plan: EffectsPlan) -> list[str]:
     for d in plan.decisions:
         unit = f", {d.unit}" if d.unit.startswith("of ") else ""
         sentence = f"{d.effect} {d.decision}: {d.why} ({d.evidence}{unit})"
-        lines += textwrap.wrap(sentence, COLUMNS, subsequent_indent="  ")
+        lines += textwrap.wrap(sentence, columns, subsequent_indent="  ")
     if any(d.effect == "masks" for d in plan.decisions):
-        lines += textwrap.wrap(MASKS, COLUMNS, subsequent_indent="  ")
+        lines += textwrap.wrap(MASKS, columns, subsequent_indent="  ")
     return [*lines, f"{plan.scene}: --effects {','.join(plan.effects()) or 'none'}"]
 
 

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.cli.options import say
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.callbacks import Lines, outcome_line, run_name
+from ambiguous_wild.io.terminal import keep_clock_running, line_width, say, wrapped
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.benchmark import BenchReport
@@ -51,22 +52,27 @@ class ProgressBar(Lines):
         if not self.one_by_one:
             super().started(cell, folder)
             return
-        group = f", {cell.group}" if cell.group else ""
-        say(f"[{self.done + 1}/{self.total}] {run_name(cell)}{group} -> {folder}")
         from tqdm import tqdm
 
+        group = f", {cell.group}" if cell.group else ""
+        say(f"[{self.done + 1}/{self.total}] {run_name(cell)}{group} -> {folder}")
         self._close()
         budget = cell.train.budget_s
-        self.bar = tqdm(
-            total=100.0 if budget is not None else cell.train.iterations,
-            unit="%" if budget is not None else "it",
-            bar_format="{desc}{percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f}{unit} [{elapsed}<{remaining}]{postfix}",
-            mininterval=1.0,
-            disable=not sys.stderr.isatty(),
-            leave=False,
-            file=sys.stderr,
-        )
+        training = "" if budget is None else f", then {tqdm.format_interval(budget)} of training"
+        self._open(total=None, bar_format=f"{{desc}}[{{elapsed}}{training}]")
         logging.getLogger("ambiguous_wild").addHandler(self.phases)
+
+    def _open(self, **settings: Any) -> None:
+        """Show a bar in place of the present one, with its name."""
+        from tqdm import tqdm
+
+        if self.bar is not None:
+            settings["desc"] = self.bar.desc
+            self.bar.close()
+        self.bar = tqdm(
+            mininterval=1.0, disable=not sys.stderr.isatty(), leave=False, file=sys.stderr, **settings
+        )
+        keep_clock_running(self.bar)
 
     def _phase(self, record: logging.LogRecord) -> None:
         if self.bar is None:
@@ -74,7 +80,7 @@ class ProgressBar(Lines):
         self.bar.set_description(text := record.getMessage())
         printed = any(h.name == VERBOSE for h in logging.getLogger("ambiguous_wild").handlers)
         if not printed and (self.bar.disable or record.levelno > logging.INFO):
-            self.bar.write(f"    {text}", file=sys.stderr)
+            self.bar.write(wrapped(f"    {plain(text)}", line_width(err=True)), file=sys.stderr)
 
     def _close(self) -> None:
         logging.getLogger("ambiguous_wild").removeHandler(self.phases)
@@ -83,11 +89,20 @@ class ProgressBar(Lines):
             self.bar = None
 
     def tick(self, trainer: Trainer) -> None:
-        done = 100.0 * trainer.progress(trainer.iteration) if trainer.config.budget_s else trainer.iteration
-        if trainer.iteration % 25 == 0 or trainer.done:
-            self.bar.set_postfix_str(
-                f"{trainer.ms_per_iteration:.0f} ms/it, {len(trainer.gaussians):,} Gaussians", refresh=False
-            )
+        budget = trainer.config.budget_s
+        done = 100.0 * trainer.progress(trainer.iteration) if budget else trainer.iteration
+        setting_up = self.bar.total is None  # until here, with a clock of its own
+        if setting_up or budget or trainer.iteration % 25 == 0 or trainer.done:
+            state = f"{trainer.ms_per_iteration:.0f} ms/it, {len(trainer.gaussians):,} Gaussians"
+            if budget:  # its end is known, and need not be guessed from the steps so far
+                left = self.bar.format_interval(max(budget - trainer.clock.now(), 0.0))
+                state = f"{left} left, {state}"
+            self.bar.set_postfix_str(state, refresh=False)
+        if setting_up:
+            form = "{desc}{percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f}"
+            form += "% [{elapsed}{postfix}]" if budget else "it [{elapsed}<{remaining}{postfix}]"
+            total = 100.0 if budget else trainer.config.iterations
+            self._open(total=total, initial=0.0 if budget else done - 1, bar_format=form, postfix=state)
         self.bar.update(done - self.bar.n)
 
     def ended(self, cell: Cell, report: CellReport) -> None:
@@ -111,6 +126,7 @@ def ticking(**settings: Any) -> Iterator[Callable[[int, int | None], None]]:
         nonlocal bar
         if bar is None:
             bar = tqdm(**{"disable": None, "file": sys.stderr, **settings})
+            keep_clock_running(bar)
         bar.total = total
         bar.update(done - bar.n)
 

@@ -14,6 +14,7 @@ from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, seed_option
 from ambiguous_wild.core.errors import AwError, counted
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.simulate.spec import CaptureSpec
@@ -85,7 +86,7 @@ def simulate_command(
     if output is None:
         raise AwError(f"the output folder is missing: aw simulate {called} -o raw")
     for line in lines:
-        click.echo(line, err=as_json)
+        say(line, out=not as_json)
 
     from tqdm import tqdm
 
@@ -103,16 +104,14 @@ def simulate_command(
             write_capture_sheet(output)
     outside = _outside(spec, facts["photos"])
     if outside:
-        click.echo(
+        say(
             f"warning: in {outside} of {spec.train_views} train photos the share of distractors is outside "
-            f"occlusion [{spec.occlusion[0]:g}, {spec.occlusion[1]:g}]; change their size, distance or number",
-            err=True,
+            f"occlusion [{spec.occlusion[0]:g}, {spec.occlusion[1]:g}]; change their size, distance or number"
         )
     for name in _never_seen(spec, facts["photos"]):
-        click.echo(
+        say(
             f"warning: no train photo shows the distractor {name!a}; change its waypoints, laps or distance, or "
-            "raise its size",
-            err=True,
+            "raise its size"
         )
     if as_json:
         click.echo(json.dumps({k: v for k, v in facts.items() if k not in ("files", "photos")}, indent=2))
@@ -124,17 +123,18 @@ def simulate_command(
         things = f"{things} and a {spec.fixed}" if spec.distractors else f"a {spec.fixed}"
         cover = "cover" if spec.distractors else "covers"
     covered = f"{things} {cover} {_range(facts['occlusion'])} of a train photo"
-    click.echo(
+    say(
         f"{state}: {output}: {spec.train_views} train and {spec.test_views} test photos of "
-        f"{spec.width}x{spec.height}; {covered if spec.distractors or spec.fixed else 'no distractors'}"
+        f"{spec.width}x{spec.height}; {covered if spec.distractors or spec.fixed else 'no distractors'}",
+        out=True,
     )
     effects = list(plain_spec(spec)["effects"])
     if effects:
-        click.echo(f"effects: {', '.join(effects)}")
-    click.echo(f"look at: {output / 'truth' / 'sheet.jpg'}")
+        say(f"effects: {', '.join(effects)}", out=True)
+    say(f"look at: {output / 'truth' / 'sheet.jpg'}", out=True)
     scene = output.parent / f"{output.name}-scene"
     factor = f" --factor {twin.factor}" if twin else ""
-    click.echo(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}")
+    say(f"next: aw build-scene {shlex.quote(str(output))} -o {shlex.quote(str(scene))}{factor}", out=True)
 
 
 def _range(share: Summary) -> str:
@@ -166,7 +166,7 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
         click.echo(json.dumps([dict(zip(keys, row)) for row in rows], indent=2))
         return
     for name, count, size, ambiguity, summary in rows:
-        click.echo(f"{name:18s} {count:>6s}  {size:9s} {ambiguity:9s} {summary}")
+        say(f"{name:18s} {count:>6s}  {size:9s} {ambiguity:9s} {summary}", out=True)
 
 
 @click.command("composite")
@@ -257,13 +257,15 @@ def composite_command(
     if plain:
         changed = sum(bool(photo["distractors"]) for photo in train.values())
         fixed = f", a {config.fixed} in all photos" if config.fixed else ""
-        click.echo(
+        say(
             f"wrote: {output}: {len(train)} train photos, {changed} of them with distractors{fixed}; distractors cover "
-            f"{shares}; {facts['source']['photos'] - len(train)} test photos"
+            f"{shares}; {facts['source']['photos'] - len(train)} test photos",
+            out=True,
         )
-        click.echo(f"next: aw build-scene {place} -o SCENE")
+        say(f"next: aw build-scene {place} -o SCENE", out=True)
         return
-    click.echo(
-        f"wrote: {output}: {len(train)} train photos, {len(facts['cutouts'])} distractors cover {shares}"
+    say(
+        f"wrote: {output}: {len(train)} train photos, {len(facts['cutouts'])} distractors cover {shares}",
+        out=True,
     )
-    click.echo(f"next: aw bench --method refinesplat --scene {place} -o runs")
+    say(f"next: aw bench --method refinesplat --scene {place} -o runs", out=True)

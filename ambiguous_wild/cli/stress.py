@@ -17,6 +17,7 @@ from ambiguous_wild.cli.options import (
     style_of,
 )
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.terminal import say
 
 SUFFIXES = {".txt": "text", ".md": "markdown", ".json": "json", "": "text"}  # of -o
 
@@ -104,7 +105,7 @@ def command(
     elif not live:
         click.echo(text, nl=False)
     failed = sum(not o.passed for o in outcomes)
-    click.echo(f"{len(outcomes) - failed} of {len(outcomes)} passed on {' and '.join(devices)}", err=True)
+    say(f"{len(outcomes) - failed} of {len(outcomes)} passed on {' and '.join(devices)}")
     if failed:
         sys.exit(1)
 
@@ -123,10 +124,8 @@ def _replay(run: Path) -> None:
 
     prepare_cpu(None)
     result = replay(run)
-    click.echo(f"reported: {result.reported}")
-    click.echo(f"replayed from iteration {result.started_at}: {result.found or 'all values are finite'}")
+    say(f"reported: {result.reported}", out=True)
+    say(f"replayed from iteration {result.started_at}: {result.found or 'all values are finite'}", out=True)
     if not result.same:
-        click.echo(
-            "the replay differs from the report: check the version, the machine and the plugins", err=True
-        )
+        say("the replay differs from the report: check the version, the machine and the plugins")
         sys.exit(1)

@@ -8,10 +8,18 @@ from typing import Any
 
 import click
 
-from ambiguous_wild.cli.options import PathName, json_option, only_option, seed_option, title_option
+from ambiguous_wild.cli.options import (
+    CommandGroup,
+    PathName,
+    json_option,
+    only_option,
+    seed_option,
+    title_option,
+)
+from ambiguous_wild.io.terminal import say
 
 
-@click.group("study")
+@click.group("study", cls=CommandGroup)
 def command() -> None:
     """Blind user study: how hard are distractors to see, and which render is better?
 
@@ -128,11 +136,12 @@ def make_command(
         facts = {k: str(v) if isinstance(v, Path) else v for k, v in vars(study).items()}
         click.echo(json.dumps(facts, indent=2))
         return
-    click.echo(
+    say(
         f"wrote {study.page} ({study.photos} questions about photos, {study.pairs} about renders, "
-        f"{study.pictures} images, {study.megabytes:.1f} MB)"
+        f"{study.pictures} images, {study.megabytes:.1f} MB)",
+        out=True,
     )
-    click.echo(f"wrote {study.key}: keep it private, it names the method of each render")
+    say(f"wrote {study.key}: keep it private, it names the method of each render", out=True)
 
 
 @command.command("score")
@@ -159,7 +168,7 @@ def score_command(answers: tuple[Path, ...], key: Path, output: Path | None, as_
     from ambiguous_wild.study.scores import score
 
     key_of_study = read_key(key)
-    raters = read_answers(answers, key_of_study, lambda text: click.echo(f"warning: {text}", err=True))
+    raters = read_answers(answers, key_of_study, lambda text: say(f"warning: {text}"))
     folder = output or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
     if folder.is_dir():
         refuse_strangers(folder, SCORE_FILES)
@@ -170,4 +179,4 @@ def score_command(answers: tuple[Path, ...], key: Path, output: Path | None, as_
     write_scores(scores, folder)
     click.echo(json.dumps(scores, indent=2, ensure_ascii=False) if as_json else markdown_of(scores))
     if not as_json:
-        click.echo(f"wrote {folder}/scores.md, scores.csv and scores.json")
+        say(f"wrote {folder}/scores.md, scores.csv and scores.json", out=True)

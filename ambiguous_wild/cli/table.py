@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING
 import click
 
 from ambiguous_wild.cli.options import (
+    Format,
     PathName,
     command_line,
     json_option,
+    label_option,
     metric_file_option,
     only_option,
     reported_option,
@@ -24,6 +26,7 @@ from ambiguous_wild.cli.options import (
     style_of,
 )
 from ambiguous_wild.core.errors import AwError, counted
+from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.store import Runs
@@ -35,19 +38,21 @@ SUFFIXES = {
     ".txt": "text", ".md": "markdown", ".csv": "csv", ".tex": "latex", ".html": "html", "": "text"
 }  # fmt: skip
 AUDIT_SUFFIXES = {".txt": "text", ".md": "markdown", ".csv": "csv", ".json": "json", "": "text"}
-SHEETS = (".png", ".jpg")
-LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
+LAYOUTS = ("blocks", "paper", "means", "ablation")
 
 
 @click.command(name="table")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "--format", "style", type=click.Choice(STYLES), help="[default: by the suffix of -o, else text]"
+    "--format",
+    "style",
+    type=Format(STYLES, {"tex": "latex", "md": "markdown", "txt": "text"}),
+    help="[default: by the suffix of -o, else text]",
 )
 @click.option(
     "--layout", type=click.Choice(LAYOUTS), default="blocks", show_default=True,
     help="blocks: a table per scene; paper: scenes side by side; means: datasets side by side; "
-    "memory: MB per scene; ablation: RUNS is the output of 'aw ablate'.",
+    "ablation: RUNS is the output of 'aw ablate'.",
 )  # fmt: skip
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Write to this file.")
 @click.option(
@@ -57,16 +62,16 @@ LAYOUTS = ("blocks", "paper", "means", "memory", "ablation")
     help="Only this column; repeatable. all: every column, however wide.  [default: those that fit, in text]",
 )
 @only_option
+@label_option
+@click.option(
+    "--compare", metavar="METHOD,METHOD",
+    help="Differences of the first method to each other one, with intervals, p, wins and losses.",
+)  # fmt: skip
 @click.option(
     "--dataset", "datasets", multiple=True, metavar="NAME=SCENE,SCENE",
     help="Group these scenes as dataset NAME; repeatable.  [default: as in the papers' tables]",
 )  # fmt: skip
 @reported_option("those of the package")
-@click.option(
-    "--sheet",
-    type=PathName(dir_okay=False),
-    help="Also write this PNG or JPG: test renders side by side, and what each method masks.",
-)
 def table_command(
     runs: tuple[Path, ...],
     style: str | None,
@@ -74,9 +79,10 @@ def table_command(
     output: Path | None,
     metrics: tuple[str, ...],
     scenes: tuple[str, ...],
+    labels: tuple[str, ...],
+    compare: str | None,
     datasets: tuple[str, ...],
     reported: Path | bool | None,
-    sheet: Path | None,
 ) -> None:
     """Compare the runs below the folders RUNS: quality, cost and masks, method by method.
 
@@ -88,7 +94,8 @@ def table_command(
     aw table runs
     aw table runs runs-masked                     several folders in one table
     aw table runs --layout paper -o table.tex
-    aw table runs --layout means --reported -o means.html
+    aw table runs --label 3dgs=3DGS --label mine=Ours -o table.tex
+    aw table runs --compare mine,robustsplat      is the difference more than chance?
     aw table runs --format tidy -o results.csv    one row per method, scene, seed, image and metric
     """
     if output is not None and output.suffix.lower() not in SUFFIXES and output.exists():
@@ -98,39 +105,36 @@ def table_command(
     if everything and len(metrics) > 1:
         raise AwError("--metric all names every column: leave the other --metric out")
     metrics = () if everything else metrics
-    if sheet is not None and sheet.suffix.lower() not in SHEETS:
-        raise AwError(f"--sheet {sheet}: it is a picture, give a name that ends in .png or .jpg")
     if style == "tidy":
-        if layout != "blocks" or datasets or reported or sheet:
+        if layout != "blocks" or datasets or reported or compare:
             raise AwError(
-                "--format tidy goes with --metric, --only and -o alone: it is every number there is"
+                "--format tidy goes with --metric, --only, --label and -o alone: it is every number there is"
             )
-        _write_tidy(_read(runs), output, metrics, scenes)
+        _write_tidy(_read(runs, labels), output, metrics, scenes)
         return
+    if compare is not None and layout != "blocks":
+        raise AwError(f"--compare does not go with --layout {layout}: it is a table of its own")
     if layout in ("blocks", "ablation"):
         refused = {"--dataset": datasets, "--reported": reported}
         if layout == "ablation":
             if len(runs) > 1:
                 raise AwError("--layout ablation shows one folder, the output of 'aw ablate': give RUNS once")
-            refused |= {"--only": scenes, "--sheet": sheet}
+            refused |= {"--only": scenes, "--label": labels}
         for flag, value in refused.items():
             if value:
-                raise AwError(
-                    f"{flag} does not go with --layout {layout}: give --layout paper, means or memory"
-                )
-    loaded = None if layout == "ablation" else _read(runs)
-    if sheet is not None and loaded is not None:
-        from ambiguous_wild.harness.sheets import write_sheet
-
-        shown = write_sheet(loaded, sheet, scene=scenes[0] if scenes else None)
-        click.echo(f"wrote {sheet}: {shown} methods side by side", err=True)
+                raise AwError(f"{flag} does not go with --layout {layout}: give --layout paper or means")
+    loaded = None if layout == "ablation" else _read(runs, labels)
     named_style = None if style == "text" else style
-    made_by = "command: " + command_line(style=named_style, output=None, sheet=None, metrics=metrics)
+    made_by = "command: " + command_line(style=named_style, output=None, metrics=metrics)
+    if compare is not None and loaded is not None:
+        _write_pairs(loaded, compare, style, output, metrics, scenes, made_by)
+        return
     tables = _layouts(loaded, runs[0], layout, metrics, scenes, _named(datasets), reported)
     blocks = layout == "blocks" and style != "html"
     width = _width(everything or (blocks and bool(metrics)), output) if style == "text" else None
     color = style == "text" and output is None and sys.stdout.isatty()
-    _put(*_formatted(tables, style, blocks, made_by, color, width), output)
+    notes_width = None if output is not None else line_width()
+    _put(*_formatted(tables, style, blocks, made_by, color, width, notes_width), output)
 
 
 def _put(text: str, summary: str, output: Path | None) -> None:
@@ -141,13 +145,13 @@ def _put(text: str, summary: str, output: Path | None) -> None:
     from ambiguous_wild.io.files import write_text
 
     write_text(output, text)
-    click.echo(f"wrote {output}: {summary}", err=True)
+    say(f"wrote {output}: {summary}")
 
 
-def _read(runs: Sequence[Path]) -> Runs:
+def _read(runs: Sequence[Path], labels: Sequence[str]) -> Runs:
     from ambiguous_wild.harness.store import read_runs
 
-    return read_runs(*runs)
+    return read_runs(*runs, labels=labels)
 
 
 def _width(everything: bool, output: Path | None) -> int | None:
@@ -165,16 +169,46 @@ def _write_tidy(loaded: Runs, output: Path | None, metrics: Sequence[str], scene
 
     for note in comparison(loaded, metrics=metrics, scenes=scenes)[-1].notes:
         if note.startswith(UNEQUAL):
-            click.echo(note, err=True)
+            say(note)
     frame = tidy(loaded, metrics=metrics, scenes=scenes)
     text = to_csv(list(frame.columns), frame.itertuples(index=False, name=None))
     for run in loaded.incomplete:
-        click.echo(f"incomplete: {run.folder}: {run.reason}", err=True)
+        say(f"incomplete: {run.folder}: {run.reason}")
     _put(text, f"{len(frame)} rows", output)
 
 
+def _write_pairs(
+    loaded: Runs,
+    compare: str,
+    style: str,
+    output: Path | None,
+    metrics: Sequence[str],
+    scenes: Sequence[str],
+    made_by: str,
+) -> None:
+    from ambiguous_wild.report.pairs import compared, names_of, pair_table, pairs_csv
+    from ambiguous_wild.report.plain_formats import divided
+
+    pairs, notes = compared(loaded, names_of(compare, loaded), metrics=metrics, scenes=scenes)
+    table = pair_table(pairs, notes).with_notes(made_by)
+    width = _width(False, output) if style == "text" else None
+    if style == "csv":
+        _echo_notes([table], made_by)
+        text = pairs_csv(pairs, notes)
+    else:
+        notes_width = None if output is not None else line_width()
+        text = _written([table] if width is None else divided(table, width), style, False, notes_width)
+    _put(text, counted(len(pairs), "difference"), output)
+
+
 def _formatted(
-    tables: list[Table], style: str, blocks: bool, made_by: str, color: bool, width: int | None
+    tables: list[Table],
+    style: str,
+    blocks: bool,
+    made_by: str,
+    color: bool,
+    width: int | None,
+    notes_width: int | None,
 ) -> tuple[str, str]:
     """Return the tables as text, and what they hold in words; `blocks`: all have the same columns."""
     from ambiguous_wild.report.papers import cost_at_the_end
@@ -191,26 +225,24 @@ def _formatted(
         return to_wide_csv(tables) if blocks else to_long_csv(tables), summary
     if blocks:
         tables = [cost_at_the_end(tables)] if style == "latex" else tables
-        return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color), summary
+        return _written([*tables[:-1], tables[-1].with_notes(made_by)], style, color, notes_width), summary
     tables = [one.with_notes(made_by) for one in tables]
     if width is not None:
         tables = [part for one in tables for part in divided(one, width)]
-    return _written(tables, style, color), summary
+    return _written(tables, style, color, notes_width), summary
 
 
 def _echo_notes(tables: Sequence[Table], made_by: str) -> None:
-    from ambiguous_wild.core.names import plain
-
     for note in dict.fromkeys([note for table in tables for note in table.notes] + [made_by]):
-        click.echo(plain(note), err=True)
+        say(note)
 
 
-def _written(tables: Sequence[Table], style: str, color: bool) -> str:
+def _written(tables: Sequence[Table], style: str, color: bool, width: int | None) -> str:
     from ambiguous_wild.report.plain_formats import to_markdown, to_text
     from ambiguous_wild.report.typeset import to_html, to_latex
 
     if style == "text":
-        return to_text(tables, color=color)
+        return to_text(tables, color=color, width=width)
     return {"markdown": to_markdown, "latex": to_latex, "html": to_html}[style](tables)
 
 
@@ -234,13 +266,10 @@ def _layouts(
     numbers = read_reported(reported if isinstance(reported, Path) else None) if reported else []
     if not datasets:
         datasets = datasets_of(numbers or read_reported(), sorted(set(loaded.runs["scene"])))
-    if layout == "memory":
-        metrics = metrics or papers.MEMORY
     if layout == "means":
         tables = papers.means(loaded, metrics=metrics, scenes=scenes, datasets=datasets)
     else:
-        subject = "memory" if layout == "memory" else ""
-        tables = papers.paper(loaded, metrics=metrics, scenes=scenes, datasets=datasets, subject=subject)
+        tables = papers.paper(loaded, metrics=metrics, scenes=scenes, datasets=datasets)
     return [with_reported(one, numbers) for one in tables] if numbers else tables
 
 
@@ -285,9 +314,9 @@ def rescore_command(
         for r in reports:
             what = r.error or (f"added {', '.join(r.added)}" if r.added else "nothing to add")
             still = f"; still missing: {', '.join(r.missing)}" if r.missing and not r.error else ""
-            click.echo(f"{r.run}: {what}{still}")
+            say(f"{r.run}: {what}{still}", out=True)
     counts = Counter(r.outcome for r in reports)
-    click.echo(", ".join(f"{n} {outcome}" for outcome, n in counts.items()), err=True)
+    say(", ".join(f"{n} {outcome}" for outcome, n in counts.items()))
     refused = [r for r in reports if r.outcome == "refused"]
     if refused:
         raise AwError(f"{len(refused)} of {len(reports)} runs refused: {refused[0].error}")
@@ -323,6 +352,6 @@ def audit_command(tables: tuple[Path, ...], output: Path | None, strict: bool, a
     else:
         click.echo(text, nl=style == "text" and bool(findings))
     count = len({n.table for n in numbers})
-    click.echo(f"{len(findings)} findings in {len(numbers)} numbers of {count} tables", err=True)
+    say(f"{len(findings)} findings in {len(numbers)} numbers of {count} tables")
     if strict and findings:
         sys.exit(1)

@@ -6,31 +6,38 @@ import dataclasses
 import json
 import math
 import re
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ambiguous_wild.cli.options import (
+    Count,
     FiniteFloat,
+    Format,
     PathName,
     device_option,
     json_option,
+    label_option,
     plugin_option,
-    say,
     scene_folder_option,
     seed_option,
     threads_option,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import plain
 from ambiguous_wild.io.splat_files import FORMATS
+from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
     from ambiguous_wild.viewing.model_export import ExportedModel
 
 MAX_GAUSSIANS = 150_000
 THIS_MACHINE = "127.0.0.1"
+NO_FORMAT = {  # what people ask for -> what to do instead
+    "splat": "it has no harmonics and no scale of the scene; viewers that read .splat also read PLY or SPZ, so "
+    "write --format spz",
+}
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
@@ -57,6 +64,7 @@ class HostPort(click.ParamType):
     help="Folder of the page; with --live, of the run (default then: runs).",
 )  # fmt: skip
 @scene_folder_option
+@label_option
 @click.option(
     "--max-gaussians", type=click.IntRange(4),
     help="Largest number of Gaussians of a model in the page; a larger model is reduced, with a note. With "
@@ -71,7 +79,7 @@ class HostPort(click.ParamType):
     help="Train on SCENE and watch it in a browser.",
 )
 @click.option("--method", default="refinesplat", show_default=True, help="With --live: method to train.")
-@click.option("--iterations", type=click.IntRange(1), help="With --live: iterations.  [default: 30000]")
+@click.option("--iterations", type=Count(1), help="With --live: iterations.  [default: 30000]")
 @seed_option("With --live: seed.")
 @threads_option
 @device_option("With --live: auto is the GPU if torch and gsplat can use one, else the CPU.")
@@ -85,6 +93,7 @@ def view_command(
     runs: tuple[Path, ...],
     output: Path,
     scene_folder: Path | None,
+    labels: tuple[str, ...],
     max_gaussians: int | None,
     title: str | None,
     live: Path | None,
@@ -132,6 +141,7 @@ def view_command(
         scene_folder=scene_folder,
         most_gaussians=max_gaussians or MAX_GAUSSIANS,
         title=title,
+        labels=labels,
         say=say,
     )
     size = f"{page.bytes / 1e6:.1f} MB, of which models {page.models_bytes / 1e6:.1f} MB"
@@ -164,6 +174,7 @@ def view_command(
     help="Also write this GIF, 640 px wide: the whole path in four seconds.",
 )
 @scene_folder_option
+@label_option
 @plugin_option
 @threads_option
 def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: Any) -> None:
@@ -176,8 +187,13 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
     from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.report.model_views import video_runs
 
-    with ticking(unit="frame") as tick:
-        done = video_runs(runs, output, path=path, **options, say=say, tick=tick)
+    # the end of a time limit is an interruption, which keeps the frames
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with ticking(unit="frame") as tick:
+            done = video_runs(runs, output, path=path, **options, say=say, tick=tick)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
     if done.gif is not None:
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
@@ -186,7 +202,7 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
 @click.command(name="export")
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @click.option(
-    "--format", "formats", multiple=True, type=click.Choice(FORMATS), default=[name for name in FORMATS if name != "ply"],
+    "--format", "formats", multiple=True, type=Format(list(FORMATS), unsupported=NO_FORMAT), default=[name for name in FORMATS if name != "ply"],
     show_default="all but ply", help="Repeatable.",
 )  # fmt: skip
 @click.option(
@@ -241,11 +257,11 @@ def export_command(
         click.echo(json.dumps(encoded(rows), indent=2, ensure_ascii=False, default=str))
         return
     for label, files in reports:
-        click.echo(f"{plain(label)}: {files[0].gaussians:,} Gaussians")
+        say(f"{label}: {files[0].gaussians:,} Gaussians", out=True)
         if told := [f"{e.format}: {_transform(e)}" for e in files if e.transform != type(e.transform)()]:
-            click.echo(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}")
+            say(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}", out=True)
         for e in files:
-            click.echo(f"  {_line(e)}")
+            say(f"  {_line(e)}", out=True)
 
 
 def _transform(e: ExportedModel) -> str:

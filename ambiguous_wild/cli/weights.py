@@ -7,11 +7,12 @@ import json
 
 import click
 
-from ambiguous_wild.cli.options import json_option
+from ambiguous_wild.cli.options import CommandGroup, json_option
 from ambiguous_wild.core.errors import AwError, counted
+from ambiguous_wild.io.terminal import say
 
 
-@click.group(name="weights")
+@click.group("weights", cls=CommandGroup)
 def command() -> None:
     """Pretrained networks for LPIPS, features and instance masks. No method needs them by default.
 
@@ -47,17 +48,18 @@ def list_command(as_json: bool) -> None:
         max(len(text) for text in texts) for texts in zip(*((w.name, w.source) for w, _ in rows))
     )
     for w, line in rows:
-        mark = click.style("✓", fg="green") if line.present else "·"
+        mark, colour = ("✓", "green") if line.present else ("·", "")
         size = f"{w.size_mb:.0f} MB" if w.size_mb >= 1 else f"{w.size_mb * 1000:.0f} kB"
         text = (
             f"{mark} {w.name.ljust(width)}  {size.rjust(7)}  {w.source.ljust(source)}  {w.licence.ljust(18)}"
         )
-        click.echo(f"{text}  {w.used_for}")
+        say(f"{text}  {w.used_for}", out=True, fg=colour, only=mark)
     for name, members in weight_registry.GROUPS.items():
-        click.echo(f"\n{name} = {', '.join(members)}")
+        click.echo()
+        say(f"{name} = {', '.join(members)}", out=True)
     present = sum(line.present for _, line in rows)
     how = folder_fault() or f"'aw weights get NAME' downloads into {weights_folder()}"
-    click.echo(f"{present} of {len(rows)} on this machine; {how}")
+    say(f"{present} of {len(rows)} on this machine; {how}", out=True)
 
 
 @command.command(name="get")
@@ -73,7 +75,7 @@ def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     from ambiguous_wild.vision import weight_download, weight_registry
 
     wanted = weight_registry.chosen(names)
-    places = weight_download.get(wanted, lambda line: click.echo(line, err=True), again)
+    places = weight_download.get(wanted, say, again)
     if as_json:
         rows = [{"name": w.name, "where": str(place)} for w, place in zip(wanted, places)]
         click.echo(json.dumps(rows, indent=2))
@@ -99,13 +101,13 @@ def check_command(names: tuple[str, ...], as_json: bool) -> None:
     for weight in wanted:
         verdicts.append(verify(weight))
         if not as_json:
-            mark = click.style("✓", fg="green") if verdicts[-1].ok else click.style("✗", fg="red")
-            click.echo(f"{mark} {weight.name}: {verdicts[-1].detail}")
+            mark, colour = ("✓", "green") if verdicts[-1].ok else ("✗", "red")
+            say(f"{mark} {weight.name}: {verdicts[-1].detail}", out=True, fg=colour, only=mark)
     if as_json:
         click.echo(json.dumps([dataclasses.asdict(v) for v in verdicts], indent=2, ensure_ascii=False))
     elif not wanted:
         how = folder_fault() or "'aw weights list' lists what can be downloaded"
-        click.echo(f"no weights on this machine; {how}")
+        say(f"no weights on this machine; {how}", out=True)
     wrong = [v for v in verdicts if not v.ok]
     if wrong:
         raise AwError(

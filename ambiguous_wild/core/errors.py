@@ -99,6 +99,17 @@ def unknown(kind: str, name: str, choices: Iterable[str], hint: str = "") -> AwE
     return AwError(f"unknown {kind} {name!r}: {suggestion}" + (f" ({hint})" if hint else ""))
 
 
+def similar_path(path: Path | str) -> str:
+    """Return "; did you mean photos?" where that lies beside a path that does not exist; else ""."""
+    given = Path(path)
+    try:
+        names = sorted(inner.name for inner in given.parent.iterdir() if not inner.name.startswith("."))
+    except OSError:
+        return ""
+    match = [] if given.name in names else difflib.get_close_matches(given.name, names, n=1, cutoff=0.6)
+    return f"; did you mean {given.with_name(match[0])}?" if match else ""
+
+
 @contextlib.contextmanager
 def logged_to(handler: logging.Handler) -> Iterator[None]:
     """Send all log messages of this package, of any level, to the handler meanwhile; close it at the end."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Literal, TypedDict
 
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera, rotation_from_quat
 from ambiguous_wild.core.config import Facts
+from ambiguous_wild.core.errors import AwError
 
 Split = Literal["train", "test"]
 NO_PHOTO = Path()  # image path of views without a photo: of a splat file's scene, or hidden from methods
@@ -168,6 +170,22 @@ class Scene:
         if radius <= 0.0 and len(self.points):
             radius = float(np.median(np.linalg.norm(self.points.xyz - centers.mean(axis=0), axis=1)))
         return 1.1 * radius if radius > 0.0 else 1.0
+
+
+def find_view(views: Sequence[View], photo: str) -> View | None:
+    """Find a view by its name, or by the name or the stem of its file; None if there is none.
+
+    Raises:
+        AwError: several views have this file name or stem.
+    """
+    found = [view for view in views if view.name == photo]
+    found = found or [v for v in views if photo in (PurePath(v.name).name, PurePath(v.name).stem)]
+    # a scene holds PNG files of photos that may have been JPEG files
+    found = found or [v for v in views if PurePath(photo).stem == PurePath(v.name).stem]
+    if len(found) > 1:
+        names = ", ".join(view.name for view in found)
+        raise AwError(f"{photo} names several photos: {names}; name one in full")
+    return found[0] if found else None
 
 
 def centred(scene: Scene) -> Scene:

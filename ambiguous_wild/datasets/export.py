@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from ambiguous_wild.io import motion_points
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera
 from ambiguous_wild.io.files import atomic_dir, check_output, write_json
-from ambiguous_wild.io.images import read_mask, write_png
+from ambiguous_wild.io.images import image_size, read_mask, write_png
 from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene, model_folder, without_suffix
 
@@ -38,7 +38,9 @@ class ExportedScene:
     left_out: tuple[str, ...]  # parts of the scene that the layout cannot hold
 
 
-def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> ExportedScene:
+def export_scene(
+    path: Path, form: str, output: Path, *, copy: bool = False, masks: Mapping[str, Path] | None = None
+) -> ExportedScene:
     """Write a scene in another layout, at the size that it is trained at (On-the-go: full size).
 
     Args:
@@ -46,6 +48,7 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
         form: "nerfstudio", "nerfbaselines", "colmap" or "on-the-go".
         output: the folder to make; it must not exist, or be empty.
         copy: copy photos instead of linking them, for a folder that is to be moved.
+        masks: keep masks of train photos by name, at their size in training, in place of the scene's.
 
     Raises:
         AwError: no scene, an unknown layout, or an output that exists.
@@ -53,6 +56,10 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     if form not in WRITERS:
         raise unknown("layout", form, WRITERS)
     scene = load_scene(path, raw=True)
+    if masks is not None:
+        views = tuple(replace(v, keep_path=masks.get(v.name, v.keep_path)) for v in scene.views)
+        scene = replace(scene, views=views)
+        _check_sizes(scene.train)
     check_output(output, outside={f"the scene {path}": scene.root}, new=True)
     with atomic_dir(output, replace=False) as folder:
         put = _copy if copy else link_file
@@ -60,6 +67,16 @@ def export_scene(path: Path, form: str, output: Path, *, copy: bool = False) -> 
     if (scene.root / motion_points.FILE).is_file():
         left_out.append("features that move (motion.npz)")
     return ExportedScene(output, len(scene.views), len(scene.train), len(scene.test), tuple(left_out))
+
+
+def _check_sizes(views: Iterable[View]) -> None:
+    for view in views:
+        size = (view.camera.width, view.camera.height)
+        if view.keep_path is not None and image_size(view.keep_path) != size:
+            raise AwError(
+                f"the mask {view.keep_path} is not of its photo's size, {size[0]}x{size[1]}: the run was "
+                "trained with another --factor than the scene was built for; train one with the scene's"
+            )
 
 
 CopyOrLink = Callable[[Path, Path], None]

@@ -12,14 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.resample import (
-    MAX_LOST,
-    Lens,
-    downsample_mask,
-    downsample_photo,
-    downsampled_size,
-    make_lens,
-)
+from ambiguous_wild.builder.resample import MAX_LOST, downsample_mask, downsample_photo, downsampled_size
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import ForeignScene
 from ambiguous_wild.datasets.photo_names import find_photo
@@ -35,6 +28,7 @@ from ambiguous_wild.io.images import (
     upright,
     write_png,
 )
+from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.photos import FROM_PROFILE
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_checks import other_pictures

@@ -30,7 +30,7 @@ FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
 FIXED = ("README.md", "croissant.json", "files.csv", "photos.csv", "checksums.sha256", "checksums.md5")
 _TIME = (1980, 1, 1, 0, 0, 0)  # the earliest time that zip can hold
-_DROPPED = ("seconds",)  # keys of scene.json that differ between two builds of one scene
+_DROPPED = ("seconds", "capture")  # keys of scene.json that differ between two builds of one scene
 _PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic")
 
 

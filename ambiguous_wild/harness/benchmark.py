@@ -158,6 +158,7 @@ def bench(
     factor: int | None = None,
     protocol: Protocol | None = None,
     start: PathLike | None = None,
+    corrections: PathLike | None = None,
     overwrite: Overwrite = "missing",
     cache: PathLike | None = None,
     pictures: bool = True,
@@ -176,7 +177,8 @@ def bench(
             several = every choice, each in its own group.
         plan: a plan of `aw plan`, or its file, for the only scene; None = made where one is needed.
         settings: options of methods, "METHOD.KEY=VALUE".
-        parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}.
+        parts: parts of other methods that every method takes, e.g. {"mask": "refinesplat"}; for
+            "mask" also a folder of masks.
         passes: 2 = train again from the start with the final masks; the runs are called METHOD+2passes.
         train: other settings of training.
         plugins: Python files that register methods.
@@ -188,8 +190,10 @@ def bench(
         factor: N of the folder images_N to train on; None = the one that the scene was built for.
         protocol: "full" or "half" (right halves are measured, NeRF-W); None = scene.json's, else "full".
         start: a splat file or a point cloud (PLY) to start from; None = the scene's points.
-        overwrite: "missing" keeps finished runs and resumes stopped ones, "changed" also trains again
-            where a method's file has changed, "always" starts anew, "never" leaves folders that exist.
+        corrections: masks corrected by hand, which the page of `aw view` saves; of the only scene.
+        overwrite: "missing" keeps finished runs and resumes stopped ones, "longer" also continues runs that
+            are shorter or have other corrections, "changed" also trains again where a method's file has
+            changed, "always" starts anew, "never" leaves folders that exist.
         cache: folder for features and instance masks; None = OUTPUT/.cache.
         pictures: draw what the method saw into RUN/pictures.
         callbacks: called at every event; None = no calls. `Lines()` prints a line for each run.
@@ -217,9 +221,11 @@ def bench(
     out = Path(output)
     with Session(engine, threads, callbacks) as session:
         from ambiguous_wild.harness.cell import RunOptions
+        from ambiguous_wild.harness.continued import as_continued, with_corrections
         from ambiguous_wild.harness.effects_plan import read_plan
         from ambiguous_wild.harness.external_runs import check_program
         from ambiguous_wild.harness.grid import (
+            cell_folder,
             check_grafts,
             expected_line,
             grouped,
@@ -258,6 +264,10 @@ def bench(
             for wanted in dict.fromkeys(choices)
         }
         cells = grouped(planned, budgets_s)
+        if corrections is not None:
+            cells = with_corrections(cells, Path(corrections))
+        if overwrite == "longer":
+            cells = [as_continued(cell, cell_folder(out, cell)) for cell in cells]
         warnings = check_grafts(cells)
         for cell in {cell.method.name: cell for cell in cells}.values():
             check_passes(cell)
@@ -299,11 +309,14 @@ def find_methods(
     """
     from ambiguous_wild.methods.entry import second_pass_name, trained_once
     from ambiguous_wild.methods.graft import graft_name
+    from ambiguous_wild.methods.references import MASKS
     from ambiguous_wild.methods.registry import get_method, load_plugin
 
     for plugin in plugins:
         load_plugin(Path(plugin))
     donors: dict[str, str | None] = dict(parts.items())
+    if (mask := donors.get("mask")) and Path(mask).is_dir():
+        donors["mask"] = MASKS + mask
     names = []
     for name in (one for text in methods for one in split_methods(text)):
         once = trained_once(name)

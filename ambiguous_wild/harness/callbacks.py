@@ -112,6 +112,7 @@ def outcome_line(report: CellReport) -> str:
         return "failed: " + " ".join(report.error.split())
     if report.result is None:
         return "trained"
+    from ambiguous_wild.harness.result_file import NOT_BEGUN
     from ambiguous_wild.harness.timing import timing_of
 
     cost = report.result["cost"]
@@ -128,6 +129,8 @@ def outcome_line(report: CellReport) -> str:
     empty = [name for name, facts in effects.items() if facts.get("points") == 0]
     if empty:
         parts.append(f"{' and '.join(empty)} added no point")
+    no_masks = str(report.result["facts"].get("no_masks", ""))
+    parts += [f"{no_masks}, a run too short"] if no_masks.startswith(NOT_BEGUN) else []
     timing = timing_of(cost)
     parts += [f"time not ranked: {timing.reason}"] if timing.verdict == "contended" else []
     return ", ".join(parts)

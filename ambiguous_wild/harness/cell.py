@@ -28,7 +28,9 @@ from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_pro
 from ambiguous_wild.harness.command_lines import bench_command, length_options, length_text, option_text
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
+    NOT_BEGUN,
     SCHEMA,
+    Continued,
     Cost,
     Environment,
     MaskScores,
@@ -41,6 +43,7 @@ from ambiguous_wild.harness.result_file import (
     config_identity,
 )
 from ambiguous_wild.harness.start import StartFile
+from ambiguous_wild.io.corrections import CorrectionsFile
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.motion_points import FILE as MOTION
 from ambiguous_wild.methods.graft import Graft
@@ -48,7 +51,7 @@ from ambiguous_wild.methods.references import reference_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.pace import TrainConfig
 
-Overwrite = Literal["never", "missing", "changed", "always"]
+Overwrite = Literal["never", "missing", "longer", "changed", "always"]
 Protocol = Literal["full", "half"]
 Outcome = Literal["trained", "kept", "skipped", "failed"]
 PACKAGES = ("numpy", "numba", "torch", "opencv-contrib-python-headless", "scipy", "gsplat", "transformers")
@@ -158,6 +161,8 @@ class Cell:
     chosen: Chosen = field(default_factory=Chosen)  # optional effects, and the reasons for them
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
     start: StartFile | None = None  # what it starts from instead of the scene's points
+    corrections: CorrectionsFile | None = None  # masks corrected by hand
+    continued: tuple[Continued, ...] = ()  # the shorter runs that it goes on from
     group: str = ""  # folder below the output, where one output takes several lengths or effects
 
     @property
@@ -171,6 +176,10 @@ class Cell:
             unusual["protocol"] = self.protocol
         if self.start is not None:
             unusual["start"] = {"sha256": self.start.sha256, "path": str(self.start.path)}
+        if self.corrections is not None:
+            unusual["corrections"] = self.corrections.record()
+        if self.continued:
+            unusual["continued"] = list(self.continued)
         return {
             **unusual,
             "method": self.method.name,
@@ -223,10 +232,17 @@ class Cell:
         """
         all_facts: RunFacts = {
             **(facts or {}),
-            "length": length_text(self.train.iterations, self.train.budget_s),
+            "length": ", continued to ".join(
+                [f"{before['iteration']} iterations" for before in self.continued]
+                + [length_text(self.train.iterations, self.train.budget_s)]
+            ),
         }
+        if self.corrections is not None:
+            all_facts["corrections"] = f"by hand ({self.corrections.sha256[:8]})"
         if mixed := mixed_tests(self.scene):
             all_facts["test_photos"] = mixed
+        if masks is None and error is None and (why := self._why_no_masks(cost or {})):
+            all_facts["no_masks"] = why
         if self.start is not None:
             all_facts["start"] = f"{self.start.path.name} ({self.start.sha256[:8]})"
         return {
@@ -248,14 +264,27 @@ class Cell:
             "version": __version__,
         }
 
+    def _why_no_masks(self, cost: Cost) -> str:
+        """Return why no masks could be compared with the exact ones; empty if the scene has none."""
+        if not any((self.scene.root / "truth" / "distractor").glob("*")):
+            return ""
+        if self.method.program is not None:
+            return "the program wrote no masks"
+        from ambiguous_wild.methods.given_masks import makes_masks
+
+        if not makes_masks(self.method.build(self.options)):
+            return "the method makes no masks"
+        return f"{NOT_BEGUN} at {cost.get('iterations', self.train.iterations)} iterations"
+
 
 @dataclass(frozen=True)
 class RunOptions:
     """How runs are made and kept. No option changes a result."""
 
     cache_dir: Path  # features and instance masks that runs share
-    # "missing" keeps a finished run and resumes a stopped one, "changed" also replaces one whose method's
-    # file has changed, "always" starts anew, "never" leaves a folder that exists as it is
+    # "missing" keeps a finished run and resumes a stopped one, "longer" also continues a shorter one,
+    # "changed" also replaces one whose method's file has changed, "always" starts anew, "never" leaves a
+    # folder that exists as it is
     overwrite: Overwrite = "missing"
     pictures: bool = True  # draw what the method saw into pictures/
 
@@ -310,6 +339,7 @@ def reproduce(cell: Cell) -> str:
         ("--effects", ",".join(cell.chosen.effects) or "none"),
         ("--factor", cell.scene.info.get("loaded_factor") or None),
         ("--start", cell.start and cell.start.path),
+        ("--corrections", cell.corrections and cell.corrections.path),
         ("--max-gaussians", train.max_gaussians),
         ("--protocol", None if cell.protocol == scene_protocol(cell.scene) else cell.protocol),
         *(("--set", setting) for setting in changed_settings(method, name, cell.options)),

@@ -7,7 +7,7 @@ import os
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import yaml
 
@@ -42,7 +42,9 @@ from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
 from ambiguous_wild.harness.training import STOPPED, train_and_measure
 from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.corrections import CORRECTIONS
 from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
+from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
 from ambiguous_wild.methods.references import error_location
 from ambiguous_wild.splat.training_loop import Tick
@@ -54,11 +56,12 @@ LOG_FILE = "log.txt"
 EFFECTS = "effects.json"
 # all that a run writes into its folder
 OURS = (
-    RESULT, FAILED, TRACEBACK, CONFIG, ENVIRONMENT, LOG_FILE, EFFECTS, FIRST_PASS, STOPPED, ROWS, WORK, LOGS,
-    NONFINITE, "checkpoint", "export", "masks", "pictures", "point_cloud.ply", "renders", "timeline.csv",
+    RESULT, FAILED, TRACEBACK, CONFIG, CORRECTIONS, ENVIRONMENT, LOG_FILE, EFFECTS, FIRST_PASS, STOPPED, ROWS,
+    WORK, LOGS, NONFINITE, "checkpoint", "export", "masks", "pictures", "point_cloud.ply", "renders",
+    REASONS, "timeline.csv",
 )  # fmt: skip
 # Files that a run writes before there is anything worth keeping in its folder.
-_WORTHLESS = {CONFIG, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK, LOG_FILE}
+_WORTHLESS = {CONFIG, CORRECTIONS, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK, LOG_FILE}
 LOG = logging.getLogger(__name__)
 Flat = Mapping[str, object]  # a configuration with dotted keys, "train.seed"
 
@@ -78,19 +81,28 @@ def left_alone(folder: Path, overwrite: Overwrite, config: RunConfig) -> Literal
     """Return the outcome of a run that need not be made: "kept" or "skipped"; None if it must be made."""
     if overwrite == "never":
         return "skipped" if folder.exists() else None
-    return "kept" if is_finished(folder) and not made_anew(folder, overwrite, config) else None
+    if not is_finished(folder) or made_anew(folder, overwrite, config) or _continues(folder, config):
+        return None
+    return "kept"
+
+
+def _continues(folder: Path, config: RunConfig) -> bool:
+    """Return whether a run of this configuration goes on from the one in the folder."""
+    earlier = config.get("continued", [])
+    return bool(earlier) and read_config(folder).get("config_hash") == earlier[-1]["config_hash"]
 
 
 def made_anew(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
     """Return whether an earlier run in the folder is replaced: always, or where the method's file changed."""
     if overwrite != "changed":
         return overwrite == "always"
-    keys = different_keys(flatten(read_config(folder)), flatten(dict(config)))
+    keys = different_keys(read_config(folder), config)
     return "source" in keys and all(key == "source" or key.startswith("options.") for key in keys)
 
 
-def different_keys(before: Flat, now: Flat) -> list[str]:
-    """Return the keys that decide the result and differ, the method's file ("source") first."""
+def different_keys(config: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return the dotted keys that decide a result and differ, the method's file ("source") first."""
+    before, now = flatten(dict(config)), flatten(dict(other))
     ignored = {f"{part}.{key}" for part, keys in IGNORED.items() for key in keys} | {"config_hash"}
     keys = [k for k in before.keys() | now.keys() if before.get(k) != now.get(k) and k not in ignored]
     return sorted(keys, key=lambda k: (k != "source", k))
@@ -206,16 +218,23 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         before = flatten(plain_yaml.read_mapping(path))
     except AwError as error:
         raise AwError(f"{error}; start anew with --overwrite always") from None
-    if before.get("config_hash") == cell.identity:
+    if before.get("config_hash") == cell.identity or _continues(folder, cell.config):
         return
     now = flatten(dict(cell.config))
     keys = different_keys(before, now)
     changes = ", ".join(_describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
     how = "changed" if made_anew(folder, "changed", cell.config) else "always"
+    longer = ", continue it with --overwrite longer" if keys and all(map(may_continue, keys)) else ""
     raise AwError(
-        f"{folder} holds a run of another configuration ({changes}); "
-        f"choose another -o, or replace it with --overwrite {how}{_hint_for_weights(cell, keys, before)}"
+        f"{folder} holds a run of another configuration ({changes}); choose another -o{longer}, or "
+        f"replace it with --overwrite {how}{_hint_for_weights(cell, keys, before)}"
     )
+
+
+def may_continue(key: str) -> bool:
+    """Return whether a run can go on with another value of this setting: its length, size or corrections."""
+    of_length = ("train.iterations", "train.budget_s", "train.max_gaussians", "continued")
+    return key in of_length or key.startswith("corrections.")
 
 
 def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = None) -> CellReport:
@@ -274,7 +293,9 @@ def _prepare_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
             for name in OURS:  # what a user put beside them stays
                 remove(folder / name)
         elif is_finished(folder):
-            return False
+            if not _continues(folder, cell.config):
+                return False
+            (folder / RESULT).unlink()  # it is no longer that of the checkpoint
     folder.mkdir(parents=True, exist_ok=True)
     sweep(folder)
     for name in (FAILED, TRACEBACK):
@@ -283,4 +304,6 @@ def _prepare_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
     write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
     write_json(folder / ENVIRONMENT, environment(cell.device))
     cell.chosen.write(folder / EFFECTS)
+    if cell.corrections is not None:
+        cell.corrections.copy(folder / CORRECTIONS)
     return True

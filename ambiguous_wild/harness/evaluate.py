@@ -17,10 +17,13 @@ from ambiguous_wild.harness.regions import true_distractor
 from ambiguous_wild.harness.result_file import Cost, MaskScores
 from ambiguous_wild.io.files import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
+from ambiguous_wild.io.mask_reasons import FILE as REASONS
+from ambiguous_wild.io.mask_reasons import MaskReasons, reasons_of, write_reasons
 from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import mask_scores as mask_metrics
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import threads
+from ambiguous_wild.splat.step import Step
 from ambiguous_wild.splat.trainer import Trainer
 
 FPS_ROUNDS = 5
@@ -137,16 +140,55 @@ def drawn_by(trainer: Trainer, half: bool) -> Draw:
 
 
 def write_masks(trainer: Trainer, folder: Path) -> MaskScores | None:
-    """Write the keep map of every train view and score it, see `write_keeps`."""
+    """Write the keep map of every train view and score it, see `write_keeps`; beside it, why it is so."""
+    reasons: dict[str, MaskReasons] = {}
 
     def keeps() -> Iterator[tuple[View, np.ndarray]]:
         for index, view in enumerate(trainer.data.scene.train):
-            step = trainer.make_step(max(trainer.iteration, 1), index, downsampling=1)
-            keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
+            keep, why = explained_keep(trainer, _last_step(trainer, index))
+            if why is not None:
+                reasons[view.name] = why
             if keep is not None:
                 yield view, (keep > 0.5).cpu().numpy()
 
-    return write_keeps(trainer.data.scene, keeps(), folder)
+    scores = write_keeps(trainer.data.scene, keeps(), folder)
+    write_reasons(folder.parent / REASONS, reasons)
+    return scores
+
+
+def keep_maps(trainer: Trainer) -> Iterator[tuple[View, np.ndarray]]:
+    """Compute the keep map [H, W] bool of each train view that has one; each is rendered for it."""
+    for index, view in enumerate(trainer.data.scene.train):
+        step = _last_step(trainer, index)
+        keep = trainer.combine_user_keep(step, trainer.hooks.mask.predict(step))
+        if keep is not None:
+            yield view, (keep > 0.5).cpu().numpy()
+
+
+def _last_step(trainer: Trainer, view: int) -> Step:
+    return trainer.make_step(max(trainer.iteration, 1), view, downsampling=1)
+
+
+def explained_keep(trainer: Trainer, step: Step) -> tuple[torch.Tensor | None, MaskReasons | None]:
+    """Return the keep map of the step's photo at its own size, and why its regions are masked or kept."""
+    predicted, reasons = trainer.hooks.mask.predict_with_reasons(step)
+    keep, own = trainer.combine_user_keep(step, predicted), trainer.data.user_keep[step.view]
+    if own is None:
+        return keep, reasons
+    outside = (own <= 0.5).cpu().numpy()
+    regions = np.full(outside.shape, -1) if reasons is None else reasons.regions.astype(int) - 1
+    sentences = [] if reasons is None else list(reasons.sentences)
+
+    def add(where: np.ndarray, sentence: str) -> None:
+        regions[where] = len(sentences)
+        sentences.append(sentence)
+
+    add(outside, "masked: the capture's own mask leaves it out")
+    by_hand = trainer.data.by_hand[step.view] if trainer.data.by_hand else None
+    if by_hand is not None:
+        add((by_hand < 0).cpu().numpy(), "masked: by hand")
+        add((by_hand > 0).cpu().numpy(), "kept: by hand")
+    return keep, reasons_of(regions, sentences)
 
 
 def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: Path) -> MaskScores | None:

@@ -35,7 +35,7 @@ from ambiguous_wild.harness.effects_plan import EffectsPlan, plan_effects
 from ambiguous_wild.harness.start import start_file, start_line, started
 from ambiguous_wild.harness.timing import MAX_RATIO, MIN_RATIO, expected_s, slowness
 from ambiguous_wild.io.files import check_output
-from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.scene_folder import ALL_TRAINED, load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.effects import check_effects
 from ambiguous_wild.splat.method_hooks import MethodHooks
@@ -127,10 +127,11 @@ def plan_cells(
     distinct = list({path.resolve(): path for path in scenes}.values())
     loaded = [load_scene(path, factor=factor) for path in distinct]
     for scene in loaded:
-        if not scene.test:
+        if not scene.test and dict(scene.info).get("split") != ALL_TRAINED:
             raise AwError(
                 f"{scene.root} tests nothing: no name in its test_list.txt is a photo of the model; correct "
-                "the list (one name a line, UTF-8), or remove both lists, then every 8th photo tests"
+                "the list (one name a line, UTF-8), or remove both lists, then every 8th photo tests; 'aw "
+                "build-scene --no-test' trains on all"
             )
     names = [scene.name for scene in loaded]
     twice = {name for name in names if names.count(name) > 1}

@@ -24,11 +24,12 @@ from ambiguous_wild.harness.chosen_effects import Chosen
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
 from ambiguous_wild.harness.start import recorded_start
+from ambiguous_wild.io.corrections import recorded_corrections
 from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.entry import trained_once
 from ambiguous_wild.methods.graft import graft_pairs, split_graft
-from ambiguous_wild.methods.references import reference_file, with_file
+from ambiguous_wild.methods.references import MASKS, NERFBASELINES, reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
 from ambiguous_wild.splat.pace import TrainConfig
 
@@ -75,7 +76,7 @@ def read_sources(
             file = reference_file(member)
             if file is not None:
                 sources.append(_source(member, "method", file))
-            elif member.startswith("nerfbaselines:"):
+            elif member.startswith((NERFBASELINES, MASKS)):
                 sources.append(CodeSource(member, "method"))
     return tuple(sources)
 
@@ -144,6 +145,8 @@ def make_cell(job: Job) -> Cell:
         chosen=job.chosen,
         protocol="half" if config.get("protocol") == "half" else "full",
         start=recorded_start(config.get("start")),
+        corrections=recorded_corrections(config.get("corrections")),
+        continued=tuple(config.get("continued", ())),
     )
     if cell.identity != job.identity:
         raise AwError(

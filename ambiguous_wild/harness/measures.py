@@ -49,6 +49,11 @@ class Measure:
     partial: bool = False  # measured on some pixels only: an image without such pixels is left out of a mean
 
     @property
+    def whole_photo(self) -> bool:
+        """True if a distractor in a test photo counts as truth."""
+        return self.per_image and self.key not in ("psnr_consistent", "psnr_valid")
+
+    @property
     def quality(self) -> bool:
         """True for a measure of the result's quality, False for one of its cost."""
         return self.per_image or self.key.startswith("mask_")
@@ -116,6 +121,7 @@ MEASURES: dict[str, Measure] = {
         _region("psnr_covered", "PSNR covered", _REGION_DB),
         _region("psnr_uncovered", "PSNR uncovered", _REGION_DB),
         _region("psnr_supported", "PSNR supported", _REGION_DB),
+        _region("psnr_consistent", "PSNR consistent", _REGION_DB),
         *(Measure(f"mask_{k}", f"mask {v}", "higher", per_image=False) for k, v in MASK_LABELS.items()),
         Measure("train_s", "train s", "lower", 1, per_image=False, timed=True),
         Measure("reference_s", "ref s", "lower", 1, per_image=False, timed=True),

@@ -1,11 +1,13 @@
-"""PSNR on parts of a test view: in a user's mask, behind distractors of train views, or seen by enough views.
+"""PSNR on parts of a test view: in a user's mask, behind distractors of train views, seen by enough views, or
+looking as other photos show it.
 
 A pixel of a test view is *supported* where at least three train views show its static surface; elsewhere a
 method extrapolates. It is *covered* where a distractor hides its static surface in at least half of the train
-views that look at it, and *uncovered* otherwise. Regions depend on the scene alone, not on a render, so that
-all methods are measured on the same pixels: surfaces come from the sparse points (inverse depth, linear
-between them, exact on planes), distractors from the exact masks. A train view looks at a surface that is in
-its frame and not behind another static surface.
+views that look at it, and *uncovered* otherwise. Where test photos may hold distractors, a pixel is
+*consistent* if at least half of the train photos that look at its surface show its colour there. Regions
+depend on the scene alone, not on a render, so that all methods are measured on the same pixels: surfaces come
+from the sparse points (inverse depth, linear between them, exact on planes), distractors from the exact
+masks. A train view looks at a surface that is in its frame and not behind another static surface.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.io.images import read_gray
+from ambiguous_wild.harness.chosen_effects import mixed_tests
+from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.metrics import mask_scores
 from ambiguous_wild.splat.data import load_keep
 from ambiguous_wild.vision.sparse_surface import (
@@ -35,10 +38,13 @@ from ambiguous_wild.vision.sparse_surface import (
 COVERED_FROM = 0.5  # share of the train views that look at a pixel's surface
 SUPPORTED_FROM = 3  # number of train views that show it
 MAX_VIEWS = 64  # number of train views compared with a test view where there are no exact masks
+AGREEING_FROM = 0.5  # share of the train photos that look at a pixel's surface and show its colour there
+COMPARED = 16  # train photos compared with a test photo
+COLOUR_RANGE = 0.04  # by which a colour may leave what the pixels around show, of [0, 1]
 
 Visibility = tuple[np.ndarray, np.ndarray]
 VALID, COVERED, UNCOVERED = "psnr_valid", "psnr_covered", "psnr_uncovered"
-SUPPORTED = "psnr_supported"
+SUPPORTED, CONSISTENT = "psnr_supported", "psnr_consistent"
 
 
 def train_visibility(scene: Scene, masks: Sequence[np.ndarray | None]) -> dict[str, Visibility] | str:
@@ -77,6 +83,64 @@ def train_visibility(scene: Scene, masks: Sequence[np.ndarray | None]) -> dict[s
         )
         visibility[view.name] = shown, share
     return visibility
+
+
+def photo_consistency(scene: Scene) -> dict[str, np.ndarray] | str:
+    """Find the pixels of each test photo whose colour train photos show on the same surface.
+
+    Photos are compared at the size of the depth maps. A train photo shows a colour if that lies between the
+    darkest and the brightest pixel around the place, because interpolated depths are a pixel or two wrong.
+    Before, the photo's channels are scaled to the test photo's, for photos of another exposure.
+
+    Returns:
+        By the name of the test view: [H, W] bool, False where fewer than three train photos show the surface;
+        or why no pixel can be compared.
+    """
+    xyz = some_points(scene.points.sure_xyz)
+    cameras = [view.camera for view in scene.train]
+    depths = [inverse_depth(camera, xyz) for camera in cameras]
+    photos = {k: _small(scene.train[k], depth.shape) for k, depth in enumerate(depths) if depth is not None}
+    consistent = {}
+    for view in scene.test:
+        inverse = inverse_depth(view.camera, xyz)
+        if inverse is None:
+            continue
+        world, photo = world_points(view.camera, inverse), _small(view, inverse.shape)
+        looking, agreeing = np.zeros((2, *inverse.shape), np.float32)
+        for k in [k for k in _nearest(view.camera, cameras) if k in photos][:COMPARED]:
+            sees, _ = _seen(world, cameras[k], depths[k], None)
+            looking += sees
+            agreeing += sees & _shown(photo, world, sees, cameras[k], photos[k])
+        agree = (looking >= SUPPORTED_FROM) & (agreeing >= AGREEING_FROM * looking)
+        # agreement by chance within a distractor is small, and beside its rim a pixel holds some of it
+        most = cv2.erode(cv2.medianBlur(agree.astype(np.uint8), 5), np.ones((3, 3), np.uint8))
+        size = (view.camera.width, view.camera.height)
+        consistent[view.name] = cv2.resize(most, size, interpolation=cv2.INTER_NEAREST) > 0
+    return consistent or "too few sparse points lie in the test views"
+
+
+def _shown(
+    photo: np.ndarray,  # [h, w, 3], of the test view
+    world: np.ndarray,  # [h, w, 3], its surface
+    sees: np.ndarray,  # [h, w] bool, where the camera looks at it
+    camera: Camera,
+    other: np.ndarray,  # [h', w', 3], the camera's photo
+) -> np.ndarray:
+    """Return where the other photo shows the same colour, [h, w] bool."""
+    if not sees.any():
+        return sees
+    local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    x, y = in_map(camera, local, other.shape[:2])
+    around = np.ones((3, 3), np.uint8)
+    low, high = (_look_up(f(other, around), x, y, sees) for f in (cv2.erode, cv2.dilate))
+    gain = np.median(photo[sees] / np.maximum((low + high)[sees] / 2, 0.02), axis=0)
+    return np.all((photo >= gain * low - COLOUR_RANGE) & (photo <= gain * high + COLOUR_RANGE), axis=-1)
+
+
+def _small(view: View, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a photo reduced to a map's size, [h, w, 3] float32 in [0, 1]."""
+    photo = read_png_rgb(view.image_path).astype(np.float32) / 255.0
+    return cv2.resize(photo, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
 
 
 def why_nothing_covered(masks: Iterable[np.ndarray | None]) -> str:
@@ -148,6 +212,7 @@ def _psnr(metric: str, drawn: np.ndarray, photo: np.ndarray, view: View, scene: 
 
 psnr_covered, psnr_uncovered = partial(_psnr, COVERED), partial(_psnr, UNCOVERED)
 psnr_supported, psnr_valid = partial(_psnr, SUPPORTED), partial(_psnr, VALID)
+psnr_consistent = partial(_psnr, CONSISTENT)
 
 _last: list[tuple[Scene, Regions]] = []  # a cache of the latest scene only
 
@@ -174,6 +239,13 @@ def _find_regions(scene: Scene) -> Regions:
         missing[VALID] = "the masks in masks/test leave no pixel to measure (white = measured)"
     else:
         missing[VALID] = "no test photo has a mask (masks/test/<stem>.png, white = measured)"
+    consistent = photo_consistency(scene) if mixed_tests(scene) else "test photos hold no distractors"
+    if isinstance(consistent, str):
+        missing[CONSISTENT] = consistent
+    elif any(mask.any() for mask in consistent.values()):
+        pixels[CONSISTENT] = consistent
+    else:
+        missing[CONSISTENT] = "no pixel of a test photo looks as train photos show its surface"
     masks_of_train = [true_distractor(scene, view) for view in scene.train]
     visibility = train_visibility(scene, masks_of_train)
     if isinstance(visibility, str):

@@ -16,6 +16,7 @@ from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.start import recorded_start, started
 from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io import plain_yaml
+from ambiguous_wild.io.corrections import CORRECTIONS, CorrectionsFile
 from ambiguous_wild.io.files import own_json
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
@@ -112,7 +113,14 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
     hooks = with_effects(hooks, tuple(config.get("effects", ())))
     settings = replace(from_plain(TrainConfig, train, f"train of {run}"), on_nonfinite="stop")
     scene = open_scene(run)
-    data = load_train_data(scene, device=device, seed=settings.seed, cache_dir=folder / "cache")
+    corrections = CorrectionsFile.of(run / CORRECTIONS) if config.get("corrections") else None
+    data = load_train_data(
+        scene,
+        device=device,
+        seed=settings.seed,
+        cache_dir=folder / "cache",
+        corrections=None if corrections is None else corrections.masks(scene),
+    )
     hooks = started(hooks, recorded_start(config.get("start")), scene)
     trainer = Trainer(data, hooks, settings, folder=folder)
     if saved.is_file():

@@ -31,6 +31,7 @@ Count = Annotated[int, Meta(ge=0, le=10**15)]  # more is no number of anything
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Name = Annotated[str, Meta(pattern=r"\S")]
 Options = dict[str, Any]  # plain values of a method's options: every method has its own keys
+NOT_BEGUN = "masks had not begun"  # begins the reason why a short run has none
 RunFacts = dict[str, Any]  # of a run; beside the keys of `Cell.result`, methods and effects add their own
 # Keys of config.yaml that do not decide the result: how often the run is saved and probed, what happens at
 # values that are not finite (the result says so where there were any), where the scene lies.
@@ -38,6 +39,7 @@ IGNORED: dict[str, tuple[str, ...]] = {
     "train": ("checkpoint_every_s", "probes", "on_nonfinite"),
     "scene": ("path",),
     "start": ("path",),
+    "corrections": ("path",),
 }
 SCHEMA = 1
 RESULT = "metrics.json"
@@ -199,12 +201,21 @@ class TrainRecord(TypedDict):
     on_nonfinite: str
 
 
+class Continued(TypedDict):
+    """Where a run went on from an earlier one that was shorter, or without corrections."""
+
+    iteration: int  # that the earlier run had reached
+    config_hash: str  # of the earlier run
+
+
 class UnusualConfig(TypedDict, total=False):
     """Settings of a run that config.yaml holds only where they differ from the usual ones."""
 
     effects: list[str]
     protocol: str
     start: dict[str, str]  # sha256 and path of the file of --start
+    corrections: dict[str, str]  # sha256 and path of the file of --corrections
+    continued: list[Continued]  # in the order of training
 
 
 class RunConfig(UnusualConfig):

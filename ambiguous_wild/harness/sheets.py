@@ -1,4 +1,4 @@
-"""Sheets of pictures with captions in a grid: of a capture, of masks, and of runs side by side."""
+"""Sheets of pictures with captions in a grid: of a capture, and of masks."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ from typing import NotRequired, TypedDict, TypeVar
 import cv2
 import numpy as np
 
-from ambiguous_wild.core import AwError, Scene, View
+from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.names import ascii_text
 from ambiguous_wild.harness.regions import true_distractor
-from ambiguous_wild.harness.result_file import RESULT, check_render, read_result
-from ambiguous_wild.harness.store import Runs
-from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io.files import atomic_path
-from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import jpeg_bytes
 from ambiguous_wild.io.palette import ADDED, MASKED, tint
-from ambiguous_wild.metrics.image import psnr
 
 Item = TypeVar("Item")
 QUALITY = 90  # of JPEG
@@ -30,7 +26,6 @@ NAME = "sheet.jpg"
 WIDTH = 320  # px of a photo on the sheets of a capture and of masks
 CAPTURE_COLUMNS, MASK_COLUMNS = 4, 5  # photos in a row
 MAX_MASKS = 20  # photos on a sheet of masks
-VIEWS = 3  # test photos, and train photos, on the sheet of runs
 
 
 def cell(caption: str, image: np.ndarray, width: int | None = None) -> np.ndarray:
@@ -174,58 +169,3 @@ def _tinted(scene: Scene, view: View, masks: Path) -> np.ndarray:
     if truth is not None:
         caption += f", {100 * truth.mean():.0f} % true"
     return cell(caption, tint(photo, masked, MASKED), WIDTH)
-
-
-def write_sheet(runs: Runs, path: Path, *, scene: str | None = None) -> int:
-    """Write the sheet of one scene: a column for each method (first seed), `VIEWS` test and train rows.
-
-    Args:
-        runs: runs from `read_runs`.
-        path: file to write, PNG or JPEG by its ending.
-        scene: name of the scene; None if the runs are of a single scene.
-
-    Returns:
-        The number of methods shown.
-
-    Raises:
-        AwError: several scenes and no name, no finished run, the scene folder has been moved or changed, or a
-            run lacks its renders.
-    """
-    finished = runs.runs[runs.runs["status"] == "ok"]
-    names = sorted(finished["scene"].unique())
-    if scene is None and len(names) > 1:
-        raise AwError(f"runs of {len(names)} scenes: name one with --only ({', '.join(names)})")
-    chosen = finished if scene is None else finished[finished["scene"] == scene]
-    if chosen.empty:
-        raise AwError("no finished run to show; 'aw table' lists what is there")
-    first = chosen.sort_values("seed").drop_duplicates("method").sort_values("method")
-    folders = {str(row.method): Path(str(row.folder)) for row in first.itertuples()}
-    if first["scene_hash"].nunique() > 1:
-        raise AwError(f"scene {first['scene'].iloc[0]!r} differs between these runs: run them again on one")
-    source = open_scene(next(iter(folders.values())))
-    rows = [_test_row(view, folders) for view in evenly_spaced(source.test, VIEWS)]
-    rows += [_train_row(view, folders) for view in evenly_spaced(source.train, VIEWS)]
-    sheet = stack([stack(row, 1) for row in rows], 0)
-    (write_jpeg if path.suffix.lower() == ".jpg" else write_png)(path, sheet)
-    return len(folders)
-
-
-def _test_row(view: View, folders: dict[str, Path]) -> list[np.ndarray]:
-    photo = read_png_rgb(view.image_path)
-    cells = [cell(f"test photo {view.name}", photo)]
-    for method, folder in folders.items():
-        path = check_render(folder, read_result(folder / RESULT), view.name)
-        render = read_png_rgb(path)
-        cells.append(cell(f"{method}  {psnr(render, photo):.2f} dB", render))
-    return cells
-
-
-def _train_row(view: View, folders: dict[str, Path]) -> list[np.ndarray]:
-    photo = read_png_rgb(view.image_path)
-    cells = [cell(f"train photo {view.name}", photo)]
-    for method, folder in folders.items():
-        path = _mask(folder / "masks", view)
-        masked = read_gray(path) < 128 if path.is_file() else np.zeros(photo.shape[:2], bool)
-        what = f"{100 * masked.mean():.0f} %" if path.is_file() else "nothing"
-        cells.append(cell(f"{method}  masks {what}", tint(photo, masked, MASKED)))
-    return cells

@@ -7,7 +7,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
-from ambiguous_wild.core.errors import counted, unknown
+from ambiguous_wild.core.errors import counted, similar_path, unknown
 from ambiguous_wild.harness.command_lines import length_text
+from ambiguous_wild.harness.labels import IN_FOLDER, shown_names
 from ambiguous_wild.harness.measures import MASK_LABELS, MEASURES, Metric, measure, users_metrics
 from ambiguous_wild.harness.result_file import (
     CONFIG,
@@ -41,9 +42,8 @@ from ambiguous_wild.io.ply import splat_count
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",
     "options_hash", "training", "unrecorded", "timing", "timing_reason", "timing_kernel", "hardware",
-    "effects", "length", "features", "test_photos", "start", "metric_functions",
+    "effects", "length", "features", "test_photos", "no_masks", "start", "metric_functions",
 )  # fmt: skip
-IN_FOLDER = " in "  # between a method and its folder, where several folders hold runs of it
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
 ReadConfig = dict[str, Any]
@@ -71,30 +71,47 @@ class Runs:
         version, code_hash, source (hash of the method's own file, or empty), options_hash, fit (what was done
         with test photos, see report/notes.py), effects, length, features and other settings of the training
         (words; features are empty if the method has none), test_photos (a warning about them, or empty),
-        device, the numbers of "cost", timing ("alone", "contended", "unknown"), timing_reason, timing_kernel,
-        hardware, and mask_iou, mask_precision, mask_recall.
+        no_masks (why, or empty), device, the numbers of "cost", timing ("alone", "contended", "unknown"),
+        timing_reason, timing_kernel, hardware, and mask_iou, mask_precision, mask_recall.
     missing: one row per run and missing metric: scene, method, seed, metric, reason.
+    methods: the name under which a method is shown (the column "method" everywhere) -> the method, with its
+        folder where it is of one of several; in the order of rows.
     """
 
     images: pd.DataFrame
     runs: pd.DataFrame
     missing: pd.DataFrame
     incomplete: tuple[Incomplete, ...] = ()
+    methods: dict[str, str] = field(default_factory=dict)
+
+    def method_of(self, shown: str) -> str:
+        """Return the method that is shown under a name, without its folder."""
+        return self.methods.get(shown, shown).partition(IN_FOLDER)[0]
+
+    def rows(self) -> list[str]:
+        """Return the names of the methods that have a finished or failed run, in the order of rows."""
+        present, order = set(self.runs["method"]), list(self.methods)
+        return [name for name in order if name in present] or sorted(present)
 
     def __repr__(self) -> str:
         counts = [counted(self.runs[key].nunique(), key) for key in ("method", "scene")]
         return f"Runs({counted(len(self.runs), 'run')} of {' on '.join(counts)})"
 
 
-def read_runs(*folders: Path | str) -> Runs:
+def read_runs(*folders: Path | str, labels: Sequence[str] = ()) -> Runs:
     """Read every result below folders of runs, at any depth.
 
     A run is a folder with config.yaml, metrics.json or failed.json in it. A run without a result (still
     running, or stopped) or with a damaged one is listed under `incomplete`, not dropped. If two folders have
     a method for the same scene and seed, it is called "METHOD in FOLDER".
 
+    Args:
+        folders: folders of runs, or run folders.
+        labels: names and order of methods, see `labels.shown_names`.
+
     Raises:
-        AwError: no such folder, no run in it, or two results in it for the same method, scene and seed.
+        AwError: no such folder, no run in it, two results in it for the same method, scene and seed, or a
+            wrong label.
     """
     known: set[Path] = set()  # runs of a folder given before, as one may be inside another
     read = [(Path(folder), *_read_folder(Path(folder), known)) for folder in folders]
@@ -103,11 +120,15 @@ def read_runs(*folders: Path | str) -> Runs:
     results: list[FolderResult] = []
     incomplete: list[Incomplete] = []
     for root, members, begun in read:
-        labels = {method: f"{method}{IN_FOLDER}{root}" for method in shared}
+        apart = {method: f"{method}{IN_FOLDER}{root}" for method in shared}
         for run, result in members:
-            result["method"] = labels.get(result["method"], result["method"])
+            result["method"] = apart.get(result["method"], result["method"])
             results.append((run, result))
-        incomplete += [replace(run, method=labels.get(run.method, run.method)) for run in begun]
+        incomplete += [replace(run, method=apart.get(run.method, run.method)) for run in begun]
+    shown = shown_names(labels, [*(r["method"] for _, r in results), *(run.method for run in incomplete)])
+    for _, result in results:
+        result["method"] = shown[result["method"]]
+    incomplete = [replace(run, method=shown[run.method]) for run in incomplete]
     starts: dict[str, str] = {}  # hash of a file -> its first name: the same file may have several
     for _, result in results:
         if hashed := start_hash(result["facts"]):
@@ -120,12 +141,8 @@ def read_runs(*folders: Path | str) -> Runs:
         ),
         missing=_frame(_missing_rows(results), ["scene", "method", "seed", "metric", "reason"]),
         incomplete=tuple(incomplete),
+        methods={name: method for method, name in shown.items()},
     )
-
-
-def method_of(label: str) -> str:
-    """Return the method that a row of `read_runs` is of, without the folder."""
-    return label.partition(IN_FOLDER)[0]
 
 
 def _read_folder(root: Path, known: set[Path]) -> tuple[list[FolderResult], list[Incomplete]]:
@@ -265,7 +282,9 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     runs: dict[Path, Path] = {}
     for root in folders:
         if not root.is_dir():
-            raise AwError(f"no folder of runs {root}: give the folder that 'aw bench -o' wrote")
+            raise AwError(
+                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote{similar_path(root)}"
+            )
         runs |= {run.resolve(): run for run in run_folders(root)}
     return list(runs.values())
 
@@ -282,15 +301,6 @@ def section(config: ReadConfig, name: str) -> ReadConfig:
     """Return a part of config.yaml; empty where it is absent or no mapping."""
     part = config.get(name)
     return part if isinstance(part, dict) else {}
-
-
-def known_iterations(root: Path) -> int | None:
-    """Return the iterations of the first run below a folder; None without a run that says them."""
-    for run in run_folders(root):
-        iterations = section(read_config(run), "train").get("iterations")
-        if isinstance(iterations, int):
-            return iterations
-    return None
 
 
 def _method_and_scene(run: Path) -> tuple[str, str]:
@@ -361,6 +371,7 @@ def _run_row(run: Path, result: RunResult) -> TableRow:
             "effects": effects_of(result["facts"]),
             "length": str(result["facts"].get("length") or _length(config)),
             "test_photos": str(result["facts"].get("test_photos", "")),
+            "no_masks": str(result["facts"].get("no_masks", "")),
             "features": _features(result["options"]),
             "start": str(result["facts"].get("start", "the scene's points")),
         }

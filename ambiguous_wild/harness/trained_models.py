@@ -3,26 +3,44 @@
 from __future__ import annotations
 
 import html
+import shlex
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
-from ambiguous_wild.core.errors import shortlist, unknown
+from ambiguous_wild.core.errors import shortlist, similar_path, unknown
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
-from ambiguous_wild.harness.result_file import CONFIG, MODEL, RESULT, check_model, metrics_of, read_result
+from ambiguous_wild.harness.labels import shown_names
+from ambiguous_wild.harness.result_file import (
+    CONFIG,
+    MODEL,
+    RESULT,
+    RunResult,
+    check_model,
+    metrics_of,
+    read_result,
+)
 from ambiguous_wild.harness.store import ReadConfig, read_config, run_folders, section
 from ambiguous_wild.io.files import write_text
+from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.splat_arrays import SplatFile
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import RenderSettings, ViewedModel, file_model
 from ambiguous_wild.viewing.page_file import MAX_GAUSSIANS, PAGE, Page, check_page_folder, page_text
 from ambiguous_wild.viewing.video import scene_around
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.trainer import Trainer
 
 MASKS = "masks"
 
@@ -46,10 +64,16 @@ class SceneModels:
     scene: Scene
     models: tuple[ViewedModel, ...]
     notes: tuple[str, ...]  # which runs are not shown, and why; the meaning of numbers
+    mixed: str = ""  # why test photos may hold distractors, see `mixed_tests`
+    runs: tuple[Path, ...] = ()  # folders of the models that are runs
 
 
 def read_models(
-    paths: Sequence[Path], *, scene: str | None = None, scene_folder: Path | None = None
+    paths: Sequence[Path],
+    *,
+    scene: str | None = None,
+    scene_folder: Path | None = None,
+    labels: Sequence[str] = (),
 ) -> SceneModels:
     """Read the models of the runs below some folders and of splat files, and their scene.
 
@@ -58,18 +82,20 @@ def read_models(
         scene: name of the scene to show, if the runs are of several.
         scene_folder: where the scene lies; None = where the runs say. For splat files alone, None gives a
             scene without photos.
+        labels: names and order of methods, see `labels.shown_names`.
 
     Raises:
-        AwError: no run, no model in any, runs of several scenes, or a scene that has been moved.
+        AwError: no run, no model in any, runs of several scenes, a wrong label, or a scene that was moved.
     """
     files, notes = read_files(paths)
     folders = [path for path in paths if not path.is_file()]
     if files and not folders:
+        shown_names(labels, ())  # files have no method
         opened = scene_around(files[0]) if scene_folder is None else load_scene(scene_folder)
         if scene_folder is None:
             notes.append(f"no --scene: the cameras are on a circle around {files[0].ply.name}, y down")
         return SceneModels(opened, tuple(model.within(opened.transform) for model in files), tuple(notes))
-    trained, more = find_models(folders if files else paths)
+    trained, more = find_models(folders if files else paths, labels)
     notes += more
     names = sorted({t.scene for t in trained})
     if scene is not None:
@@ -87,9 +113,8 @@ def read_models(
     if any(t.half for t in trained):
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
     opened = open_scene(trained[0].run, scene_folder)
-    notes += [mixed] if (mixed := mixed_tests(opened)) else []
     models = (*(t.model for t in trained), *(model.within(opened.transform) for model in files))
-    return SceneModels(opened, models, tuple(notes))
+    return SceneModels(opened, models, tuple(notes), mixed_tests(opened), tuple(t.run for t in trained))
 
 
 def read_files(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
@@ -104,10 +129,11 @@ def read_files(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
     return models, [note for _, note in read if note]
 
 
-def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
+def find_models(paths: Sequence[Path], labels: Sequence[str] = ()) -> tuple[list[TrainedModel], list[str]]:
     """Find the finished runs that have a model, in the order of their paths; write a line on each other run.
 
-    Labels distinguish runs of the same method by seed, then by folder.
+    `labels` name and order the methods, see `labels.shown_names`. The models' labels distinguish runs of the
+    same method by seed, then by folder.
 
     Raises:
         AwError: no such folder, or no run with a model in any of them.
@@ -118,7 +144,7 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
         if not root.is_dir():
             raise AwError(
                 f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, a run in it, or a "
-                "splat file"
+                f"splat file{similar_path(root)}"
             )
         for run in dict.fromkeys(run_folders(root)):
             if any(t.run.samefile(run) for t in trained):
@@ -132,9 +158,14 @@ def find_models(paths: Sequence[Path]) -> tuple[list[TrainedModel], list[str]]:
                 notes.append(trained[-1].note)
     if not trained:
         why = f" ({notes[0]})" if notes else ""
-        if scene := next((path for path in paths if (path / "scene.json").exists()), None):
+        scenes = (path for path in paths for part in ("scene.json", "sparse") if (path / part).exists())
+        if scene := next(scenes, None):
             why = f": {scene} is a scene, which 'aw bench --method NAME --scene {scene} -o runs' trains"
         raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
+    if labels:
+        shown = shown_names(labels, [t.model.label for t in trained])
+        trained.sort(key=lambda t: list(shown).index(t.model.label))
+        trained = [replace(t, model=replace(t.model, label=shown[t.model.label])) for t in trained]
     return _with_labels(trained), notes
 
 
@@ -195,11 +226,70 @@ def _read_model(run: Path) -> TrainedModel:
         ply=ply,
         render_settings=look,
         psnr={name: float(value) for name, value in psnr.items() if value is not None},
-        masks=run / MASKS if (run / MASKS).is_dir() else None,
+        masks=run / MASKS if any((run / MASKS).rglob("*.png")) else None,  # empty where nothing is masked
+        reasons=run / REASONS if (run / REASONS).is_file() else None,
+        retrain=_retrain_command(run, result),
         reference=knows_truth(result["method"]),
     )
     half = config.get("protocol") == "half"
     return TrainedModel(run, result["scene"], result["scene_hash"], model, half, note)
+
+
+def _retrain_command(run: Path, result: RunResult) -> str:
+    """Return the command that trains a run half as long again with corrected masks; "" if none is recorded.
+
+    Its paths are seen from the current folder if they are below, else from the one that holds scene and runs.
+    """
+    try:
+        words = shlex.split(str(result.get("reproduce", "")))
+    except ValueError:
+        return ""
+    iterations, runs = result["cost"].get("iterations"), run.resolve().parents[2]
+    if words[:2] != ["aw", "bench"] or not iterations:
+        return ""
+    options = [
+        (option, str(_from_here(Path(value), runs)) if value.startswith("/") else value)
+        for option, value in zip(words[2::2], words[3::2])
+        if option not in ("--device", "--iterations", "--budget")
+    ]
+    options += [("-o", str(_from_here(runs, runs))), ("--iterations", str(round(1.5 * iterations)))]
+    options += [("--overwrite", "longer"), ("--corrections", "corrections.json")]
+    return shlex.join(["aw", "bench", *(word for pair in options for word in pair)])
+
+
+def _from_here(path: Path, runs: Path) -> Path:
+    """Return the path from the current folder, else from the one above `runs`, else its name alone."""
+    for base in (Path.cwd(), runs.parent):
+        if path.is_relative_to(base):
+            return path.relative_to(base)
+    return Path(path.name)
+
+
+def next_steps(shown: SceneModels, *, on_page: bool = True) -> list[str]:
+    """Return where masks and splat files of runs lie, and commands for them.
+
+    `on_page`: folders of this machine are not named.
+    """
+    steps: list[str] = []
+    for run, model in zip(shown.runs, shown.models):
+        runs = run.resolve().parents[2]
+        place, root = str(run), str(run.parents[2])
+        if on_page:
+            place, root = str(_from_here(run.resolve(), runs)), str(_from_here(runs, runs))
+        if model.masks is not None:
+            steps.append(f"masks of {model.label}, white = static: `{place}/{MASKS}`")
+            full = shlex.join(["aw", "masks", place, "-o", "masks"])
+            steps.append(f"masks of the photos at full size, for other tools: `{full}`")
+        export = shlex.join(["aw", "export", place])
+        steps.append(f"splat file of {model.label}: `{place}/{MODEL}`; as SPZ, SOG and glTF: `{export}`")
+        if run == shown.runs[-1]:
+            steps.append(f"table of the runs: `{shlex.join(['aw', 'table', root])}`")
+    return steps
+
+
+def page_title(scene: Scene) -> str:
+    """Return the scene's name; where it is only "scene", the name of the folder that holds it."""
+    return scene.root.resolve().parent.name if scene.name == "scene" else scene.name
 
 
 def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
@@ -247,6 +337,8 @@ def view_runs(
     scene_folder: Path | None = None,
     most_gaussians: int = MAX_GAUSSIANS,
     title: str | None = None,
+    steps: Sequence[str] | None = None,
+    labels: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Page:
     """Write OUTPUT/index.html with the models of runs.
@@ -258,23 +350,48 @@ def view_runs(
         scene_folder: where the scene lies; None = where the runs say.
         most_gaussians: a larger model is reduced to this number, with a note on the page.
         title: title of the page; None = the scene's name.
+        steps: lines of the panel "What next", see `page_text`; None = those of `next_steps`.
+        labels: names and order of methods, see `labels.shown_names`.
         say: gets a line about each step.
 
     Raises:
         AwError: no run with a model, several scenes, no scene, or another page in the folder.
     """
-    shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    shown = read_models(paths, scene=scene, scene_folder=scene_folder, labels=labels)
     check_page_folder(output)
     text, models_bytes = page_text(
         shown.scene,
         shown.models,
-        title=shown.scene.name if title is None else title,
+        title=page_title(shown.scene) if title is None else title,
         most_gaussians=most_gaussians,
         notes=shown.notes,
+        mixed=shown.mixed,
+        next_steps=next_steps(shown) if steps is None else steps,
         say=say,
     )
     write_text(output / PAGE, text)
     return Page(output / PAGE, len(text.encode("utf-8")), models_bytes)
+
+
+def training_model(
+    trainer: Trainer, label: str, masks: Mapping[str, np.ndarray] | None = None
+) -> ViewedModel:
+    """Return the model of a run that is still trained, for a page that is written again and again.
+
+    Args:
+        trainer: its trainer; nothing in it is changed.
+        label: name of the model on the page, the same on each page of a training.
+        masks: keep maps by name of the train view, [H, W] bool; `evaluate.keep_maps` computes them.
+    """
+    arrays = {name: value.cpu().numpy() for name, value in trainer.neutral_model().items()}
+    hooks = trainer.hooks
+    return ViewedModel(
+        label=label,
+        ply=trainer.folder / MODEL,
+        render_settings=RenderSettings(hooks.sh_degree, hooks.antialias, hooks.blur, hooks.background),
+        masks=masks,
+        splats=SplatFile(arrays, trainer.data.scene.transform, hooks.antialias),
+    )
 
 
 class Viewer:
@@ -292,7 +409,14 @@ class Viewer:
         shown = read_models(paths)
         self.labels = tuple(model.label for model in shown.models)
         self.height = height
-        self.page, _ = page_text(shown.scene, shown.models, title=shown.scene.name, notes=shown.notes)
+        self.page, _ = page_text(
+            shown.scene,
+            shown.models,
+            title=page_title(shown.scene),
+            notes=shown.notes,
+            mixed=shown.mixed,
+            next_steps=next_steps(shown),
+        )
 
     def __repr__(self) -> str:
         return f"Viewer of {', '.join(self.labels)}; a notebook shows it, 'aw view' writes it to a file"

@@ -36,10 +36,10 @@ from ambiguous_wild.harness.start import started
 from ambiguous_wild.io.files import atomic_dir, own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.io.ply import write_splat_ply
-from ambiguous_wild.methods.given_masks import FixedMasks, GraftedPolicy
+from ambiguous_wild.methods.given_masks import FixedMasks, makes_masks
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import Stopped, Tick, train
@@ -111,7 +111,13 @@ def _make_trainer(
     """Return a trainer whose time is measured; without `truth` the test PSNR is not probed on the way."""
     folder.mkdir(parents=True, exist_ok=True)
     device = torch.device(cell.device)
-    data = load_train_data(cell.scene, device=device, seed=cell.train.seed, cache_dir=cache_dir)
+    data = load_train_data(
+        cell.scene,
+        device=device,
+        seed=cell.train.seed,
+        cache_dir=cache_dir,
+        corrections=None if cell.corrections is None else cell.corrections.masks(cell.scene),
+    )
     hooks = started(
         with_effects(cell.method.build(cell.options), cell.chosen.effects), cell.start, cell.scene
     )
@@ -132,6 +138,7 @@ def _make_trainer(
         "about": f"{cell.method.name} on {cell.scene.name}, seed {cell.train.seed}, "
         + length_text(cell.train.iterations, cell.train.budget_s),
     }
+    trainer.continues = frozenset(earlier["config_hash"] for earlier in cell.continued)
     if first is not None:
         trainer.timeline.before_s = first.cost["train_s"]
     return trainer
@@ -229,9 +236,7 @@ def check_passes(cell: Cell) -> None:
 
 def refuse_without_masks(name: str, hooks: MethodHooks) -> None:
     """Raise AwError if the method's mask policy keeps every pixel."""
-    policy = hooks.mask.mask if isinstance(hooks.mask, GraftedPolicy) else hooks.mask
-    kind = type(policy)
-    if kind.keep is MaskPolicy.keep and kind.predict is MaskPolicy.predict:
+    if not makes_masks(hooks):
         raise AwError(
             f"+2passes trains again with the final masks, and {name} has none: "
             "choose another method, or give it masks with --mask METHOD"

@@ -231,7 +231,7 @@ def orientation(path: Path | str) -> int:
 def upright(image: np.ndarray, orientation: int) -> np.ndarray:
     """Apply EXIF orientation 1..8 (EXIF 2.32, tag 274)."""
     if orientation in (5, 6, 7, 8):
-        image = image.transpose(1, 0, 2)
+        image = image.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
         image = image[:, ::-1]
     if orientation in (3, 4, 7, 8):

@@ -1,11 +1,13 @@
-"""Find keep masks by the names of photos, in the spellings of the field's tools."""
+"""Names of keep masks in the spellings of the field's tools: to find masks, and to write them for a tool."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import spelling_key
 from ambiguous_wild.core.scene import Split
 
@@ -15,6 +17,60 @@ OWN_MASKS = "masks.json"  # marks a folder with instances of a segmentation, not
 # a.jpg.mask.png: RealityScan; a.mask.png: OpenMVS; a_mask.png: Metashape
 MARKS = (".mask", "_mask", "-mask")
 SPELLINGS = "a mask of a.jpg is called a.png, a.jpg.png, a.mask.png, a.jpg.mask.png, a_mask.png or mask_a.png"
+
+
+@dataclass(frozen=True)
+class MaskStyle:
+    """What a tool reads as the mask of a photo. Masks lie in folders as the photos do."""
+
+    pattern: str  # of the name: of a.jpg, {stem} is a and {name} is a.jpg
+    use: str  # how the tool takes them
+    left_out: int = 0  # code of the pixels that the tool does not use, the others have 255 minus it
+
+
+OWN_STYLE = MaskStyle("{stem}.png", "'aw build-scene --keep-masks' and 'aw bench --mask' read them")
+# All of them read a mask as large as the photo. Left out is black, but for Postshot.
+MASK_STYLES = {
+    # pycolmap.ImageReaderOptions.mask_path: the photo's sub-path with .png added; nothing is extracted where
+    # the mask is black.
+    "colmap": MaskStyle("{name}.png", "colmap feature_extractor --ImageReader.mask_path MASKS"),
+    # nerfstudio/data/dataparsers/colmap_dataparser.py: (masks_path / name).with_suffix(".png"); its docs,
+    # data conventions: "Black corresponds to regions to ignore", and a mask for every photo.
+    "nerfstudio": MaskStyle("{stem}.png", "ns-train METHOD --data DATA colmap --masks-path MASKS"),
+    # Import Masks takes a template of names (agisoft.freshdesk.com/support/solutions/articles/31000162414);
+    # agisoft-llc/metashape-scripts#86: its masks go to nerfstudio as they are, and a white one masks nothing.
+    "metashape": MaskStyle("{stem}_mask.png", "File, Import, Import Masks: template {filename}_mask.png"),
+    # rchelp.capturingreality.com/en-US/tools/imglayers.htm: DSC_0001.jpg.mask.png; tools/mask.htm: masks are
+    # alpha channels, where white is what is seen. LichtFeld reads these files with white = used
+    # (MrNeRF/LichtFeld-Studio#551).
+    "realityscan": MaskStyle("{name}.mask.png", "put the masks beside the photos, then add both"),
+    # jawset.com/docs/d/Postshot+User+Guide/Interface/Training+Configuration: the same base file name; "Remove
+    # Occluders: the active (white) regions of the mask images will be ignored".
+    "postshot": MaskStyle("{stem}.png", "Image Masks, Mask Mode: Remove Occluders", left_out=255),
+    # MrNeRF/LichtFeld-Studio, src/io/include/io/filesystem_utils.hpp: DATA/masks, stem or name with .png;
+    # #1314: values below 128 are to ignore.
+    "lichtfeld": MaskStyle("{stem}.png", "put the folder into DATA as masks; --mask-mode ignore"),
+}
+
+
+def mask_names(photos: Iterable[str], style: MaskStyle) -> dict[str, str]:
+    """Return the path of each photo's mask, relative to the folder of masks, as `find_masks` finds it.
+
+    Raises:
+        AwError: the masks of two photos would be one file.
+    """
+    names: dict[str, str] = {}
+    taken: dict[str, str] = {}
+    for photo in photos:
+        pure = PurePosixPath(photo)
+        names[photo] = str(pure.with_name(style.pattern.format(name=pure.name, stem=pure.stem)))
+        other = taken.setdefault(spelling_key(names[photo]), photo)
+        if other != photo:
+            raise AwError(
+                f"the masks of {other} and {photo} would both be {names[photo]}: rename one of the photos, "
+                "or choose --for colmap, whose masks have the whole name"
+            )
+    return names
 
 
 def find_masks(folder: Path, names: Iterable[str], files: set[Path] | None = None) -> dict[str, Path]:

@@ -13,6 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.io.images import decode, header_size
+
+_PNG_URI = "data:image/png;base64,"
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def fill_page(
@@ -92,3 +96,23 @@ def narrowed(image: np.ndarray, width: int) -> np.ndarray:
 def data_uri(kind: str, data: bytes) -> str:
     """Return a data: address of a picture; `kind` is "jpeg" or "png"."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def png_of(uri: object, max_width: int, max_height: int) -> np.ndarray | None:
+    """Decode a data: address of a PNG that may come from a stranger.
+
+    Returns:
+        its grey values [H, W] uint8; None if `uri` is no such address, or its picture is larger or damaged.
+    """
+    import cv2
+
+    if not isinstance(uri, str) or not uri.startswith(_PNG_URI):
+        return None
+    try:
+        data = base64.b64decode(uri.removeprefix(_PNG_URI), validate=True)
+    except ValueError:  # also of text that is not ASCII
+        return None
+    size = header_size(data) if data.startswith(_PNG_SIGNATURE) else None
+    if size is None or size[0] > max_width or size[1] > max_height:
+        return None
+    return decode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE, "a picture of a page")

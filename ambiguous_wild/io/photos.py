@@ -97,6 +97,7 @@ class Photo:
     plain: bool  # 8-bit upright RGB with the right suffix: other tools read the same pixels
     notes: tuple[str, ...]  # what was converted, e.g. "16 bits reduced to 8"
     sphere: bool = False  # a 360 degree photo, as its metadata say
+    turned: int = 1  # EXIF orientation that was applied to the pixels in the file; 1 = none
 
 
 def read_photo(
@@ -144,7 +145,8 @@ def read_photo(
     notes += _misnamed(source, form)
     height, width = rgb.shape[:2]
     plain = not notes and form in ("jpeg", "png")
-    return Photo(source, form, width, height, exif, plain, tuple(notes), sphere), np.ascontiguousarray(rgb)
+    photo = Photo(source, form, width, height, exif, plain, tuple(notes), sphere, exif.orientation)
+    return photo, np.ascontiguousarray(rgb)
 
 
 def is_photo(path: Path) -> bool:
@@ -189,11 +191,13 @@ def _read_by_pillow(source: Path, form: str) -> tuple[Photo, np.ndarray]:
     rgb, more = _three_channels(source, pixels, names, "")
     rgb = _in_srgb(rgb, colours, notes)
     exif = _block_exif(raw)
-    if form == "avif" and exif.orientation != 1:
-        more.append(f"turned upright (EXIF orientation {exif.orientation})")
-        rgb = np.ascontiguousarray(upright(rgb, exif.orientation))
+    turned = exif.orientation if form == "avif" else 1
+    if turned != 1:
+        more.append(f"turned upright (EXIF orientation {turned})")
+        rgb = np.ascontiguousarray(upright(rgb, turned))
     notes += [*more, *_misnamed(source, form)]
-    return Photo(source, form, rgb.shape[1], rgb.shape[0], exif, False, tuple(notes)), rgb
+    height, width = rgb.shape[:2]
+    return Photo(source, form, width, height, exif, False, tuple(notes), turned=turned), rgb
 
 
 def _register_heif() -> bool:

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeGuard, cast
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
-from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.errors import shortlist, similar_path
 from ambiguous_wild.core.names import check_name, plain, quoted
 from ambiguous_wild.core.scene import SceneInfo, Split, centred
 from ambiguous_wild.io.colmap_model import read_model
@@ -27,6 +27,7 @@ MAX_FACTOR = 1000  # largest downsampling factor; the builder allows 64
 SIDES: tuple[Split, Split] = ("train", "test")
 MAP = "map.png"  # in the scene's folder: the cameras from above
 TEST_EVERY = 8  # in scenes without lists every 8th photo is a test photo, as in 3DGS and gsplat
+ALL_TRAINED = "none"  # "split" in scene.json: there are no test photos, and none are missed
 TESTS_OF_3DGS = "test.txt"  # names of test photos, one a line
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
@@ -64,7 +65,8 @@ def load_scene(
     if root.is_file():
         raise AwError(f"{root} is a file, not a scene folder; give the folder: {root.parent}")
     if not root.is_dir():
-        raise AwError(f"there is no scene folder {root}; 'aw build-scene PHOTOS -o {root}' makes one")
+        hint = similar_path(root) or f"; 'aw build-scene PHOTOS -o {root}' makes one"
+        raise AwError(f"there is no scene folder {root}{hint}")
     read = read_scene_json(root)
     if read is not None and verify:
         verify_files(root, read, quick=verify == "quick")

@@ -12,6 +12,7 @@ BUILTIN = (
         summary="plain 3D Gaussian Splatting: treats all pixels as static",
         recipe="ambiguous_wild.methods.threedgs:build",
         paper="Kerbl et al., SIGGRAPH 2023",
+        cite="kerbl20233d",
     ),
     MethodEntry(
         name="refinesplat",
@@ -50,6 +51,7 @@ BUILTIN = (
         "taught coarse to fine",
         recipe="ambiguous_wild.methods.robustsplat:build",
         paper="Fu et al., ICCV 2025 (arXiv 2506.02751)",
+        cite="fu2025robustsplat",
         note="features {features}",
     ),
     MethodEntry(
@@ -57,6 +59,7 @@ BUILTIN = (
         summary="masks instances whose residual is high for their photo",
         recipe="ambiguous_wild.methods.dronesplat:build",
         paper="Tang et al., CVPR 2025 (arXiv 2503.16964)",
+        cite="tang2025dronesplat",
         note="instances {instances}",
     ),
     MethodEntry(
@@ -65,6 +68,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.wildgaussians:build",
         ablations="ambiguous_wild.methods.ablation_groups:WILDGAUSSIANS",
         paper="Kulhanek et al., NeurIPS 2024 (arXiv 2407.08447)",
+        cite="kulhanek2024wildgaussians",
         note="features {features}",
     ),
     MethodEntry(
@@ -72,30 +76,35 @@ BUILTIN = (
         summary="large blurred Gaussians split by the absolute screen gradient",
         recipe="ambiguous_wild.methods.absgs:build",
         paper="AbsGS, 2024",
+        cite="ye2024absgs",
     ),
     MethodEntry(
         name="mcmc",
         summary="a fixed number of Gaussians: dead ones move onto live ones, noise explores",
         recipe="ambiguous_wild.methods.mcmc:build",
         paper="3DGS-MCMC",
+        cite="kheradmand20243d",
     ),
     MethodEntry(
         name="pup-3dgs",
         summary="after growth, removes the Gaussians that pictures depend on least, then refines",
         recipe="ambiguous_wild.methods.pup:build",
         paper="PUP 3D-GS, CVPR 2025",
+        cite="hanson2025pup",
     ),
     MethodEntry(
         name="desplat",
         summary="per-image Gaussians in front of the camera model the transients",
         recipe="ambiguous_wild.methods.desplat:build",
         paper="DeSplat, CVPR 2025 (arXiv 2411.19756)",
+        cite="wang2025desplat",
     ),
     MethodEntry(
         name="asymgs",
         summary="agrees with a slow average of itself, under two kinds of masks in turn",
         recipe="ambiguous_wild.methods.asymgs:build",
         paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its EMA-GS form",
+        cite="li2026robust",
         note="features {features}, instances {instances}",
     ),
     MethodEntry(
@@ -103,12 +112,14 @@ BUILTIN = (
         summary="two models under different masks are to agree; one of them is the result",
         recipe="ambiguous_wild.methods.asymgs:build_twin",
         paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its GS-GS form",
+        cite="li2026robust",
     ),
     MethodEntry(
         name="spotlesssplats",
         summary="a small net on frozen features, held between two bounds of the residual, finds outliers",
         recipe="ambiguous_wild.methods.spotlesssplats:build",
         paper="SpotLessSplats (arXiv 2406.20055), its MLP form",
+        cite="sabour2024spotlesssplats",
         note="features {features}",
     ),
     MethodEntry(
@@ -117,6 +128,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.spotlesssplats:build",
         config="ambiguous_wild.methods.spotlesssplats:ClusterConfig",
         paper="SpotLessSplats (arXiv 2406.20055), its clustered form",
+        cite="sabour2024spotlesssplats",
         note="features {features}",
     ),
     MethodEntry(
@@ -124,6 +136,7 @@ BUILTIN = (
         summary="no Gaussian smaller than any photo resolves, and a screen filter that keeps the brightness",
         recipe="ambiguous_wild.methods.mip:build",
         paper="Mip-Splatting, CVPR 2024",
+        cite="yu2024mip",
     ),
     MethodEntry(
         name="gs-w",
@@ -131,24 +144,28 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.gsw:build",
         ablations="ambiguous_wild.methods.ablation_groups:GSW",
         paper="Gaussian in the Wild, from its code",
+        cite="zhang2024gaussian",
     ),
     MethodEntry(
         name="splatfacto-w",
         summary="harmonics by a net of each Gaussian's feature and each photo's embedding, and a background",
         recipe="ambiguous_wild.methods.splatfactow:build",
         paper="Splatfacto-W, from its code",
+        cite="xu2024splatfacto",
     ),
     MethodEntry(
         name="swag",
         summary="a net of each photo's embedding and each Gaussian's place colours it, and may switch it off",
         recipe="ambiguous_wild.methods.swag:build",
         paper="SWAG (arXiv 2403.10427), its mechanism; sizes and rates are unverified",
+        cite="dahmani2024swag",
     ),
     MethodEntry(
         name="nexussplats",
         summary="uncertainty of Gaussians, drawn like a colour, masks; light is a code beside each of them",
         recipe="ambiguous_wild.methods.nexussplats:build",
         paper="NexusSplats (arXiv 2411.14514), without anchors",
+        cite="tang2024nexussplats",
         note="features {features}",
     ),
     MethodEntry(
@@ -156,12 +173,14 @@ BUILTIN = (
         summary="every photo has 2D Gaussians on its plane for what only it shows, added up, not blended",
         recipe="ambiguous_wild.methods.hybridgs:build",
         paper="HybridGS, CVPR 2025 (arXiv 2412.03844); its training is unverified",
+        cite="lin2024hybridgs",
     ),
     MethodEntry(
         name="t-3dgs",
         summary="masks pixels whose photo and render lead a head to different distributions of their errors",
         recipe="ambiguous_wild.methods.t3dgs:build",
         paper="T-3DGS (arXiv 2412.00155), its first stage",
+        cite="markin2024t",
         note="features {features}",
     ),
     MethodEntry(
@@ -169,6 +188,7 @@ BUILTIN = (
         summary="one small transient field, bent for each photo by a net, shows where a net masks it",
         recipe="ambiguous_wild.methods.forestsplats:build",
         paper="ForestSplats, WACV 2026 (arXiv 2503.06179)",
+        cite="park2026forestsplats",
     ),
     MethodEntry(
         name="uad",

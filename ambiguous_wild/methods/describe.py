@@ -205,6 +205,7 @@ def details(entry: MethodEntry) -> Facts:
         "name": entry.name,
         "summary": entry.summary,
         "paper": entry.paper,
+        "cite": entry.cite,
         "needs": entry.needs,
         "recipe": entry.recipe if isinstance(entry.recipe, str) else "",
         "about": "" if entry.program is not None else recipe_text(entry),

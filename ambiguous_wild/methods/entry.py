@@ -41,6 +41,7 @@ class MethodEntry:
     recipe: str | Callable[[Any], MethodHooks]
     config: str | type | None = None
     paper: str = ""
+    cite: str = ""  # key of the paper in a .bib file, as Google Scholar makes it
     needs: str = ""  # required extras, weights or hardware; empty = none
     ablations: (
         str | tuple[Group, ...]

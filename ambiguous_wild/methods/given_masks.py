@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.data import shrink_keep
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.method_hooks import MaskPolicy
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, as_cotangents
 from ambiguous_wild.splat.step import Step, TrainData
 
@@ -85,6 +86,9 @@ class GraftedPolicy(MaskPolicy):
     def panels(self, step: Step) -> dict[str, np.ndarray]:
         return self.mask.panels(step)
 
+    def predict_with_reasons(self, step: Step) -> tuple[Tensor | None, MaskReasons | None]:
+        return self.mask.predict_with_reasons(step)
+
     def explain(self, step: Step, x: int, y: int) -> list[str]:
         return self.mask.explain(step, x, y)
 
@@ -99,3 +103,10 @@ class GraftedPolicy(MaskPolicy):
         self.mask.load_state_dict(state["mask"])
         if self.regulariser is not None:
             self.regulariser.load_state_dict(state["regulariser"])
+
+
+def makes_masks(hooks: MethodHooks) -> bool:
+    """Return whether the method's mask policy, without a grafted regulariser, masks anything."""
+    policy = hooks.mask.mask if isinstance(hooks.mask, GraftedPolicy) else hooks.mask
+    kind = type(policy)
+    return kind.keep is not MaskPolicy.keep or kind.predict is not MaskPolicy.predict

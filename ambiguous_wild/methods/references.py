@@ -3,12 +3,14 @@
 recipe.py:my_recipe     a function, or a MethodEntry, in a Python file, which is loaded as a module
 external:my.yaml        a program with commands of its own, see external.py
 nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see nerfbaselines_methods.py
+masks:FOLDER            masks in files, see folder_masks.py
 """
 
 from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import importlib.metadata
 import importlib.util
 import inspect
@@ -18,17 +20,22 @@ import sys
 import traceback
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.core.names import check_name
 from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.mask_files import SPELLINGS, mask_files
 from ambiguous_wild.methods.entry import MethodEntry, required
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.method_hooks import MethodHooks
 
 _loaded: set[str] = set()  # paths of loaded files, as in tracebacks
 _helpers: dict[str, Path] = {}  # files of modules that loaded files imported from beside them, by name
 _NO_HELPERS = (Path(os.__file__).resolve().parent, Path(__file__).resolve().parents[1])  # Python's and ours
-EXTERNAL, NERFBASELINES = "external:", "nerfbaselines:"
+EXTERNAL, NERFBASELINES, MASKS = "external:", "nerfbaselines:", "masks:"
 _GRAFTED = re.compile(r"@(?:mask|density|regulariser|effects)=[^@]*$")
 _RECIPE = re.compile(r"(?P<path>.+\.py):(?P<name>[A-Za-z_]\w*)")
 
@@ -67,6 +74,8 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
         del _helpers[helper]
         sys.modules.pop(helper, None)
     before = set(sys.modules)
+    # first, as Python does for a script; afterwards last, for imports in functions, where it hides nothing
+    sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(module)
     except AwError as error:
@@ -79,6 +88,9 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
             why += "; Parts is MethodHooks of ambiguous_wild.splat.method_hooks now"
         raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
     finally:
+        sys.path.remove(str(folder))
+        if str(folder) not in sys.path:
+            sys.path.append(str(folder))
         files = {new: _file_of(new) for new in sys.modules.keys() - before}
         own = {new: file for new, file in files.items() if file and file.is_relative_to(folder)}
         _helpers.update(own)
@@ -134,7 +146,7 @@ def error_location(error: BaseException) -> str:
 
 def is_reference(name: str) -> bool:
     """Whether the name is a reference."""
-    return is_program(name) or _recipe_match(name) is not None
+    return is_program(name) or name.startswith(MASKS) or _recipe_match(name) is not None
 
 
 def _recipe_match(name: str) -> re.Match[str] | None:
@@ -151,7 +163,7 @@ def reference_file(name: str) -> Path | None:
     """Return the file that a reference names; None if it names no file."""
     if name.startswith(EXTERNAL):
         return Path(name.removeprefix(EXTERNAL))
-    match = None if name.startswith(NERFBASELINES) else _recipe_match(name)
+    match = None if name.startswith((NERFBASELINES, MASKS)) else _recipe_match(name)
     return Path(match["path"]) if match else None
 
 
@@ -164,6 +176,8 @@ def with_file(name: str, path: Path) -> str:
 
 def absolute(name: str) -> str:
     """Return the reference with an absolute path."""
+    if name.startswith(MASKS):
+        return f"{MASKS}{Path(name.removeprefix(MASKS)).resolve()}"
     path = reference_file(name)
     return name if path is None else with_file(name, path.resolve())
 
@@ -186,9 +200,32 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
         from ambiguous_wild.methods.nerfbaselines_methods import nerfbaselines_entry
 
         entry = nerfbaselines_entry(name.removeprefix(NERFBASELINES))
+    elif name.startswith(MASKS):
+        entry = _folder(Path(name.removeprefix(MASKS)))
     else:
         entry = _recipe(name)
     return dataclasses.replace(entry, given_as=absolute(given_as or name))
+
+
+def _folder(folder: Path) -> MethodEntry:
+    """Return 3DGS with the masks in a folder, under the folder's name; changed masks are another method."""
+    if not folder.is_dir():
+        raise AwError(f"no folder of masks {folder}: give one with a mask for each train photo")
+    if bad := [sign for sign in ",=@" if sign in str(folder.resolve())]:
+        raise AwError(f"the path of the masks {folder.resolve()} holds {bad[0]!r}: rename that folder")
+    files = sorted(mask_files(folder))
+    if not files:
+        raise AwError(f"{folder} holds no masks: {SPELLINGS}")
+    digest = config_hash([[path.relative_to(folder).as_posix(), sha256_file(path)] for path in files])
+    name = check_name("name of a folder of masks", folder.resolve().name)
+    recipe = functools.partial(_build_folder, folder.resolve())
+    return MethodEntry(name, f"3dgs with the masks in {folder.name}/", recipe, source_hash=digest)
+
+
+def _build_folder(folder: Path) -> MethodHooks:
+    from ambiguous_wild.methods.folder_masks import build
+
+    return build(folder)
 
 
 def _recipe(name: str) -> MethodEntry:

@@ -253,7 +253,7 @@ def _panel(
         axes.errorbar(ms, psnr, yerr=spread or None, fmt="*" if is_default else "o", color=colour,
                       ms=13 if is_default else 7, elinewidth=1, capsize=2)  # fmt: skip
         if is_default or not swept:  # the axis names the others
-            ends.append((f"{DEFAULT} ({ms:g})" if swept else name, ms, psnr, colour))
+            ends.append((f"{DEFAULT} ({ms:g})" if swept else name, ms, 0.0, psnr, colour))
     axes.margins(0.12)
     label_points(axes, ends)
     axes.set_title(f"{group['name']}: {group['title']}", fontsize=8)

@@ -20,6 +20,8 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.chosen_effects import mixed_tests
+from ambiguous_wild.harness.labels import shown_names
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.harness.result_file import RESULT, encoded
 from ambiguous_wild.harness.trained_models import TrainedModel, find_models, open_scene
@@ -100,6 +102,7 @@ def facts(
     reported: Reported,
     files: list[str],
     models: Mapping[str, str] = MappingProxyType({}),
+    shown: Mapping[str, str] = MappingProxyType({}),
 ) -> Facts:
     """Return the page's data, ready for JSON.
 
@@ -109,6 +112,7 @@ def facts(
         reported: numbers that papers print; may be empty.
         files: names of the CSV files beside the page.
         models: page that shows a run's model, by the hash of its result.
+        shown: names of methods on the page; others keep theirs.
     """
     order = in_order({k for e in entries for k in e.quality})
     missing = {k for e in entries for k in e.missing}
@@ -128,15 +132,16 @@ def facts(
         # metrics that some images or scenes lack
         "partial": [*(k for k in (*order, *sorted(missing)) if measure(k).partial), *MASKS],
         "times": list(TIMES),
-        "references": sorted({e.method for e in entries if knows_truth(e.method)}),
+        "references": sorted({shown.get(e.method, e.method) for e in entries if knows_truth(e.method)}),
         # name -> summary, paper, links
-        "methods": {name: _method(name) for name in sorted({e.method for e in entries})},
+        "methods": {shown.get(name, name): _method(name) for name in sorted({e.method for e in entries})},
         "measures": measures,
-        "runs": [_run(e) for e in entries],
+        "runs": [_run(e) | {"method": shown.get(e.method, e.method)} for e in entries],
         "models": dict(models),
         "images": [
             {k: v for k, v in row.items() if k not in ("sha256", "psnr")}
             | {"psnr": encoded(to_number(row["psnr"], "psnr"))}
+            | {"method": shown.get(row["method"], row["method"])}
             for row in index
         ],
         **reported.plain(),
@@ -262,6 +267,7 @@ def publish(
     reported_from: Path | None = None,
     title: str = "Leaderboard",
     models: Sequence[Path] = (),
+    labels: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Published:
     """Write the page; an earlier page in `out` is replaced once the new one is complete.
@@ -273,10 +279,11 @@ def publish(
         reported_from: also show numbers that papers print, from this folder.
         title: title of the page.
         models: run folders, or folders of them; their models are shown on OUT/models/*.html, as by `aw view`.
+        labels: names of methods on the page, see `labels.shown_names`; CSV files and commands keep theirs.
         say: gets a line for each entry without a model there.
 
     Raises:
-        AwError: the board is damaged, or `out` holds something else.
+        AwError: the board is damaged, a label is wrong, or `out` holds something else.
     """
     if not board.is_dir():
         raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
@@ -294,6 +301,8 @@ def publish(
         _check_folder(out)
         sweep_siblings(out)
         entries, index = read_board(board), board_pictures.read_index(board)
+        shown = shown_names(labels, [e.method for e in entries])
+        named = [replace(e, method=shown[e.method]) for e in entries]
         printed = read_reported(source) if source is not None else Reported()
         with atomic_dir(out) as folder:
             names = _write_data(board, folder / "data", entries, printed.numbers)
@@ -303,8 +312,8 @@ def publish(
                     folder / "images" / row["file"],
                     row["sha256"],
                 )
-            links, pages = write_model_pages(entries, models, folder, say) if models else ({}, 0)
-            text = page(title, facts(entries, index, printed, names, links))
+            links, pages = write_model_pages(named, models, folder, say) if models else ({}, 0)
+            text = page(title, facts(entries, index, printed, names, links, shown))
             (folder / "index.html").write_text(text, encoding="utf-8")
             write_json(folder / MANIFEST, list_names(folder))
     return Published(
@@ -418,8 +427,10 @@ def write_model_pages(
         if len({f.scene_hash for _, f in shown}) > 1:
             raise AwError(f"runs on scene {scene!r} of {dataset!r} used different photos: publish them apart")
         name = _page_name(dataset, scene, names)
-        models = [replace(f.model, label=label) for label, f in shown]
-        text, _ = page_text(open_scene(shown[0][1].run), models, title=f"{dataset}: {scene}")
+        # readers of the board have not the runs that a command would train on
+        models = [replace(f.model, label=label, retrain="") for label, f in shown]
+        opened = open_scene(shown[0][1].run)
+        text, _ = page_text(opened, models, title=f"{dataset}: {scene}", mixed=mixed_tests(opened))
         (out / MODELS).mkdir(exist_ok=True)
         (out / MODELS / name).write_text(text, encoding="utf-8")
         for label, _ in shown:

@@ -85,6 +85,12 @@ def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:
     """
     result, config = _result(run), _config(run)
     _check_identity(run, result, config)
+    for key, what in (
+        ("continued", "was continued from a shorter run"),
+        ("corrections", "has masks corrected by hand"),
+    ):
+        if config.get(key):
+            raise AwError(f"{run} {what}, which no command makes again from the scene: train it anew without")
     renders = _check_files(run, result, ours=not config["source"])
     scene = scenes.find(run, config)
     mixed = str(result["facts"].get("test_photos") or ("" if scene is None else mixed_tests(scene)))

@@ -20,13 +20,14 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.measures import ALWAYS, COST, MEASURES, Measure, measure
-from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, method_of, read_runs
-from ambiguous_wild.methods.registry import knows_truth
+from ambiguous_wild.harness.store import TEXT_OF_RUNS, Runs, check_names, read_runs
+from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.notes import (
     incomparable,
     metric_versions,
     mixed_runs,
+    mixed_scenes,
     notes,
     scenes_apart,
     untimed,
@@ -35,6 +36,7 @@ from ambiguous_wild.report.plain_formats import to_text
 from ambiguous_wild.report.table_layout import Column, Row, State, Table, TableCell, ranks
 from ambiguous_wild.report.typeset import to_html
 
+LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
 MASK_COLUMNS = ("mask_iou", "mask_precision")
 EFFECTS = Measure("effects", "effects", None, 0, per_image=False)
 COLUMNS = ("scene", "method", "seed", "image", "metric", "value", "better", "reason", "config_hash",
@@ -78,13 +80,15 @@ def comparison(
     )
     versions = metric_versions(runs.runs)
     runs = replace(runs, images=_of_one_function(runs.images, versions))
-    methods = sorted(runs.runs["method"].unique())
+    methods = runs.rows()
     index = _Index(runs)
     columns = _columns(runs, metrics)
     defined = {c.key: [s for s in chosen if index.can_have(s, c, methods)] for c in columns}
     unranked = incomparable(runs.runs, columns) | versions.keys()
     apart, quality = scenes_apart(runs), frozenset(c.key for c in columns if c.quality)
     apart |= {""} if apart else set()  # the mean over scenes
+    mixed, whole = mixed_scenes(runs.runs), frozenset(c.key for c in columns if c.whole_photo)
+    mixed |= {""} if mixed else set()
     rows = {scene: [_scene_row(index, m, scene, columns) for m in methods] for scene in chosen}
     if len(chosen) > 1:
         mean = [_mean_row(index, k, m, chosen, columns, rows, defined) for k, m in enumerate(methods)]
@@ -93,13 +97,14 @@ def comparison(
     tables = [
         Table(
             scene or title,
-            tuple(Column("", measure, scene) for measure in columns),
-            tuple(_ranked(of, columns, unranked | (quality if scene in apart else frozenset()))),
+            tuple(Column("", measure, scene, doubtful=measure.key in doubtful) for measure in columns),
+            tuple(_ranked(of, columns, unranked | doubtful | (quality if scene in apart else frozenset()))),
             continued=True,
         )
         for scene, of in rows.items()
+        for doubtful in [whole if scene in mixed else frozenset()]
     ]
-    tables = [_with_effects(table, runs.runs) for table in tables]
+    tables = [_with_effects(_cited(table, runs), runs.runs) for table in tables]
     tables[-1] = replace(tables[-1], continued=False).with_notes(
         *notes(runs, columns, methods, chosen), *_undefined(columns, chosen, defined)
     )
@@ -126,6 +131,14 @@ def table(
     runs = runs if isinstance(runs, Runs) else read_runs(runs)
     columns, only = ([names] if isinstance(names, str) else names for names in (metrics, scenes))
     return Tables(comparison(runs, metrics=columns, scenes=only))
+
+
+def _cited(table: Table, runs: Runs) -> Table:
+    """Add the key of the paper to rows with a label: a table with names of papers is for a paper."""
+    labelled = {name: method for name, method in runs.methods.items() if name != method}
+    entries = all_methods() if labelled else {}
+    keys = {name: entries[method].cite for name, method in labelled.items() if method in entries}
+    return replace(table, rows=tuple(replace(row, cite=keys.get(row.name, "")) for row in table.rows))
 
 
 def _with_effects(table: Table, frame: pd.DataFrame) -> Table:
@@ -179,6 +192,7 @@ class _Index:
         self.runs = dict(iter(runs.runs.groupby(["method", "scene"])))
         self.images = dict(iter(runs.images.groupby(["method", "scene", "metric"])))
         self.unfinished = {(i.method, i.scene) for i in runs.incomplete}
+        self.references = {name for name in runs.rows() if knows_truth(runs.method_of(name))}
         self.untimed, self.mixed = set(untimed(runs.runs)), set(mixed_runs(runs.runs))
 
     def seeds(self, method: str, scene: str, column: Measure) -> pd.Series:
@@ -230,6 +244,15 @@ def _columns(runs: Runs, metrics: Sequence[str]) -> tuple[Measure, ...]:
     return (*quality, *masks, *cost)
 
 
+def quality_columns(runs: Runs) -> tuple[str, ...]:
+    """Return PSNR, SSIM and the first LPIPS that was measured, or else the first with a row for it."""
+    measured = set(runs.images.dropna(subset=["value"])["metric"])
+    present = measured | set(runs.images["metric"])
+    lpips = next((k for k in LPIPS if k in measured), next((k for k in LPIPS if k in present), ""))
+    consistent = ["psnr_consistent"] if "psnr_consistent" in measured else []
+    return ("psnr", *consistent, "ssim", *([lpips] if lpips else []))
+
+
 def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, ...]) -> Row:
     state = index.state(method, scene)
     if state != "ok":
@@ -251,13 +274,12 @@ def _scene_row(index: _Index, method: str, scene: str, columns: tuple[Measure, .
                 index="image", columns="seed", values="value", aggfunc="mean", dropna=False
             )
             means = images.to_numpy().mean(axis=1)
-            interval = stats.bootstrap_interval(
-                means[np.isfinite(means)] if np.isfinite(means).any() else means
-            )
+            interval = stats.mean_interval(means[np.isfinite(means)] if np.isfinite(means).any() else means)
             low, high = interval.low, interval.high
         cells.append(TableCell(value, stats.sample_std(values), low, high))
-    ranked = (method, scene) not in index.unfinished and not knows_truth(method_of(method))
-    return Row(method, tuple(cells), runs=len(index.runs[method, scene]), ranked=ranked)
+    why = "unfinished, not ranked" if (method, scene) in index.unfinished else ""
+    why = "knows the truth, not ranked" if method in index.references else why
+    return Row(method, tuple(cells), runs=len(index.runs[method, scene]), ranked=not why, note=why)
 
 
 def _mean_row(
@@ -287,9 +309,8 @@ def _mean_row(
             # means over scenes for each seed, whose spread is shown; they need the same seeds on all scenes
             by_seed = pd.concat([index.seeds(method, s, column) for s in over], axis=1).to_numpy()
             cells.append(TableCell(value, stats.sample_std(by_seed.mean(axis=1))))
-    return Row(
-        method, tuple(cells), runs=sum(row.runs for row in rows), ranked=all(row.ranked for row in rows)
-    )
+    why = next((row.note for row in rows if row.note), "")
+    return Row(method, tuple(cells), runs=sum(row.runs for row in rows), ranked=not why, note=why)
 
 
 def _ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozenset[str]) -> list[Row]:
@@ -305,13 +326,7 @@ def _ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozens
         ]
         for k, rank in enumerate(ranks(values, column)):
             marked[k][i] = replace(cells[k], rank=rank)
-    return [replace(row, cells=tuple(cells), note=_why_unranked(row)) for row, cells in zip(rows, marked)]
-
-
-def _why_unranked(row: Row) -> str:
-    if row.ranked:
-        return ""
-    return "knows the truth, not ranked" if knows_truth(method_of(row.name)) else "unfinished, not ranked"
+    return [replace(row, cells=tuple(cells)) for row, cells in zip(rows, marked)]
 
 
 def tidy(runs: Runs, *, metrics: Sequence[str] = (), scenes: Sequence[str] = ()) -> pd.DataFrame:

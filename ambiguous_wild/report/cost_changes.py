@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -42,7 +42,7 @@ class Change:
     scenes: tuple[str, ...]
     pairs: int
     db: MeanAndDeviation  # gain in PSNR, over pairs
-    db_low: float  # 95 % bootstrap interval of the gain, over the test images of all pairs
+    db_low: float  # 95 % interval of the gain, over the test images of all pairs
     db_high: float
     minutes: MeanAndDeviation  # extra minutes of training, over pairs
     ms_per_iteration: MeanAndDeviation  # extra ms, of the reference machine if the minutes are
@@ -70,6 +70,8 @@ def changes(runs: Sequence[CostRun]) -> list[Change]:
         for key, pair in (*_part_pairs(group), *_option_pairs(group)):
             pairs.setdefault(key, []).append(pair)
     measured = [_change(key, of) for key, of in sorted(pairs.items(), key=lambda item: item[0])]
+    shown = {run.method: run.shown or run.method for run in usable}
+    measured = [replace(c, method=shown.get(c.method, c.method)) for c in measured]
     return sorted(measured, key=lambda c: (KINDS.index(c.kind), c.name, c.method))
 
 

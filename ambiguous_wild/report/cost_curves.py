@@ -22,8 +22,6 @@ from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_runs import CostRun, Length, why_unranked
 
 BELOW_BEST = (3.0, 1.0, 0.5)  # dB below the end of the best curve: the targets if none are given
-NEAR_BEST = 0.9  # of the best PSNR
-LAST_DB = 1.0
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,13 @@ class Curve:
 
 
 def curves_of(runs: Sequence[CostRun]) -> list[Curve]:
-    """Gather runs into curves, sorted by name, then from the shortest training."""
+    """Gather runs into curves, in the order of methods, then by name and from the shortest training."""
     named = grouped(zip(_names(runs), runs), lambda item: (item[0], item[1].length))
     curves = [
         Curve(name, items[0][1].method, length, tuple(run for _, run in items))
         for (name, length), items in named.items()
     ]
-    return sorted(curves, key=lambda curve: (curve.name, curve.trained_s, curve.length))
+    return sorted(curves, key=lambda curve: (curve.runs[0].place, curve.name, curve.trained_s, curve.length))
 
 
 def _names(runs: Sequence[CostRun]) -> list[str]:
@@ -85,12 +83,14 @@ def _names(runs: Sequence[CostRun]) -> list[str]:
         asked.setdefault(run.method, set()).add(run.asked)
         for key, value in run.options:
             values.setdefault((run.method, key), set()).add(value)
-    swept = _swept(runs)
+    swept, shown = _swept(runs), {run.method: run.shown for run in runs}
     names = []
     for run in runs:
         effects = f"+ {run.asked}" if run.asked else "plain"
-        method, key = (run.base, swept[run.base]) if run.base in swept else (run.method, "")
-        parts = [method, effects] if len(asked[run.method]) > 1 else [method]
+        name, key = run.shown or run.method, swept.get(run.base, "")
+        if key and name == run.method:  # a variant without a label of its own
+            name = shown.get(run.base) or run.base
+        parts = [name, effects] if len(asked[run.method]) > 1 else [name]
         varied = (f"{k}={value}" for k, value in run.options if k == key or len(values[run.method, k]) > 1)
         names.append(" ".join([*parts, *varied]))
     return names
@@ -352,73 +352,6 @@ def _missing(curve: Curve, scenes: Iterable[str], runs: Sequence[CostRun]) -> st
     return shortlist(unprobed, 2) if unprobed and len(unprobed) < len(runs) else ""
 
 
-@dataclass(frozen=True)
-class TargetRow:
-    """What accuracy costs on one scene, in one line.
-
-    It takes the time of the method that is fastest, in the mean over its seeds. It leaves out references, and
-    runs that were not alone if others were.
-    """
-
-    scene: str
-    best: float  # dB, the highest mean over seeds at the end of a training
-    best_curve: str
-    most_s: float  # seconds until 90 % of the best PSNR; NaN if no training has a probe as low
-    most_spread_s: float  # sample deviation over seeds; NaN for one seed
-    most_curve: str
-    bound: bool  # it was reached at the first probe: most_s is an upper bound
-    last_s: float  # seconds from 1 dB below the best to the best
-    ranked: bool  # False: some times are of runs that were not alone
-
-    @property
-    def text(self) -> str:
-        """For example "on yard 90 % of the best PSNR (28.4 dB) takes 41 s (3dgs), the last dB 6 min"."""
-        spread = "" if math.isnan(self.most_spread_s) else f" ± {self.most_spread_s:.1f} s"
-        bound = "at most " if self.bound else ""
-        most = f"takes {bound}{duration(self.most_s)}{spread} ({self.most_curve})"
-        most = "not measured" if math.isnan(self.most_s) else most
-        last = "not measured" if math.isnan(self.last_s) else f"{duration(self.last_s)} ({self.best_curve})"
-        line = f"on {self.scene} 90 % of the best PSNR ({self.best:.1f} dB) {most}, the last dB {last}"
-        return line if self.ranked else f"{line}; not all of these runs were alone on their machine"
-
-
 def duration(seconds: float) -> str:
     """Return a time as seconds below two minutes, else as minutes."""
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.3g} min"
-
-
-def answers(curves: Sequence[Curve]) -> list[TargetRow]:
-    """Compute the answer for each scene with a finished run."""
-    rivals = [curve for curve in curves if not knows_truth(curve.method)]
-    alone = [curve for curve in rivals if not why_unranked(curve.runs)]
-    by_scene = (_answer(scene, alone or rivals) for scene in scenes_of(rivals))
-    return [answer for answer in by_scene if answer is not None]
-
-
-def _answer(scene: str, curves: Sequence[Curve]) -> TargetRow | None:
-    finished = [replace(c, runs=tuple(c.on(scene))) for c in curves if math.isfinite(c.end(scene))]
-    if not finished:
-        return None
-    best_curve = max(finished, key=lambda c: c.end(scene))
-    best = best_curve.end(scene)
-    # seeds end above or below their mean, so the mean is reached at the end of the training
-    end_s = summary(best_curve, (scene,), lambda run: run.train_s + run.added_s).mean
-    most = _first(finished, NEAR_BEST * best)
-    before = _first([best_curve], best - LAST_DB)
-    return TargetRow(
-        scene,
-        best,
-        best_curve.name,
-        math.nan if most is None else 60.0 * most.minutes.mean,
-        math.nan if most is None else 60.0 * most.minutes.spread,
-        "" if most is None else most.curve,
-        most is not None and most.upper_bound,
-        math.nan if before is None or before.upper_bound else end_s - 60.0 * before.minutes.mean,
-        not any(why_unranked(c.runs) for c in finished),
-    )
-
-
-def _first(curves: Sequence[Curve], psnr: float) -> Reach | None:
-    """Return the row of the curve that is first to reach `psnr` with all its seeds."""
-    rows = [row for row in times_to_reach(curves, [psnr]) if math.isfinite(row.minutes.mean)]
-    return min(rows, key=lambda row: row.minutes.mean, default=None)

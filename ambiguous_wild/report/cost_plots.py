@@ -23,6 +23,12 @@ GREY = "0.45"
 PANEL = (4.6, 3.4)  # inches
 DPI = 130
 MAX_COLUMNS = 3
+# Metadata by suffix: no dates, no versions.
+UNDATED: dict[str, dict[str, None]] = {
+    ".svg": {"Date": None, "Creator": None},
+    ".png": {"Software": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
 AXES = (
     ("minutes", "training time", True),
     ("model_mb", "model size (MB)", True),
@@ -54,14 +60,21 @@ def new_figure(
 
 def save(figure: Any, stem: Path) -> list[Path]:
     """Write STEM.svg and STEM.png; equal figures give equal bytes."""
+    paths = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
+    for path in paths:
+        save_as(figure, path)
+    return paths
+
+
+def save_as(figure: Any, path: Path) -> None:
+    """Write a figure as PDF, PNG or SVG, by the suffix; equal figures give equal bytes.
+
+    A PDF embeds its fonts as TrueType (type 42), which publishers ask for; in an SVG letters are outlines.
+    """
     import matplotlib
 
-    paths = [stem.with_name(stem.name + suffix) for suffix in (".svg", ".png")]
-    with matplotlib.rc_context({"svg.hashsalt": "aw"}):
-        for path, metadata in zip(paths, ({"Date": None, "Creator": None}, {"Software": None})):
-            with atomic_path(path) as temporary:
-                figure.savefig(temporary, metadata=metadata)
-    return paths
+    with matplotlib.rc_context({"svg.hashsalt": "aw", "pdf.fonttype": 42}), atomic_path(path) as temporary:
+        figure.savefig(temporary, metadata=UNDATED[path.suffix.lower()])
 
 
 class LineStyle(TypedDict):
@@ -116,16 +129,23 @@ def label_right(axes: Any, ends: Sequence[tuple[str, float, float, Any]]) -> Non
         )  # fmt: skip
 
 
-def label_points(axes: Any, points: Sequence[tuple[str, float, float, Any]]) -> None:
-    """Write names beside points, on the side of the panel's middle; each point is (name, x, y, colour)."""
+def label_points(axes: Any, points: Sequence[tuple[str, float, float, float, Any]]) -> None:
+    """Write names beside points and their error bars, on the side with more room.
+
+    Args:
+        axes: the panel.
+        points: (name, x, half the length of its horizontal bar, y, colour) of each.
+    """
     low, high = axes.get_ylim()
     to_axes = axes.transData + axes.transAxes.inverted()
-    heights = spread_out([y for _, _, y, _ in points], 0.062 * (high - low))
-    for (name, x, y, colour), height in zip(points, heights):
-        on_right = to_axes.transform((x, y))[0] > 0.5
+    heights = spread_out([y for _, _, _, y, _ in points], 0.062 * (high - low))
+    for (name, x, bar, y, colour), height in zip(points, heights):
+        left, right = (to_axes.transform((end, y))[0] for end in (x - bar, x + bar))
+        on_right = left > 1 - right
         axes.annotate(
-            plain(name), (x, height), xytext=(-8 if on_right else 8, 0), textcoords="offset points",
-            color=colour, fontsize=8, va="center", ha="right" if on_right else "left", parse_math=False,
+            plain(name), (x - bar if on_right else x + bar, height), xytext=(-8 if on_right else 8, 0),
+            textcoords="offset points", color=colour, fontsize=8, va="center",
+            ha="right" if on_right else "left", parse_math=False,
         )  # fmt: skip
 
 
@@ -284,7 +304,11 @@ def draw_front(report: CostReport) -> Any | None:
             panel.plot([x for _, x in line], [p.psnr.mean for p, _ in line], **styles[name], linewidth=1.0,
                        alpha=0.6)  # fmt: skip
         # of a curve of several lengths, the longest has the name
-        ends = [(c, line[-1][1], line[-1][0].psnr.mean, styles[c]["color"]) for c, line in lines.items()]
+        ends = []
+        for c, line in lines.items():
+            point, x = line[-1]
+            spread = _x(point, key, unit).spread
+            ends.append((c, x, spread if finite(spread) else 0.0, point.psnr.mean, styles[c]["color"]))
         if key == "minutes":
             label = f"{label}{' and set-up' if report.setup else ''} ({unit.name})"
         panel.margins(x=0.08, y=0.1)

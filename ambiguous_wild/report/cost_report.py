@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.result_file import encoded
 from ambiguous_wild.harness.timing import seconds_range
 from ambiguous_wild.io.files import is_record, refuse_files_there, write_json, write_text
+from ambiguous_wild.io.terminal import wrapped
 from ambiguous_wild.report import plain_formats
 from ambiguous_wild.report.cost_changes import Change, changes
 from ambiguous_wild.report.cost_curves import (
@@ -22,8 +23,6 @@ from ambiguous_wild.report.cost_curves import (
     MeanAndDeviation,
     Point,
     Reach,
-    TargetRow,
-    answers,
     curves_of,
     points,
     times_to_reach,
@@ -72,7 +71,6 @@ class CostReport:
     reach: tuple[Reach, ...]
     changes: tuple[Change, ...]
     notes: tuple[str, ...]
-    answers: tuple[TargetRow, ...]  # one for each scene
     reference: bool  # times are seconds of the reference machine; else wall seconds
     setup: bool  # times include the set-up before the first step
     made_by: str  # the command
@@ -116,7 +114,6 @@ def cost_report(
         tuple(times_to_reach(curves, targets)),
         tuple(changes(runs)),
         (*cost_runs.notes, *_gaps(curves, scenes), *_unprobed(curves), *_unranked(curves)),
-        tuple(answers(curves)),
         cost_runs.reference,
         setup,
         made_by,
@@ -194,7 +191,6 @@ def plain_data(report: CostReport) -> Facts:
         "made_by": report.made_by,
         "time": "training and what comes before its first step" if report.setup else "training",
         "seconds": "reference" if report.reference else "wall",
-        "answers": [asdict(answer) | {"text": answer.text} for answer in report.answers],
         "scenes": list(report.scenes),
         "curves": list(map(_row, report.points)),
         "time_to_psnr": list(map(_row, report.reach)),
@@ -229,16 +225,26 @@ def _timeline_rows(curves: Iterable[Curve]) -> Iterator[Facts]:
                        "train_s": at, "psnr": psnr}  # fmt: skip
 
 
-def to_text(report: CostReport) -> str:
-    """Return every table of the report as aligned text, with the notes below."""
-    parts = [plain_formats.to_text(tables_of(report))]
-    parts += [f"{plain(answer.text)}" for answer in report.answers]
+def to_text(report: CostReport, width: int | None = None) -> str:
+    """Return every table of the report as aligned text, with the notes below.
+
+    Args:
+        report: the report.
+        width: columns at which tables are divided and notes are broken; None: any number.
+    """
+    tables = tables_of(report)
+    if width is not None:
+        tables = [part for table in tables for part in plain_formats.divided(table, width)]
     spread = any(not math.isnan(p.psnr.spread) for p in report.points)
-    parts += ["±: sample standard deviation over seeds"] if spread else []
-    parts += [TIMES[report.reference]]
-    parts += [plain(note) for note in report.notes]
-    parts += [f"command: {plain(report.made_by)}"] if report.made_by else []
-    return "\n".join(parts) + "\n"
+    notes = ["±: sample standard deviation over seeds"] if spread else []
+    notes += [TIMES[report.reference], *report.notes]
+    notes += [f"command: {report.made_by}"] if report.made_by else []
+    return (
+        "\n".join(
+            [plain_formats.to_text(tables, width=width), *(wrapped(plain(note), width) for note in notes)]
+        )
+        + "\n"
+    )
 
 
 def tables_of(report: CostReport) -> list[Table]:

@@ -20,6 +20,7 @@ import numpy as np
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.labels import shown_names
 from ambiguous_wild.harness.result_file import Cost, Options, RunResult, mean_of
 from ambiguous_wild.harness.store import (
     BOOKKEEPING,
@@ -87,7 +88,10 @@ class CostRun:
     error: str = ""
     unprobed: str = ""  # why PSNR over time is unknown; empty: it was probed, or the run failed
     added_s: float = 0.0  # added to times that are compared: the set-up, if it was asked for
+    doubt: str = ""  # whether test photos are truth
     apart: str = ""  # why no run on its scene is ranked: they measured other pixels
+    shown: str = ""  # name of the method in tables and plots
+    place: int = 0  # of the method among those that are shown
     speed: float = 1.0  # reference seconds in a second of the training; 1: times are wall seconds
 
     @property
@@ -116,15 +120,18 @@ class CostRuns:
     reference: bool = False  # times are reference seconds; False: wall seconds
 
 
-def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> CostRuns:
+def read_cost_runs(
+    folders: Sequence[Path], *, scenes: Sequence[str] = (), labels: Sequence[str] = ()
+) -> CostRuns:
     """Read every run below the folders, each once.
 
     Args:
         folders: outputs of `aw bench` or `aw ablate`, or folders of them.
         scenes: names of the scenes to read; empty = all.
+        labels: names and order of methods, see `labels.shown_names`.
 
     Raises:
-        AwError: no such folder, no finished run, an unknown scene, or two copies of a run.
+        AwError: no such folder, no finished run, an unknown scene, a wrong label, or two copies of a run.
     """
     runs: list[CostRun] = []
     notes: list[str] = []
@@ -142,6 +149,9 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
             + ": 'aw bench --method NAME --scene SCENE -o RUNS' makes one"
         )
     _refuse_twice(runs)
+    shown = shown_names(labels, [run.method for run in runs])
+    places = {method: place for place, method in enumerate(shown)}
+    runs = [replace(run, shown=shown[run.method], place=places[run.method]) for run in runs]
     notes += [f"failed: {r.method} on {r.scene}, seed {r.seed}: {r.error}" for r in runs if r.error]
     runs = _without_mixed_metrics(runs, notes)
     for scene in sorted({run.scene for run in runs}):
@@ -151,6 +161,8 @@ def read_cost_runs(folders: Sequence[Path], *, scenes: Sequence[str] = ()) -> Co
             notes.append(f"not comparable: {apart}")
             runs = [replace(run, apart=apart) if run.scene == scene else run for run in runs]
         notes += _unequal_methods(scene, of)
+        doubts = dict.fromkeys(run.doubt for run in of if run.doubt)
+        notes += [f"{doubt} ({scene}): a model that draws distractors gains PSNR by it" for doubt in doubts]
     runs = _with_effects_of_plans(runs)
     reference = _all_calibrated(runs)
     if not reference and any(math.isfinite(run.timing.reference_s) for run in runs):
@@ -287,6 +299,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         scene_hash=result["scene_hash"],
         reproduce=str(result.get("reproduce", "")),
         error=result["error"] or "",
+        doubt=str(result["facts"].get("test_photos", "")),
         unprobed="" if result["error"] else damage or no_probes,
     )
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import re
+import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,15 +15,26 @@ from ambiguous_wild.core import AwError, Camera, Scene
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.harness.benchmark import BenchReport, bench
 from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
-from ambiguous_wild.harness.trained_models import find_models, open_scene, read_files, read_models
-from ambiguous_wild.io.files import check_output, refuse_files_there
+from ambiguous_wild.harness.chosen_effects import mixed_tests
+from ambiguous_wild.harness.evaluate import keep_maps
+from ambiguous_wild.harness.trained_models import (
+    find_models,
+    open_scene,
+    page_title,
+    read_files,
+    read_models,
+    training_model,
+)
+from ambiguous_wild.io.files import check_output, refuse_files_there, write_text
 from ambiguous_wild.io.page_parts import narrowed
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS
+from ambiguous_wild.report.cost_curves import duration
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
 from ambiguous_wild.viewing.model import space_of
 from ambiguous_wild.viewing.model_export import ExportedModel, ExportParts, export
+from ambiguous_wild.viewing.page_file import PAGE, check_page_folder, page_text
 from ambiguous_wild.viewing.video import (
     Frame,
     Tick,
@@ -37,7 +51,12 @@ if TYPE_CHECKING:
     from ambiguous_wild.splat.trainer import Trainer
 
 
+LOG = logging.getLogger(__name__)
 FOLDER = "export"  # in a run folder
+FIRST_PAGE_S = 10.0  # of training until the first page of a run that is trained
+LONGEST_PAUSE_S = 60.0  # of training between two pages
+LEAST_PAUSE = 10.0  # least pause, in times that a page takes
+GAUSSIANS_WHILE_TRAINING = 60_000  # of a model in such a page, which is to be written within a second or two
 
 
 def export_runs(
@@ -169,6 +188,7 @@ def video_runs(
     gif_width: int = 640,
     scene: str | None = None,
     scene_folder: Path | None = None,
+    labels: Sequence[str] = (),
     threads: int | None = None,
     say: Callable[[str], None] = lambda text: None,
     tick: Tick = lambda done, total: None,
@@ -186,6 +206,7 @@ def video_runs(
         gif_seconds, gif_width: length and width in px of the animation.
         scene: name of the scene to show, if the runs are of several.
         scene_folder: where the scene lies; None = where the runs say.
+        labels: names and order of methods, see `labels.shown_names`.
         threads: threads of the kernels; None = all cores.
         say: gets notes about the models.
         tick: called with (frames done, frames).
@@ -200,7 +221,7 @@ def video_runs(
     frames = round(seconds * fps)
     if frames < 2:
         raise AwError(f"{seconds:g} seconds at {fps:g} frames per second are fewer than two frames")
-    shown = read_models(paths, scene=scene, scene_folder=scene_folder)
+    shown = read_models(paths, scene=scene, scene_folder=scene_folder, labels=labels)
     for wanted in (output, *([gif] if gif else [])):
         check_output(wanted)
     for note in shown.notes:
@@ -209,6 +230,7 @@ def video_runs(
     prepare_cpu(threads, say)
     labels = tuple(model.label for model in shown.models)
     say(f"drawing {frames} frames of {', '.join(labels)}")
+    begin = time.perf_counter()
     kept: list[Frame] = []
     chosen = {
         round(k * (frames - 1) / max(1, round(gif_seconds * GIF_FPS) - 1))
@@ -220,6 +242,9 @@ def video_runs(
             if gif is not None and number in chosen:
                 kept.append(narrowed(frame, gif_width))
             yield frame
+            if number == 1:  # written, and most of what only the first frames take is over
+                spent = time.perf_counter() - begin
+                say(f"about {duration(spent * frames / 2)}; a smaller --width or --fps is faster")
 
     written = write_mp4(output, watched(), fps)
     if gif is not None:
@@ -257,6 +282,74 @@ class ShowInView(Callbacks):
         line = f"{run_name(cell)}: {outcome_line(report)}"
         self.view.end(line)
         self._say(line)
+
+
+class GrowingPage:
+    """Writes the page of `aw view` while runs are trained: soon after the first step, then more rarely."""
+
+    def __init__(self, folder: Path, runs: Path) -> None:
+        """
+        Args:
+            folder: where index.html is written.
+            runs: folder of the runs; finished ones are shown beside the one that is trained.
+        """
+        check_page_folder(folder)
+        self.folder, self.runs = folder, runs
+        self._trainer: Trainer | None = None
+        self._label = self._next_label = ""
+        self._cost_s = 0.0  # of the last page
+
+    def begin(self, label: str) -> None:
+        """Call it before each run; `label` is the run's name on the page."""
+        self._next_label = label
+
+    def tick(self, trainer: Trainer) -> bool:
+        """Write the page if one is due, after an iteration with the clock stopped; return whether it was."""
+        now = trainer.clock.now()
+        if trainer is not self._trainer:
+            self._trainer, self._label, self._due = trainer, self._next_label, now + FIRST_PAGE_S
+        if now < self._due or trainer.done:
+            return False
+        pause_s = max(min(max(now, FIRST_PAGE_S), LONGEST_PAUSE_S), LEAST_PAUSE * self._cost_s)
+        self._due = now + pause_s
+        try:
+            self._write(_state(trainer), pause_s + self._cost_s)
+        except (AwError, OSError) as error:  # no reason to end a training
+            LOG.warning("the page could not be written: %s", error)
+            return False
+        return True
+
+    def end(self) -> bool:
+        """Write the page of a run that was stopped; return whether there is one."""
+        if self._trainer is None:
+            return False
+        self._write(f"stopped: {_state(self._trainer)}; the same command continues")
+        return True
+
+    def _write(self, state: str, reload_s: float = 0.0) -> None:
+        assert self._trainer is not None
+        begin, scene = time.monotonic(), self._trainer.data.scene
+        masks = {view.name: keep for view, keep in keep_maps(self._trainer)}
+        models = [training_model(self._trainer, self._label, masks)]
+        with suppress(AwError):  # no run has ended yet
+            models = [t.model for t in find_models([self.runs])[0] if t.model.label != self._label] + models
+        text, _ = page_text(
+            scene,
+            models,
+            title=page_title(scene),
+            mixed=mixed_tests(scene),
+            most_gaussians=GAUSSIANS_WHILE_TRAINING,
+            training=state,
+            reload_s=reload_s,
+        )
+        write_text(self.folder / PAGE, text)
+        self._cost_s = time.monotonic() - begin
+
+
+def _state(trainer: Trainer) -> str:
+    seconds, budget = trainer.clock.now(), trainer.config.budget_s
+    of = f"{budget:.0f} s" if budget is not None else f"{trainer.config.iterations} iterations"
+    return f"{trainer.iteration:,} iterations in {seconds:.0f} s of training, of {of}"
 
 
 def watch(

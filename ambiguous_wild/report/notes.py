@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,12 +13,14 @@ import pandas as pd
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.labels import IN_FOLDER
 from ambiguous_wild.harness.measures import Measure, measure
-from ambiguous_wild.harness.result_file import Options
-from ambiguous_wild.harness.store import Runs, method_of, read_config, section
+from ambiguous_wild.harness.result_file import NOT_BEGUN, Options
+from ambiguous_wild.harness.store import Runs, read_config, section
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
+from ambiguous_wild.report.table_layout import DOUBTFUL
 
 LENGTHS_DIFFER = 1.1  # a note is written if the longest training has this many times the shortest's steps
 REFERENCE = "reference_s"  # comparable between machines; other times are not
@@ -51,15 +54,16 @@ def notes(
     """Return all notes, one line each, the most serious first."""
     return (
         *unequal(runs.runs),
-        *_mixed(runs.runs),
+        *_mixed(runs.runs, columns),
         *_failed(runs),
         *_absent(runs, methods, scenes),
         *(f"incomplete: {i.folder}: {i.reason}" for i in runs.incomplete),
         *_not_ranked(runs),
-        *_references(methods),
+        *_references(runs, methods),
         *_fitted(runs),
         *_unfitted(runs),
         *_missing(runs, columns),
+        *_no_masks(runs, columns),
         *_infinite(runs, columns),
         *_not_comparable(runs, columns),
         *_about(runs, methods),
@@ -93,10 +97,21 @@ def unequal(frame: pd.DataFrame) -> list[str]:
     return lines
 
 
-def _mixed(frame: pd.DataFrame) -> list[str]:
-    """Return a line for each reason to doubt test photos, with the scenes."""
+def mixed_scenes(frame: pd.DataFrame) -> frozenset[str]:
+    """Return scenes whose test photos may hold distractors."""
+    return frozenset(frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]["scene"])
+
+
+def _mixed(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
+    """Return a line for each reason to doubt test photos, with the scenes, and what is ranked instead."""
     rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
-    return [f"{reason} ({shortlist(sorted(set(of['scene'])))})" for reason, of in rows.groupby("test_photos")]
+    ranked = [c.label for c in columns if c.per_image and not c.whole_photo]
+    instead = f"ranked is {' and '.join(ranked)}, over pixels that other photos show alike" if ranked else ""
+    why = f"{DOUBTFUL} is not ranked, as a model that draws distractors gains by it"
+    return [
+        f"{reason} ({shortlist(sorted(set(of['scene'])))}): {'; '.join(filter(None, (why, instead)))}"
+        for reason, of in rows.groupby("test_photos")
+    ]
 
 
 def _failed(runs: Runs) -> list[str]:
@@ -124,8 +139,8 @@ def _not_ranked(runs: Runs) -> list[str]:
     ]
 
 
-def _references(methods: Sequence[str]) -> list[str]:
-    names = [method for method in methods if knows_truth(method_of(method))]
+def _references(runs: Runs, methods: Sequence[str]) -> list[str]:
+    names = [method for method in methods if knows_truth(runs.method_of(method))]
     return [f"references, not ranked: {shortlist(names)} (exact masks or clean photos)"] if names else []
 
 
@@ -152,16 +167,22 @@ def _unfitted(runs: Runs) -> list[str]:
 
 
 def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
-    """Return the note of each method, and of each donor of a graft, with the options of its runs."""
+    """Return the options of methods, and of donors of grafts, that their notes name, with the runs' values.
+
+    A note without an option is the same under every table, and stands in docs/fidelity.md.
+    """
     entries = all_methods()
-    lines = []
-    for name in dict.fromkeys(member for method in methods for member in members(method_of(method))):
-        if name not in entries or not entries[name].note:
+    shown = {runs.method_of(method): method for method in reversed(methods)}
+    said: dict[str, list[str]] = {}
+    for name in dict.fromkeys(member for method in methods for member in members(runs.method_of(method))):
+        if name not in entries or "{" not in entries[name].note:
             continue
-        own = runs.runs[[name in members(method_of(method)) for method in runs.runs["method"]]]
+        own = runs.runs[[name in members(runs.method_of(method)) for method in runs.runs["method"]]]
         options = [_options_of(Path(folder), name) for folder in own["folder"]]
-        lines.append(f"{name}: {entries[name].about(options)}")
-    return lines
+        said.setdefault(entries[name].about(options), []).append(
+            shown.get(name, name).partition(IN_FOLDER)[0]
+        )
+    return [f"{', '.join(names)}: {note}" for note, names in said.items()]
 
 
 def _options_of(folder: Path, name: str) -> Options:
@@ -202,6 +223,17 @@ def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
             names = [f"{r.image} ({r.method} on {r.scene})" for r in residual_mask]
             lines.append(f"missing: {column.key}, no reason given, for {shortlist(names)}")
     return lines
+
+
+def _no_masks(runs: Runs, columns: Sequence[Measure]) -> list[str]:
+    """Return a line for each reason why methods have no masks on scenes with exact ones."""
+    without = runs.runs[(runs.runs["status"] == "ok") & (runs.runs["no_masks"] != "")]
+    shown = any(column.key.startswith("mask_") for column in columns)
+    return [
+        f"no mask IoU: {shortlist(dict.fromkeys(f'{r.method} on {r.scene}' for r in of.itertuples()))}: {why}"
+        for why, of in without.groupby("no_masks")
+        if shown or str(why).startswith(NOT_BEGUN)
+    ]
 
 
 def _infinite(runs: Runs, columns: Sequence[Measure]) -> list[str]:
@@ -328,9 +360,9 @@ def time_notes(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
         return []
     total = len(frame[frame["status"] == "ok"].groupby(["method", "scene"]))
     lines = []
-    for reason, of in grouped(untimed(frame).items(), lambda item: item[1]).items():
-        who = shortlist(f"{method} on {scene}" for (method, scene), _ in of)
-        lines.append(f"times not ranked: {'all' if len(of) == total else who} ({reason})")
+    for of in grouped(untimed(frame).items(), lambda item: re.sub(r"[\d.]+", "", item[1])).values():
+        who = "all" if len(of) == total else shortlist(f"{method} on {scene}" for (method, scene), _ in of)
+        lines.append(f"times not ranked: {who} ({max(reason for _, reason in of)})")
     unranked = incomparable(frame, columns)
     if unranked - {REFERENCE}:
         machines = sorted(set(frame[frame["timing"] == "alone"]["hardware"]))

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import pandas as pd
-
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.store import Runs, check_names
 from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, PrintedNumber, read_tables
-from ambiguous_wild.report.comparison import comparison
+from ambiguous_wild.report.comparison import comparison, quality_columns
+from ambiguous_wild.report.pairs import Ties
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell
 
 PER_TABLE = 6  # scenes side by side, as in the papers
-LPIPS = ("lpips_alex", "lpips_vgg", "lpips_vgg_01")
-MEMORY = ("model_mb",)
-LEVEL = 0.95
-RESAMPLES = 2000
-MIN_IMAGES = 6  # images; five differences have the same sign by chance once in 16 times
 FAMILIES = ("psnr", "ssim", "lpips")
 NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
@@ -39,7 +31,6 @@ def paper(
     scenes: Sequence[str] = (),
     datasets: Mapping[str, Sequence[str]] | None = None,
     per_table: int = PER_TABLE,
-    subject: str = "",
 ) -> list[Table]:
     """Return tables with scenes side by side, PSNR / SSIM / LPIPS under each, and the mean last.
 
@@ -49,15 +40,14 @@ def paper(
         scenes: names of scenes to show; empty = all.
         datasets: scenes by dataset. Each dataset has its own tables and mean; other scenes come last.
         per_table: most scenes of a table; more are divided into several tables, with the mean in the last.
-        subject: subject of the tables, for their titles.
 
     Raises:
         AwError: unknown metric, scene, or a scene in two datasets.
     """
-    parts, begin = [], f"{subject}, " if subject else ""
+    parts = []
     for name, members, tables in _by_dataset(runs, metrics, scenes, datasets or {}):
         by_scene, mean = (tables[1:], tables[:1]) if len(members) > 1 else (tables, [])
-        title = begin + (name or (f"{len(members)} scenes" if mean else tables[0].title))
+        title = name or (f"{len(members)} scenes" if mean else tables[0].title)
         chunks = [by_scene[i : i + per_table] for i in range(0, len(by_scene), per_table)]
         for number, chunk in enumerate(chunks, start=1):
             part = f" ({number} of {len(chunks)})" if len(chunks) > 1 else ""
@@ -93,12 +83,13 @@ def means(
         parts.append(replace(part, columns=tuple(replace(column, scene="") for column in part.columns)))
         notes |= dict.fromkeys(tables[-1].notes)
     rows = []
-    for method in sorted({row.name for part in parts for row in part.rows}):
+    every = {row.name: row for part in parts for row in part.rows}
+    for method in (name for name in runs.rows() if name in every):
         cells: list[TableCell] = []
         for part in parts:
             absent = (TableCell(state="absent"),) * len(part.columns)
             cells += next((row.cells for row in part.rows if row.name == method), absent)
-        rows.append(Row(method, tuple(cells)))
+        rows.append(replace(every[method], cells=tuple(cells)))
     columns = tuple(column for part in parts for column in part.columns)
     return [Table("means over scenes, by dataset (number of scenes)", columns, tuple(rows), tuple(notes))]
 
@@ -123,7 +114,7 @@ def side_by_side(title: str, tables: Sequence[tuple[str, Table]], *, dataset: st
     ]
     for same in zip(*(table.rows for _, table in shown)):
         note = next((row.note for row in same if row.note), "")
-        rows.append(Row(same[0].name, tuple(cell for row in same for cell in row.cells), note=note))
+        rows.append(replace(same[0], cells=tuple(cell for row in same for cell in row.cells), note=note))
     return Table(title, tuple(columns), tuple(rows))
 
 
@@ -159,95 +150,6 @@ def divided(
                 )
     by_dataset = {name: tuple(s for s in wanted if of.get(s, "") == name) for name in [*datasets, ""]}
     return {name: members for name, members in by_dataset.items() if members}
-
-
-def quality_columns(runs: Runs) -> tuple[str, ...]:
-    """Return PSNR, SSIM and the first LPIPS that was measured, or else the first with a row for it."""
-    measured = set(runs.images.dropna(subset=["value"])["metric"])
-    present = measured | set(runs.images["metric"])
-    lpips = next((k for k in LPIPS if k in measured), next((k for k in LPIPS if k in present), ""))
-    return ("psnr", "ssim", *([lpips] if lpips else []))
-
-
-def difference_interval(
-    differences: Sequence[np.ndarray],  # of each scene: [n], one method minus another on the same images
-) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of the mean over scenes of the mean over images.
-
-    Images are drawn within their scene. It is NaN if a value is missing or a scene has less than two images.
-    """
-    if not differences or any(len(d) < 2 or not np.isfinite(d).all() for d in differences):
-        return math.nan, math.nan
-    rng = np.random.default_rng(0)
-    total = np.zeros(RESAMPLES)
-    for values in differences:
-        total += values[rng.integers(0, len(values), size=(RESAMPLES, len(values)))].mean(axis=1)
-    means, tail = np.sort(total / len(differences)), (1.0 - LEVEL) / 2.0
-    low, high = math.floor(tail * (RESAMPLES - 1)), math.ceil((1.0 - tail) * (RESAMPLES - 1))
-    return float(means[low]), float(means[high])
-
-
-class Ties:
-    """Find methods that do not differ significantly from the best, by a paired bootstrap over test images.
-
-    The same images are drawn for both methods, scene by scene, so that a hard image affects both alike.
-    Seeds are averaged before. There is no correction for the number of compared methods.
-    """
-
-    def __init__(self, runs: Runs) -> None:
-        self._rows = dict(iter(runs.images.groupby(["scene", "metric"])))
-        self._values: dict[tuple[str, str], pd.DataFrame] = {}
-
-    def values(self, scene: str, metric: str) -> pd.DataFrame:
-        """Return means over seeds, a row for each image, a column for each method; NaN if a seed has none."""
-        key = (scene, metric)
-        if key not in self._values:
-            if key not in self._rows:
-                return pd.DataFrame()
-            cells = self._rows[key].groupby(["image", "method"])["value"].agg(["mean", "count", "size"])
-            means = cells["mean"].where(cells["count"] == cells["size"])
-            self._values[key] = means.unstack("method")
-        return self._values[key]
-
-    def marked(self, tables: Sequence[Table], scenes: Sequence[str]) -> list[Table]:
-        """Mark the cells of `comparison` tables that do not differ from the best of their column.
-
-        `scenes` are those of the means.
-        """
-        return [
-            replace(table, rows=tuple(self._marked(row, table, scenes) for row in table.rows))
-            for table in tables
-        ]
-
-    def _marked(self, row: Row, table: Table, scenes: Sequence[str]) -> Row:
-        cells = []
-        for i, (column, cell) in enumerate(zip(table.columns, row.cells)):
-            best = [other.name for other in table.rows if other.cells[i].rank == 1]
-            of = (column.scene,) if column.scene else scenes
-            tie = (
-                row.ranked and cell.state == "ok" and column.measure.per_image
-                and bool(best) and row.name not in best
-                and self.tied(best[0], row.name, of, column.measure.key)
-            )  # fmt: skip
-            cells.append(replace(cell, tie=tie))
-        return replace(row, cells=tuple(cells))
-
-    def tied(self, best: str, other: str, scenes: Sequence[str], metric: str) -> bool:
-        """Return whether the interval of the difference contains zero, or there are too few images.
-
-        It is False if the interval is unknown.
-        """
-        differences = []
-        for scene in scenes:
-            values = self.values(scene, metric)
-            if best not in values or other not in values:
-                return False
-            a, b = values[best].to_numpy(float), values[other].to_numpy(float)
-            finite = ~(np.isinf(a) | np.isinf(b))  # means leave out infinite values, so differences do too
-            differences.append(a[finite] - b[finite])
-        low, high = difference_interval(differences)
-        few = sum(map(len, differences)) < MIN_IMAGES and not math.isnan(low)
-        return few or low <= 0.0 <= high
 
 
 def read_reported(folder: Path | None = None) -> list[PrintedNumber]:

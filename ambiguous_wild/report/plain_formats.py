@@ -10,7 +10,6 @@ import csv
 import io
 import math
 import re
-import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,9 @@ from typing import Any
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.names import csv_text, plain
+from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import MEASURES, Measure
+from ambiguous_wild.io.terminal import display_width, wrapped
 from ambiguous_wild.report.table_layout import ARROWS, TIE, Column, Row, Table, TableCell
 
 RANKS = "(1) (2) (3): first, second and third in the column"
@@ -29,16 +30,10 @@ UNEQUAL = "not comparable"  # begins a note that every format with ranks shows
 WIDTH = 100
 # The most important columns; others follow in the order of the table.
 FIRST = (
-    "psnr", "effects", "lpips_alex", "train_s", "ssim", "mask_iou", "psnr_covered", "gaussians", "lpips_vgg",
-    "flip", "fps", "model_mb",
+    "psnr", "psnr_consistent", "effects", "lpips_alex", "ssim", "mask_iou", "train_s", "psnr_covered",
+    "gaussians", "lpips_vgg", "flip", "fps", "model_mb",
 )  # fmt: skip
 UNFITTED = "colours of test photos are not fitted"  # begins a note, with which PSNR affine comes second
-
-
-def display_width(text: str) -> int:
-    """Return the width in columns of a terminal: wide characters take two, combining ones none."""
-    wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
-    return len(text) + wide - sum(unicodedata.combining(c) > 0 for c in text)
 
 
 def marked(cell: TableCell, measure: Measure) -> str:
@@ -52,12 +47,18 @@ def row_name(row: Row) -> str:
     return plain(f"  {row.name}" if row.kind == "reported" else row.name)
 
 
-def to_text(tables: Sequence[Table], *, color: bool = False) -> str:
-    """Return tables as aligned text; with `color`, the three best are coloured."""
+def to_text(tables: Sequence[Table], *, color: bool = False, width: int | None = None) -> str:
+    """Return tables as aligned text.
+
+    Args:
+        tables: the tables.
+        color: colour the three best.
+        width: columns at which titles and the lines below a table are broken; None: each stays one line.
+    """
     parts = []
     for table, below in _with_below(tables):
-        parts += [plain(table.title), *_aligned(table, color), ""]
-        parts += [*map(plain, below), ""] if below else []
+        parts += [wrapped(plain(table.title), width), *_aligned(table, color), ""]
+        parts += [*(wrapped(plain(line), width) for line in below), ""] if below else []
     return "\n".join(parts).rstrip("\n") + "\n"
 
 
@@ -118,7 +119,7 @@ def to_markdown(tables: Sequence[Table]) -> str:
     for table, below in _with_below(tables):
         parts += [f"**{markdown_text(table.title)}**", ""] if table.title else []
         head = [
-            f"{markdown_text(c.group)} {markdown_text(c.measure.label)} {ARROWS[c.measure.better]}".strip()
+            f"{markdown_text(c.group)} {markdown_text(c.name)} {ARROWS[c.measure.better]}".strip()
             for c in table.columns
         ]
         parts.append(_markdown_row([table.head, *head]))
@@ -259,13 +260,13 @@ def to_long_csv(tables: Sequence[Table]) -> str:
 
 
 def _limits(table: Table) -> str:
-    return "; ".join(note for note in table.notes if note.startswith(UNEQUAL))
+    return "; ".join(note for note in table.notes if note.startswith((UNEQUAL, MIXED)))
 
 
 def to_wide_csv(tables: Sequence[Table]) -> str:
     """Return CSV with one row per scene and method, for tables with the same columns; means have no scene.
 
-    Every column has the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 % bootstrap
+    Every column has the mean, `_std` over seeds, and for image metrics `_low` and `_high`, the 95 %
     interval over the test images of one scene, and `_tied`, "yes" if not significantly below the best. The
     last column is `note`, as in `to_long_csv`.
     """
@@ -304,7 +305,9 @@ def fitted(tables: Sequence[Table], width: int = WIDTH) -> list[Table]:
     left = width - max(map(display_width, names))
     unfitted = any(note.startswith(UNFITTED) for note in tables[-1].notes)
     first = (FIRST[0], "psnr_affine", *FIRST[1:]) if unfitted else FIRST
-    order = sorted(range(len(columns)), key=lambda i: (_importance(columns[i].measure, first), i))
+    ranged = [any(row.cells[i].ranged for table in tables for row in table.rows) for i in range(len(columns))]
+    # a time that is not ranked tells less than any other column
+    order = sorted(range(len(columns)), key=lambda i: (ranged[i], _importance(columns[i].measure, first), i))
     kept: list[int] = []
     for i in order:
         need = max(_column_width(table, i) for table in tables)

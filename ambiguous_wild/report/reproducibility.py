@@ -297,5 +297,5 @@ def to_latex(said: Statement) -> str:
             latex_text(line).replace("--", "-{}-").replace("'", r"\textquotesingle{}")
             for line in said.commands
         )
-        lines += [r"\par".join(f"{line}\n" for line in commands).rstrip("\n"), r"\end{flushleft}"]
+        lines += [r"\par ".join(f"{line}\n" for line in commands).rstrip("\n"), r"\end{flushleft}"]
     return "\n".join(lines) + "\n"

@@ -18,6 +18,7 @@ State = Literal["ok", "missing", "failed", "absent", "blank"]
 SHOWN = {"missing": "—", "failed": "failed", "absent": "no run", "blank": ""}  # blank: no value is expected
 ARROWS = {"higher": "↑", "lower": "↓", None: ""}
 TIE = "≈"
+DOUBTFUL = "†"
 
 
 @dataclass(frozen=True)
@@ -29,10 +30,16 @@ class Column:
     scene: str = ""  # empty: a mean over scenes
     dataset: str = ""  # dataset of the scene, or of all scenes of the mean
     words: bool = False  # text, aligned left, not numbers, aligned right, if the format can do so
+    doubtful: bool = False  # distractors in test photos count as truth: marked, and not ranked
 
     @property
     def label(self) -> str:
-        return f"{self.measure.label}{ARROWS[self.measure.better]}"
+        return f"{self.name}{ARROWS[self.measure.better]}"
+
+    @property
+    def name(self) -> str:
+        """The label without its arrow."""
+        return self.measure.label + (DOUBTFUL if self.doubtful else "")
 
 
 @dataclass(frozen=True)
@@ -41,7 +48,7 @@ class TableCell:
 
     value: float = math.nan
     spread: float = math.nan  # sample deviation over seeds; NaN for one seed
-    low: float = math.nan  # 95 % bootstrap interval over the images of one scene
+    low: float = math.nan  # 95 % interval over the images of one scene
     high: float = math.nan
     rank: int | None = None  # 1, 2, 3 or None
     ranged: bool = False  # a time that cannot be compared: the range from `low` to `high` is shown
@@ -75,6 +82,7 @@ class Row:
     kind: Kind = "measured"
     note: str = ""  # the meaning of the row, if its name does not say it
     runs: int = 0  # finished runs behind it
+    cite: str = ""  # key of the paper, cited in LaTeX
     ranked: bool = True  # False: a run behind it is unfinished, or the method knows the truth
 
 
@@ -120,8 +128,7 @@ class Table:
         lines = []
         if any(cell.tie for cell in self.cells):
             lines.append(
-                f"{TIE}: not significantly different from the best (paired bootstrap over the test images, "
-                "95 %)"
+                f"{TIE}: not significantly different from the best (paired t interval over test images, 95 %)"
             )
         shown = [e for row in self.rows for c, e in zip(self.columns, row.cells) if c.measure.quality]
         if any(not math.isnan(cell.spread) for cell in shown):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -10,7 +11,7 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.chosen_effects import MIXED
 from ambiguous_wild.harness.measures import Measure
 from ambiguous_wild.report.plain_formats import UNEQUAL
-from ambiguous_wild.report.table_layout import TIE, Row, Table, TableCell
+from ambiguous_wild.report.table_layout import DOUBTFUL, TIE, Row, Table, TableCell
 
 NEEDS = "% needs \\usepackage{booktabs,graphicx} and \\usepackage[table]{xcolor}"
 COLORS = (("awfirst", "1,0.75,0.75"), ("awsecond", "1,0.87,0.72"), ("awthird", "1,0.98,0.72"))
@@ -31,6 +32,7 @@ SPECIAL = {
     "↑": r"$\uparrow$",
     "↓": r"$\downarrow$",
     TIE: r"$\approx$",
+    DOUBTFUL: r"\dag{}",
     "–": "--",
     "—": "---",
 }
@@ -80,11 +82,12 @@ def _tabular(table: Table) -> list[str]:
             lines += ["\\midrule", f"{head}{{\\emph{{reported, not measured here}}}} \\\\"]
             before = row.kind
         cells = [_latex_cell(cell, column.measure) for column, cell in zip(table.columns, row.cells)]
-        lines.append(" & ".join([latex_text(row.name), *cells]) + r" \\")
+        cited = f"~\\cite{{{row.cite}}}" if row.cite else ""
+        lines.append(" & ".join([latex_text(row.name) + cited, *cells]) + r" \\")
     # these notes are printed, as they limit what a rank means; the others are comments
     below = [note for note in table.notes if note.startswith((UNEQUAL, MIXED))]
     if not table.title and any(cell.tie for cell in table.cells):  # a bare tabular has no caption
-        below.append(f"{TIE}: not significantly different from the best (paired bootstrap, 95 %).")
+        below.append(f"{TIE}: not significantly different from the best (paired t interval, 95 %).")
     width = f"\\multicolumn{{{len(table.columns) + 1}}}{{p{{\\linewidth}}}}"
     printed = [f"{width}{{\\footnotesize {latex_text(note)}}} \\\\" for note in below]
     return [*lines, "\\bottomrule", *printed, "\\end{tabular}}"]
@@ -96,7 +99,7 @@ def _caption(table: Table) -> str:
         first, second, third = (f"\\colorbox{{{c}}}{{{rank}}}" for (c, _), rank in zip(COLORS, RANKS))
         text += f" {first}, {second} and {third} of each column."
     if any(cell.tie for cell in table.cells):
-        text += " $\\approx$: not significantly different from the best (paired bootstrap, 95\\,\\%)."
+        text += " $\\approx$: not significantly different from the best (paired t interval, 95\\,\\%)."
     if any("\u00b1" in rest for rest in table.legend):
         text += f" $\\pm$: sample standard deviation over {table.spread_over}."
     if table.contradicts:
@@ -121,6 +124,7 @@ def _latex_cell(cell: TableCell, measure: Measure) -> str:
     if cell.state == "missing":
         return "--"
     text = latex_text(cell.text(measure)).replace("±", r"$\pm$").replace("inf", r"$\infty$")
+    text = re.sub(r"(?<!\w)-(?=\d)", "$-$", text)  # a minus, not a hyphen
     text += r"$^{\approx}$" if cell.tie else ""
     return text if cell.rank is None else f"\\cellcolor{{{COLORS[cell.rank - 1][0]}}}{text}"
 

@@ -19,6 +19,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.processes import python_meanwhile
+from ambiguous_wild.io.terminal import clock
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import how_often, one_thread
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -27,7 +28,9 @@ from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Cotangents
 
-COLD_S = 27  # seconds to compile all kernels, measured on two cores at 2.6 GHz
+COLD_IN_SAMPLES = (
+    77  # time to compile all kernels, in those of `_compile_sample`; 31.6 s of 0.41 s, two cores
+)
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,24 @@ def _cached() -> bool:
     return bool(adam.catch_up_all.compiled._cache._cache_file._load_index())
 
 
-def warm_up(announce: Callable[[str], None] = lambda text: None, helper: bool = False) -> float:
+def _compile_sample() -> float:
+    """Compile a small kernel, and keep it nowhere; returns the seconds, a measure of this machine."""
+    import numba
+
+    def sample(values, out):
+        for i in numba.prange(len(values)):
+            total = 0.0
+            for j in range(len(values)):
+                total += np.exp(-values[i] * values[j])
+            out[i] = np.sqrt(total)
+
+    for _ in range(2):  # the first compilation of a process also sets up the compiler
+        begin = time.perf_counter()
+        numba.njit("void(float32[::1], float32[::1])", parallel=True)(sample)
+    return time.perf_counter() - begin
+
+
+def warm_up(announce: Callable[[str], None] | None = None, helper: bool = False) -> float:
     """Run every kernel that most methods need on eight Gaussians; returns the seconds it took.
 
     Args:
@@ -156,7 +176,10 @@ def warm_up(announce: Callable[[str], None] = lambda text: None, helper: bool = 
     begin = time.perf_counter()
     with ExitStack() as stack:
         if not _cached():
-            announce(f"compiling CPU kernels (about {COLD_S} s, {how_often()})...")
+            if announce is not None:
+                expected_s = COLD_IN_SAMPLES * _compile_sample()
+                announce(f"compiling CPU kernels (about {expected_s:.0f} s, {how_often()})...")
+                stack.enter_context(clock("compiling", expected_s))
             if helper:
                 code = f"from {__name__} import warm_losses; warm_losses()"
                 stack.enter_context(python_meanwhile(code, finish=True))
@@ -199,7 +222,7 @@ def warm_losses() -> None:
     all_finite([tensor for _, tensor in gaussians.items()])
 
 
-def prepare_cpu(threads: int | None, say: Callable[[str], None] = lambda text: None) -> None:
+def prepare_cpu(threads: int | None, say: Callable[[str], None] | None = None) -> None:
     """Set the threads of the kernels and compile them, once per machine.
 
     Args:

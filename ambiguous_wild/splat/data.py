@@ -8,7 +8,7 @@ its photo is copied or read while the step before computes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol, overload
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.core.machine import usable_memory
+from ambiguous_wild.io.corrections import corrected
 from ambiguous_wild.io.images import as_float, load_image_codes, read_alpha, read_keep_map
 from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.splat.step import TrainData
@@ -27,10 +28,24 @@ RESIDENT = 0.25  # share of the memory; Gaussians, their moments, masks and gspl
 READY = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
 
 
-def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir: Path) -> TrainData:
+def load_train_data(
+    scene: Scene,
+    *,
+    device: torch.device,
+    seed: int,
+    cache_dir: Path,
+    corrections: Mapping[str, np.ndarray] | None = None,
+) -> TrainData:
     """Read the train photos and the user's own keep masks.
 
     Masks are put on the device, and photos too, unless they would fill it.
+
+    Args:
+        scene: the scene.
+        device: where it is trained.
+        seed: seed of the run.
+        cache_dir: folder for features and instance masks.
+        corrections: by photo, masks corrected by hand, see `io/corrections.py`.
 
     Raises:
         AwError: there is no train view, or a photo differs in size from its camera.
@@ -38,9 +53,12 @@ def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir:
     if not scene.train:
         raise AwError(f"scene {scene.root} has no training views: check train_list.txt")
     keeps: list[Tensor | None] = []
+    by_hand: list[Tensor | None] = []
     for view in scene.train:
         keep = load_keep(view, with_alpha="files" not in scene.info)
+        keep, hand = corrected(keep, (corrections or {}).get(view.name), view.camera)
         keeps.append(None if keep is None else torch.from_numpy(keep).to(device))
+        by_hand.append(None if hand is None else torch.from_numpy(hand).to(device))
     cameras = [view.camera for view in scene.train]
     return TrainData(
         scene=scene,
@@ -50,6 +68,7 @@ def load_train_data(scene: Scene, *, device: torch.device, seed: int, cache_dir:
         device=device,
         seed=seed,
         cache_dir=cache_dir,
+        by_hand=by_hand if corrections else (),
     )
 
 

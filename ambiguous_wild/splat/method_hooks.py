@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts, State
+from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.fields import Fields
@@ -163,8 +164,12 @@ class MaskPolicy:
         """
         return {}
 
+    def predict_with_reasons(self, step: Step) -> tuple[Tensor | None, MaskReasons | None]:
+        """Return `predict` at the photo's own size, and why regions are kept or masked, if it is known."""
+        return self.predict(step), None
+
     def explain(self, step: Step, x: int, y: int) -> list[str]:
-        """Return why the pixel in column x and row y of the photo is kept or masked, in lines."""
+        """Return what was measured at the pixel in column x and row y of the photo, in lines."""
         return []
 
     def draw(self, folder: Path) -> list[Path]:

@@ -111,6 +111,12 @@ class TrainConfig:
         if not 1 <= self.iterations <= 100_000_000:  # months on a GPU
             raise AwError(f"--iterations {self.iterations} is not from 1 to 100 000 000")
 
+    def share_done(self, iteration: int, elapsed_s: float) -> float:
+        """Return the share of the run done after these steps and seconds of training, in [0, 1]."""
+        if self.budget_s is not None:
+            return min(elapsed_s / self.budget_s, 1.0)
+        return min(iteration / self.iterations, 1.0)
+
 
 def cap(
     config: TrainConfig, schedule: Schedule, sizes: Sequence[tuple[int, int]], most: int, start: int = 0
@@ -150,9 +156,7 @@ class Pace:
 
     def progress(self, iteration: int, elapsed_s: float) -> float:
         """Return the share of the run done after these steps and seconds of training, in [0, 1]."""
-        if self.config.budget_s is not None:
-            return min(elapsed_s / self.config.budget_s, 1.0)
-        return min(iteration / self.config.iterations, 1.0)
+        return self.config.share_done(iteration, elapsed_s)
 
     def marks(self, count: int, iteration: int, elapsed_s: float) -> int:
         """Return how many of `count` evenly spaced marks are passed, the last at the end of the run."""

@@ -27,10 +27,13 @@ class TrainData:
     scene: Scene
     photos: Sequence[Tensor]  # one for each train view: [H, W, 3] float32 in [0, 1], sRGB, on `device`
     cameras: list[Camera]  # one for each train view, of the size of its photo
-    user_keep: list[Tensor | None]  # [H, W] float32, 1 = static; the capture's own masks
+    # [H, W] float32, 1 = static; the capture's own masks, with what was corrected by hand
+    user_keep: list[Tensor | None]
     device: torch.device
     seed: int
     cache_dir: Path  # features and instance masks that survive the run; shared between runs
+    # [H, W] float32, marked by hand: 1 = static, -1 = distractor, 0 = as masks say; empty = no photo was
+    by_hand: Sequence[Tensor | None] = ()
 
     @property
     def backend(self) -> Backend:

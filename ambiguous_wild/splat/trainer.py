@@ -75,6 +75,7 @@ class Trainer:
         self.setup_s = 0.0  # seconds before the first step, in the process that began the run
         # "hash" of the run's configuration and "about", its name; empty = unknown
         self.run_identity: dict[str, str] = {}
+        self.continues: frozenset[str] = frozenset()  # hashes of shorter runs whose checkpoint may be resumed
         self.iteration = 0
         self.timeline = Timeline()
         self._skipped: set[int] = set()  # views that were fully masked at some step
@@ -189,7 +190,7 @@ class Trainer:
             return False
         state = checkpoint.load(path)
         other = state.get("run", self.run_identity)  # checkpoints of earlier versions do not hold it
-        if self.run_identity and other != self.run_identity:
+        if self.run_identity and other != self.run_identity and other.get("hash") not in self.continues:
             raise AwError(
                 f"checkpoint {path} is of another run ({other.get('about')}, configuration "
                 f"{str(other.get('hash'))[:12]}), this one is {self.run_identity['about']}, configuration "
@@ -314,12 +315,16 @@ class Trainer:
         )
 
     def combine_user_keep(self, step: Step, keep: Tensor | None) -> Tensor | None:
-        """Multiply the policy's keep map by the capture's own mask, if there is one.
+        """Multiply the policy's keep map by the capture's own mask, and keep what a person marked as static.
 
         Raises:
             AwError: the policy's map is no tensor, or its values are out of range.
         """
         check_keep(keep, read=self.device_check is None)
+        by_hand = self.data.by_hand[step.view] if self.data.by_hand else None
+        if keep is not None and by_hand is not None:
+            static = shrink_keep((by_hand > 0).float(), step.downsampling) > 0.5
+            keep = torch.where(static, torch.ones_like(keep), keep)
         user = self.data.user_keep[step.view]
         if user is None:
             return keep

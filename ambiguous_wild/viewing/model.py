@@ -18,6 +18,7 @@ from ambiguous_wild.io.splat_files import read_splats
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.gaussians import Gaussians
+    from ambiguous_wild.splat.rendered import Rendered
 
 AXES = {
     sign + axis: (-1.0 if sign else 1.0) * row for sign in ("", "-") for axis, row in zip("xyz", np.eye(3))
@@ -78,11 +79,14 @@ class ViewedModel:
     ply: Path
     render_settings: RenderSettings = field(default_factory=RenderSettings)
     psnr: Mapping[str, float] = field(default_factory=dict)  # dB by name of the test view
-    masks: Path | None = None  # folder of keep maps of train views, white = keep
+    # keep maps of train views: a folder of PNGs (white = keep), or [H, W] bool by name of the view (1 = keep)
+    masks: Path | Mapping[str, np.ndarray] | None = None
+    reasons: Path | None = None  # reasons.json of the run: why regions are masked or kept
+    retrain: str = ""  # command that trains it longer with the corrections.json of the page
     reference: bool = False  # trained with exact masks or clean photos, so it does not compete
     splats: SplatFile | None = field(
         default=None, repr=False, compare=False
-    )  # content of `ply` if it is a splat file and not a run's model
+    )  # content of `ply` if it is a splat file, or a model that is still trained, and not a run's
 
     def read(self) -> dict[str, np.ndarray]:
         """Read the Gaussians, in the coordinates of `transform`.
@@ -194,13 +198,17 @@ class Renderer:
 
     def __call__(self, camera: Camera) -> np.ndarray:  # [H, W, 3] uint8
         """Render the picture that a camera sees, as a run writes it to PNG."""
+        return to_uint8(self.frame(camera).image.numpy())
+
+    def frame(self, camera: Camera) -> Rendered:
+        """Render picture, alpha and depth of a camera."""
         import torch
 
         from ambiguous_wild.splat.render import render
 
         settings = self._render_settings
         with torch.no_grad():
-            drawn = render(
+            return render(
                 self._gaussians,
                 camera,
                 sh_degree=min(settings.sh_degree, self._gaussians.sh_degree),
@@ -208,7 +216,6 @@ class Renderer:
                 antialias=settings.antialias,
                 blur=settings.blur,
             )
-        return to_uint8(drawn.image.numpy())
 
 
 def upright(model: ViewedModel, space: Space, axis: str) -> SceneTransform:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +16,8 @@ from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.io.files import check_output, refuse_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.mask_reasons import WIDTH as REASONS_WIDTH
+from ambiguous_wild.io.mask_reasons import read_reasons, regions_uri
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.scene_folder import MAP
@@ -29,15 +33,21 @@ MAX_PHOTO_BYTES = 1_000_000  # text of all photos and of the map
 MAX_MAP_BYTES = 200_000
 MAX_POINTS = 20_000  # moving and static features of all photos
 MAX_MASK_BYTES = 300_000  # text of the masks of all models
+MAX_REASON_BYTES = 200_000  # text of the maps of reasons of all models that have any
 _SPZ = FORMATS["spz"]  # the format that the page's renderer reads
-SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_main.js")
+SCRIPTS = ("page_data.js", "page_camera.js", "page_panes.js", "page_masks.js", "page_main.js")
 _HERE = Path(__file__).resolve().parent / "page"
 WIDTHS = (640, 480, 360, 240, 160, 96, 64)  # px, tried from the largest
 MAP_WIDTHS = (1300, 1000, 800)  # px
 _QUALITY = 78
 _MASK_WIDTH = 480  # px; largest width of masks
+PHOTO = "photo"  # in place of the index of a model
+_PREFERRED = "refinesplat"  # shown first among methods with masks
+_MOST_REMOVED = 0.5  # larger shares of a photo are no distractor, but a mask gone wrong
 _NEAR = 0.01  # nearest depth, as in training
 _MARGIN = 0.15  # share of the picture beyond each side that is still counted
+
+Source = TypeVar("Source")
 
 
 @dataclass(frozen=True)
@@ -71,9 +81,15 @@ def page_text(
     title: str,
     most_gaussians: int = MAX_GAUSSIANS,
     notes: Sequence[str] = (),
+    mixed: str = "",
+    next_steps: Sequence[str] = (),
+    training: str = "",
+    reload_s: float = 0.0,
     say: Callable[[str], None] = lambda text: None,
 ) -> tuple[str, int]:
     """Return the page's text, and the bytes of models in it.
+
+    A page that is written again and again while a run trains costs little: photos are encoded once.
 
     Args:
         scene: scene of all the models.
@@ -81,6 +97,12 @@ def page_text(
         title: title of the page; any text.
         most_gaussians: a larger model is reduced to this number, with a note.
         notes: lines below the models.
+        mixed: why test photos may hold distractors; "" = they are clean. Their PSNR then decides nothing.
+        next_steps: lines of the panel "What next"; text between two ` is a command or a path.
+        training: how far the training is, if it goes on, as a sentence; "" = it has ended.
+        reload_s: seconds after which the page loads itself again, counted from when its models are drawn;
+            0 = never. It waits while somebody moves the camera or has something that is not saved, and stops
+            after ten times in which `training` did not change.
         say: called with a line for each model.
 
     Raises:
@@ -90,6 +112,10 @@ def page_text(
         raise AwError("no model to show")
     views = (*scene.test, *scene.train)
     page_notes, elements, facts = list(notes), [], []
+    if mixed:
+        page_notes.insert(0, f"* PSNR here rewards ghosts: {mixed}")
+    explained = sum(model.reasons is not None for model in models)
+    shares = MAX_MASK_BYTES // len(models), MAX_REASON_BYTES // max(explained, 1)
     for number, model in enumerate(models):
         say(f"{model.label}: {model.count:,} Gaussians")
         gaussians = model.read()
@@ -111,7 +137,8 @@ def page_text(
         elements.append(
             f'<script id="{element}" type="text/plain">{base64.b64encode(packed).decode("ascii")}</script>'
         )
-        facts.append(_model_facts(model, element, views, scene.train, MAX_MASK_BYTES // len(models)))
+        facts.append(_model_facts(model, element, views, scene.train, shares))
+        facts[-1]["whole"] = shown == given
     for line in page_notes:
         say(line)
     space = space_of(scene)
@@ -120,8 +147,12 @@ def page_text(
         drawn = Renderer(models[0].read(), models[0].render_settings)
         uris = [data_uri("jpeg", jpeg_bytes(narrowed(drawn(v.camera), WIDTHS[1]), _QUALITY)) for v in views]
     else:
-        uris = photo_uris(views, MAX_PHOTO_BYTES - len(capture_map))
+        files = tuple((v.image_path, _changed_ns(v.image_path)) for v in views)
+        uris = _encoded_photos(files, MAX_PHOTO_BYTES - len(capture_map))
     data = {
+        "scene": scene.name,
+        "mixed": bool(mixed),
+        "opening": opening(models, scene, mixed=bool(mixed)),
         "up": space.up.tolist(),
         "middle": space.middle.tolist(),
         "extent": space.extent,
@@ -132,6 +163,9 @@ def page_text(
         "map": capture_map,
         "models": facts,
         "notes": page_notes,
+        "next": list(next_steps),
+        "training": training,
+        "reload_s": reload_s,
     }
     return _fill(title, data, "\n".join(elements)), sum(map(len, elements))
 
@@ -153,7 +187,11 @@ def _rounding_cost(
 
 
 def _model_facts(
-    model: ViewedModel, element: str, views: Sequence[View], train: Sequence[View], most_mask_bytes: int
+    model: ViewedModel,
+    element: str,
+    views: Sequence[View],
+    train: Sequence[View],
+    most_bytes: tuple[int, int],
 ) -> dict[str, object]:
     psnr = {v.name: model.psnr[v.name] for v in views if np.isfinite(model.psnr.get(v.name, np.nan))}
     return {
@@ -165,8 +203,68 @@ def _model_facts(
         "background": list(model.render_settings.background),
         "psnr": psnr,
         "mean": sum(psnr.values()) / len(psnr) if psnr else None,
-        "masks": {} if model.masks is None else mask_uris(model.masks, train, most_mask_bytes),
+        "masks": {} if model.masks is None else mask_uris(model.masks, train, most_bytes[0]),
+        "reasons": {} if model.reasons is None else _reason_facts(model.reasons, train, most_bytes[1]),
+        "retrain": model.retrain,
     }
+
+
+def _reason_facts(path: Path, train: Sequence[View], most_bytes: int) -> dict[str, object]:
+    read = read_reasons(path)
+    shown = {view.name: read[view.name] for view in train if view.name in read}
+    maps = [reasons.regions for reasons in shown.values()]
+    widths = [width for width in WIDTHS if width <= REASONS_WIDTH]
+    uris = _as_wide_as_fits(regions_uri, maps, widths, most_bytes)
+    return {
+        name: {"regions": uri, "sentences": reasons.sentences}
+        for (name, reasons), uri in zip(shown.items(), uris)
+    }
+
+
+def opening(models: Sequence[ViewedModel], scene: Scene, *, mixed: bool) -> dict[str, object]:
+    """Choose what the page opens with: where a method that masks distractors removed most, if one does.
+
+    Returns:
+        `left` and `right`, indices of models or "photo"; `view`, an index among test and train views, or
+        None; `place`, x and y of the upper edge of what was removed as shares of the photo, or None.
+    """
+    masking = [n for n, model in enumerate(models) if model.masks is not None and not model.reference]
+    masking.sort(key=lambda n: not models[n].label.startswith(_PREFERRED))
+    for right in masking:
+        masks = models[right].masks
+        assert masks is not None
+        shares = {name: 1.0 - float(keep.mean()) for name, keep in _keep_maps(masks, scene.train)}
+        shares = {name: share for name, share in shares.items() if 0.0 < share <= _MOST_REMOVED}
+        if shares:
+            name = max(shares, key=lambda n: shares[n])
+            ((_, keep),) = _keep_maps(masks, [view for view in scene.train if view.name == name])
+            view = len(scene.test) + [view.name for view in scene.train].index(name)
+            others = sorted(
+                set(range(len(models))) - {right}, key=lambda n: (models[n].reference, n in masking)
+            )
+            left = others[0] if others else PHOTO
+            return {"left": left, "right": right, "view": view, "place": _top_of_largest(~keep)}
+    means = [_mean_psnr(model) if not mixed else 0.0 for model in models]
+    best = max(range(len(models)), key=lambda n: (not models[n].reference, means[n]))
+    # the test photo that the best model knows best
+    known = {view.name: max(m.psnr.get(view.name, -np.inf) for m in models) for view in scene.test}
+    view = max(range(len(scene.test)), key=lambda n: 0.0 if mixed else known[scene.test[n].name], default=0)
+    left = next((n for n in range(len(models)) if n != best), best)
+    return {"left": left, "right": best if left != best else PHOTO, "view": view, "place": None}
+
+
+def _mean_psnr(model: ViewedModel) -> float:
+    finite_values = [value for value in model.psnr.values() if np.isfinite(value)]
+    return float(np.mean(finite_values)) if finite_values else -100.0
+
+
+def _top_of_largest(masked: np.ndarray) -> list[float]:
+    """Return x and y of the upper edge's middle of the largest region [H, W] bool, as shares of the photo."""
+    import cv2
+
+    _, _, stats, _ = cv2.connectedComponentsWithStats(masked.astype(np.uint8))
+    left, top, width, _, _ = stats[1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])].tolist()
+    return [(left + width / 2) / masked.shape[1], top / masked.shape[0]]
 
 
 def _points(scene: Scene, views: Sequence[View]) -> list[list[int]]:
@@ -218,12 +316,22 @@ def _fill(title: str, data: Mapping[str, object], models: str) -> str:
     )
 
 
-def photo_uris(views: Sequence[View], most_bytes: int) -> list[str]:
+def photo_uris(paths: Sequence[Path], most_bytes: int) -> list[str]:
     """Return a data: address of each photo as JPEG, at the largest width at which all fit `most_bytes`.
 
     1000 photos or more can exceed it at the smallest width. One photo is in memory at a time.
     """
-    return _as_wide_as_fits(_photo, [view.image_path for view in views], WIDTHS, most_bytes)
+    return _as_wide_as_fits(_photo, paths, WIDTHS, most_bytes)
+
+
+def _changed_ns(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.is_file() else 0
+
+
+@lru_cache(maxsize=1)
+def _encoded_photos(files: tuple[tuple[Path, int], ...], most_bytes: int) -> list[str]:
+    """Return `photo_uris` of files and their times of change, from memory for the last page's photos."""
+    return photo_uris([path for path, _ in files], most_bytes)
 
 
 def map_uri(path: Path) -> str:
@@ -231,26 +339,49 @@ def map_uri(path: Path) -> str:
     return _as_wide_as_fits(_photo, [path], MAP_WIDTHS, MAX_MAP_BYTES)[0] if path.is_file() else ""
 
 
-def mask_uris(folder: Path, views: Sequence[View], most_bytes: int) -> dict[str, str]:
-    """Return a data: address of each keep map in `folder` as black-and-white PNG, by view name.
+def mask_uris(
+    masks: Path | Mapping[str, np.ndarray], views: Sequence[View], most_bytes: int
+) -> dict[str, str]:
+    """Return a data: address of each keep map as black-and-white PNG, by view name.
 
     They have the largest width at which all fit `most_bytes` of text.
+
+    Args:
+        masks: folder of the maps, or the maps by name of the view; see `ViewedModel.masks`.
+        views: views whose maps are wanted, where there are any.
+        most_bytes: limit of all addresses together.
     """
-    paths = {view.name: folder / Path(view.name).with_suffix(".png") for view in views}
-    files = {name: path for name, path in paths.items() if path.is_file()}
+    sources = _mask_sources(masks, views)
     widths = [width for width in WIDTHS if width <= _MASK_WIDTH]
-    return dict(zip(files, _as_wide_as_fits(_mask, list(files.values()), widths, most_bytes)))
+    return dict(zip(sources, _as_wide_as_fits(_mask, list(sources.values()), widths, most_bytes)))
+
+
+def _mask_sources(
+    masks: Path | Mapping[str, np.ndarray], views: Sequence[View]
+) -> dict[str, Path | np.ndarray]:
+    if not isinstance(masks, Path):
+        return {view.name: masks[view.name] for view in views if view.name in masks}
+    paths = {view.name: masks / Path(view.name).with_suffix(".png") for view in views}
+    return {name: path for name, path in paths.items() if path.is_file()}
+
+
+def _keep_maps(
+    masks: Path | Mapping[str, np.ndarray], views: Sequence[View]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield name and keep map [H, W] bool of the views that have one."""
+    for name, keep in _mask_sources(masks, views).items():
+        yield name, (read_gray(keep) if isinstance(keep, Path) else keep * np.uint8(255)) > 127
 
 
 def _as_wide_as_fits(
-    uri: Callable[[Path, int], str], paths: Sequence[Path], widths: Sequence[int], most_bytes: int
+    uri: Callable[[Source, int], str], sources: Sequence[Source], widths: Sequence[int], most_bytes: int
 ) -> list[str]:
     """Return the addresses at the first width at which they fit, else at the last one."""
     uris: list[str] = []
     for width in widths:
         uris, size = [], 0
-        for path in paths:
-            uris.append(uri(path, width))
+        for source in sources:
+            uris.append(uri(source, width))
             size += len(uris[-1])
             if size > most_bytes and width != widths[-1]:
                 break
@@ -263,10 +394,11 @@ def _photo(path: Path, width: int) -> str:
     return data_uri("jpeg", jpeg_bytes(narrowed(read_png_rgb(path), width), _QUALITY))
 
 
-def _mask(path: Path, width: int) -> str:
+def _mask(keep: Path | np.ndarray, width: int) -> str:
     import cv2
 
-    black_and_white = ((narrowed(read_gray(path), width) > 127) * 255).astype(np.uint8)
+    gray = read_gray(keep) if isinstance(keep, Path) else keep.astype(np.uint8) * 255
+    black_and_white = ((narrowed(gray, width) > 127) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_PNG_BILEVEL, 1]
     return data_uri("png", bytes(cv2.imencode(".png", black_and_white, options)[1]))
 

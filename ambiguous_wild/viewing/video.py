@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -271,20 +272,29 @@ def write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> int:
 
     Raises:
         AwError: this OpenCV has no such encoder.
+        KeyboardInterrupt: it was interrupted; the message says that NAME-part.mp4 has the frames until then.
     """
     import cv2
 
     with atomic_path(path) as temporary:
-        writer, count = None, 0
+        writer, count, interrupted = None, 0, False
         try:
             for frame in frames:
                 if writer is None:
                     writer = _open(temporary, path, frame, fps)
                 writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
                 count += 1
+        except KeyboardInterrupt:
+            interrupted = True
         finally:
             if writer is not None:
                 writer.release()
+        if interrupted:
+            part = path.with_name(f"{path.stem}-part{path.suffix}")
+            if count:
+                shutil.copyfile(temporary, part)
+            kept = f"the first {count} frames are in {part}" if count else "no frame was finished"
+            raise KeyboardInterrupt(f"interrupted: {kept}")
         if not count or temporary.stat().st_size == 0:
             raise AwError(f"cannot write {path}: the encoder wrote nothing")
     return count

@@ -88,6 +88,14 @@ def test_a_stranger_does_not_hang_together_and_a_copy_is_a_duplicate(
     assert found["near-duplicates"].photos == ("p08.png",)
 
 
+def test_few_pairs_that_overlap_are_counted(clean: list[np.ndarray], tmp_path: Path) -> None:
+    strangers = [cv2.resize(texture(20 + k), (320, 240)) for k in range(5)]
+    few = checks(tmp_path / "few", [*clean[:3], *strangers])["overlap"]
+    assert few.finding.endswith("; most pairs share too few features (3 of 28 share enough)")
+    none = checks(tmp_path / "none", strangers)["overlap"].finding
+    assert none.endswith("none will be placed; most pairs share too few features (0 of 10 share enough)")
+
+
 @pytest.mark.parametrize("step", [0.12, 0.3])
 def test_walking_where_one_looks_is_told(step: float, tmp_path: Path) -> None:
     ahead = [render(np.array([0.0, 0.0, step * k]), np.array([0.0, 0.0, 5.2])) for k in range(6)]

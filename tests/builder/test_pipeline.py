@@ -31,6 +31,7 @@ def hashes(scene: Path) -> dict[str, str]:
     }
     info = json.loads((scene / "scene.json").read_text())
     info.pop("seconds")
+    info.pop("capture")  # the way from the scene to its photos
     return {**found, "scene.json": json.dumps(info)}
 
 
@@ -100,7 +101,8 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
     assert list(info) == [
         "schema", "schema_version", "name", "license", "factor", "images", "split", "seed", "settings",
         "chosen", "counts", "reprojection_error_px", "mean_track_length", "cameras", "lost", "skipped",
-        "warnings", "photos", "masks", "fixed_to_camera", "truth", "build_key", "inputs", "seconds", "files",
+        "warnings", "photos", "masks", "fixed_to_camera", "truth", "build_key", "inputs",
+        "capture", "seconds", "files",
     ]  # fmt: skip
     assert set(info) == SceneRecord.__required_keys__
     assert list(info["inputs"]) == ["photos", "masks", "truth", "test_list", "settings", "versions"]
@@ -110,7 +112,8 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
         "points_of_track_length_2", "pairs", "pairs_verified", "features_that_stay",
         "features_that_move",
     ]  # fmt: skip
-    assert list(info["cameras"][0]) == ["photos", "focal_px", "focal_sd_px"]
+    lens = ["model", "width", "height", "params"]
+    assert list(info["cameras"][0]) == ["photos", "focal_px", "focal_sd_px", *lens]
     assert list(info["photos"]["p01.png"]) == [
         "source", "sha256", "split", "width", "height", "sharpness", "mean_luma", "features", "partners",
         "provisional", "notes", "exif",

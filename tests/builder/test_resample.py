@@ -17,7 +17,6 @@ from ambiguous_wild.builder.resample import (
     downsample_mask,
     downsample_photo,
     downsampled_size,
-    make_lens,
     resample,
 )
 from ambiguous_wild.core import AwError
@@ -25,6 +24,7 @@ from ambiguous_wild.datasets.imported_photos import resized
 from ambiguous_wild.io.colmap_model import read_model, write_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
+from ambiguous_wild.io.lens import make_lens
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from tests.builder.capture_maker import render
 from tests.io.model_maker import make_model

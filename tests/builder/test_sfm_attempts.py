@@ -52,7 +52,9 @@ def attempts(
 
     monkeypatch.setattr(Stages, "_attempt", attempt)
     screened = SimpleNamespace(facts={"skipped": []})
-    self = Stages(SimpleNamespace(), BuildSettings(part=part), None, None, 1, Bar(enabled=False), False)
+    self = Stages(
+        SimpleNamespace(), BuildSettings(part=part), None, None, Path("scene"), 1, Bar(enabled=False), False
+    )
     one = ScreenedPhoto("p.jpg", "p.jpg", width=1000, height=800)
     return tried, self._sfm(SimpleNamespace(), screened, [one] * photos, None).mapping.facts["plan"]
 

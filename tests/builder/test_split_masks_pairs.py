@@ -41,6 +41,11 @@ def test_folders_split_and_a_lost_test_photo_is_said():
     assert split.warnings == ["1 of 3 test photos are lost: scores cover 2"]
 
 
+def test_all_photos_are_trained_on_request():
+    split = split_photos(photos_of(sides=["test"] * 3 + ["train"] * 7), ALL, set())
+    assert (split.how, split.test, len(split.train), split.warnings) == ("none", [], 10, [])
+
+
 def test_all_test_photos_lost_is_an_error():
     sides = ["test"] * 3 + ["train"] * 7
     with pytest.raises(AwError, match="none of the 3 test photos"):

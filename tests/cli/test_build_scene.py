@@ -80,8 +80,18 @@ def test_copies_of_one_photo_are_used_once(tmp_path):
     ("photos", "word"), [(3, "few photos, about 20 are needed"), (19, "few photos"), (20, "ready")]
 )
 def test_the_verdict_says_whether_the_photos_are_enough(photos, word):
-    counts = {"registered": photos, "photos": photos, "points": 900}
+    counts = {"registered": photos, "photos": photos, "readable": photos, "points": 900}
     line = verdict(
         {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1}, (4, 3), Path("s")
     )
     assert word in line and ("ready" in line) == (photos >= 20)
+
+
+@pytest.mark.parametrize(("placed", "missing"), [(13, 11), (24, None), (20, None)])
+def test_the_verdict_says_that_much_of_a_walk_is_missing(placed, missing):
+    counts = {"registered": placed, "photos": 24, "readable": 24, "points": 900}
+    line = verdict(
+        {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1}, (4, 3), Path("s")
+    )
+    told = f"not whole: what the {missing} photos left out show is missing"
+    assert (told in line) == (missing is not None) == ("ready" not in line)

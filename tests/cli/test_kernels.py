@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+import sys
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 from ambiguous_wild.cli import build_scene as kernels
+from ambiguous_wild.splat import calibration
+from tests.command_line import Terminal
 
 
 @pytest.fixture
@@ -39,3 +43,16 @@ def test_what_compiles_beside_a_command_can_be_imported(code):
     assert lines
     for line in lines:
         exec(line, {})
+
+
+def test_the_time_of_compiling_is_measured_here_and_a_clock_runs(monkeypatch):
+    monkeypatch.setattr(calibration, "_cached", lambda: False)
+    monkeypatch.setattr(calibration, "COLD_IN_SAMPLES", 1000.0)
+    monkeypatch.setattr(sys, "stderr", shown := Terminal())
+    said = []
+    calibration.warm_up(said.append)
+    (seconds,) = re.findall(r"^compiling CPU kernels \(about (\d+) s, once per machine", said[0])
+    assert len(said) == 1 and 20 < int(seconds) < 60_000  # a sample takes from 20 ms to a minute
+    assert "compiling [00:0" in shown.getvalue() and shown.left().strip() == ""
+    calibration.warm_up()  # nobody is told
+    assert shown.getvalue().count("compiling [00:00 of") == 1

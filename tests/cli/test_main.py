@@ -8,16 +8,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import cv2
 import numpy as np
 import pytest
 
 from ambiguous_wild import __version__
 from ambiguous_wild.cli.main import COMMANDS
-from ambiguous_wild.cli.options import say
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.weight_files import read_tensors
+from ambiguous_wild.io.terminal import say
 from tests.command_line import aw
+from tests.harness.fake_runs import fake_result, save
 
 
 def test_help_lists_every_command_and_version_prints() -> None:
@@ -58,6 +60,29 @@ def test_a_closed_or_full_output_is_no_traceback(line: str, code: int, expected:
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=tmp_path, env=env)
     assert done.returncode == code and expected in done.stderr and done.stderr.count("\n") <= 1, done.stderr
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "methods", "methods refinesplat", "weights list", "fetch", "simulate", "plan none", "screen none",
+        "leaderboard --help", "bench --help", "table {runs}", "table {runs} --metric all",
+        "cost {runs} -o {out}",
+        "export {runs}",
+    ],
+)  # fmt: skip
+def test_no_word_is_broken_at_80_columns(line: str, tmp_path: Path) -> None:
+    runs = save(tmp_path / "runs", *(fake_result(m, seed=s) for m in ("3dgs", "refinesplat") for s in (0, 1)))
+    words = line.format(runs=runs, out=tmp_path / "cost").split()
+    whole, narrow = aw(*words), aw(*words, columns=80)
+    out, err = click.unstyle(narrow.stdout), click.unstyle(narrow.stderr)
+    for text in (out, err):
+        for shown in text.splitlines():
+            # paths and commands are never broken, and every column of a table was asked for
+            long = "aw " in shown or "/" in shown or "--metric" in line
+            assert (len(shown) <= 80 or long) and "\\n" not in shown, shown
+    if words[0] not in ("table", "cost", "methods") and "--help" not in words:  # these choose other columns
+        assert (out.split(), err.split()) == (whole.stdout.split(), whole.stderr.split())
 
 
 @pytest.mark.parametrize("value", ["abc", "0", "-1", "1.5"])

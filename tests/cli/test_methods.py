@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
@@ -51,6 +52,13 @@ def test_a_method_in_full_says_what_differs_and_its_options() -> None:
     assert "features=labhog" in out and "upper=0.9" in out and "density.free_colour=8002" in out
     line = next(row for row in out.splitlines() if "upper=0.9" in row)
     assert "published also 0.8" in line
+
+
+def test_papers_have_keys_for_a_bibliography() -> None:
+    assert "\\cite{fu2025robustsplat}" in " ".join(shown("robustsplat").split())
+    keys = {entry.name: entry.cite for entry in registry.BUILTIN if entry.cite}
+    assert all(re.fullmatch(r"[a-z]+20\d\d[a-z0-9]+", key) for key in keys.values())
+    assert {entry.name for entry in registry.BUILTIN if "arXiv" in entry.paper} - keys.keys() == {"uad"}
 
 
 def test_every_builtin_method_is_described_in_full() -> None:

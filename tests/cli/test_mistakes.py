@@ -38,13 +38,14 @@ MISTAKES = [
     (f"{BENCH} refinsplat", "did you mean 'refinesplat'"),
     (f"{BENCH} 3dgs --iterations 5 --budget 1m", "exclude each other"),
     (f"{BENCH} 3dgs --iterations 0", "--iterations"),
-    (f"{BENCH} 3dgs --iterations 10k", "'10k' is not a whole number"),
+    (f"{BENCH} 3dgs --iterations 10kk", "'10kk' is not a whole number"),
+    (f"{BENCH} 3dgs, refinesplat", "write 3dgs,refinesplat without a space"),
     (f"{BENCH} 3DGS --seed 2 refinesplat", "did you mean --method refinesplat?"),
     (f"{BENCH} 3dgs ./other", "did you mean --scene ./other?"),
     (f"{BENCH} mine:trimmed", "write FILE.py:RECIPE, as mine.py:trimmed"),
     (f"{BENCH} 3dgs,refinsplat", "unknown method 'refinsplat': did you mean 'refinesplat'"),
     (f"{BENCH} own.py", "error: own.py is a file: add the name of a recipe in it: own.py:chroma\n"),
-    (f"{BENCH} 3dgs --overwrite perhaps", "'never', 'missing', 'changed', 'always'"),
+    (f"{BENCH} 3dgs --overwrite perhaps", "'never', 'missing', 'longer', 'changed', 'always'"),
     (f"{BENCH} 3dgs --itterations 5", "--iterations"),
     (f"{BENCH} refinesplat --set refinesplat.lamda_cr=1", "did you mean 'lambda_cr'"),
     (f"{BENCH} refinesplat --set refinesplat.lambda_dssim=nan", "finite"),
@@ -62,6 +63,16 @@ MISTAKES = [
     (f"{BENCH} 3dgs --effects gone.json", "there is no plan gone.json"),
     (f"{BENCH} 3dgs --effects gone.json --effects auto", "gone.json is a plan, and auto"),
     ("bench --method 3dgs --scene nothing -o out", "there is no scene folder"),
+    ("bench --method 3dgs --scene scenee -o out", "no scene folder scenee; did you mean scene?"),
+    ("bench --method 3dgs --scene above -o out", "above is no scene; did you mean above/scene?"),
+    ("try rwa -o out", "'rwa' does not exist; did you mean raw?"),
+    ("table run", "no folder of runs run ... did you mean runs?"),
+    ("view run", "no folder of runs run ... did you mean runs?"),
+    ("view above/scene", "above/scene is a scene, which 'aw bench"),
+    ("capture rwa -o out", "did you mean raw?"),
+    ("import rwa -o out", "did you mean ... /raw?"),
+    ("build-scene rwa -o out", "capture rwa does not exist; did you mean raw?"),
+    ("export runs --format splat", "'splat' is not supported ... --format spz"),
     ("bench --method 3dgs --scene scene --iterations 5 -o file", "file"),
     ("bench --method 3dgs --scene scene --iterations 5 -o file/deeper", "file"),
     ("plan scene -o scene/plan.json", "would change the scene"),
@@ -94,12 +105,22 @@ MISTAKES = [
     ("stress -o t.pdf", "end the name in .txt, .md, .json"),
     ("table runs --metric nope", "unknown metric 'nope': the nearest of ... 'aw table RUNS' shows"),
     ("table runs --metric all --metric psnr", "leave the other --metric out"),
-    ("table runs --sheet sheet.txt", "ends in .png or .jpg"),
     ("table runs --reported", "--layout paper"),
     ("table runs --layout paper --reported nowhere", "no reported numbers in nowhere"),
     ("table runs --layout paper --dataset D", "NAME=SCENE"),
     ("table runs --layout ablation --only yard", "--only does not go"),
     ("table runs --layout ablation", "aw ablate"),
+    ("figure runs", "Missing option '-o'"),
+    ("figure runs -o figure.txt", "no format is known for .txt: end the name in .pdf, .png, .svg"),
+    ("figure runs -o figure", "error: -o figure: end the name in .pdf, .png, .svg"),
+    ("figure empty -o figure.pdf", "no run in empty"),
+    ("figure runs -o figure.pdf --only yrd", "unknown scene 'yrd': did you mean 'yard'?"),
+    ("figure runs -o figure.pdf --label mine=Ours", "unknown method 'mine'"),
+    ("figure runs -o figure.pdf --inches 0", "--inches"),
+    *((f"figure runs -o figure.pdf --crop {crop}", "write X,Y,W,H with the upper left corner first")
+      for crop in ("1,2,3", "a,b,c,d", "1,2,nan,4", "nothing")),
+    ("figure runs -o figure.pdf --crop none --crop none", "--crop is given 2 times and --photo 0 times"),
+    ("figure runs -o figure.pdf", "no config.yaml that names its scene"),
     ("video empty --fps nan", "--fps"),
     ("video empty --seconds nan", "--seconds"),
     ("video empty --seconds inf", "--seconds"),
@@ -181,6 +202,8 @@ def here(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "own.py").write_text(OWN)
     save(root / "runs", fake_result("3dgs"))
     (root / "scene").symlink_to(scene)
+    (root / "above").mkdir()
+    (root / "above" / "scene").symlink_to(scene)
     (root / "link").symlink_to(scene)
     (root / "to-raw").symlink_to("raw")
     for name in ("pipe", "pipe.png"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import re
 import signal
 import sys
@@ -12,25 +11,10 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.cli import main, run_progress
-from tests.command_line import aw
+from tests.command_line import Terminal, aw
 from tests.tiny_scene import write_tiny_scene
 
 LENGTH = 30
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-    def left(self) -> str:
-        """What still stands there: after a carriage return a line is written over."""
-        lines = []
-        for line in self.getvalue().split("\n"):
-            shown = ""
-            for piece in line.split("\r"):
-                shown = piece + shown[len(piece) :]
-            lines.append(shown.rstrip())
-        return "\n".join(lines)
 
 
 @pytest.fixture
@@ -54,6 +38,19 @@ def test_a_bar_says_what_is_done_and_goes(words: list[str], monkeypatch: pytest.
     phases = ["finding start points: ", "training: ", r"measuring \d+ test views: 100%", "drawing masks"]
     assert re.search(".*".join(phases), shown.getvalue(), re.DOTALL)
     assert "|" not in shown.left() and "PSNR" in shown.left()
+
+
+def test_set_up_has_a_clock_of_its_own_and_the_end_of_a_budget_is_known(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = seen([*words, "--effects", "none"], monkeypatch).getvalue()
+    begun = shown.index("training: ")
+    assert "setting up: [00:00]" in shown[:begun] and "%" not in shown[:begun]
+    assert re.search(r"training: +0%\|.*\| 0/30it \[00:00<\?, \d+ ms/it, 400 Gaussians", shown)
+    budget = [*words[: words.index("--iterations")], "--budget", "1s", "--seed", "1", "--effects", "none"]
+    shown = seen(budget, monkeypatch).getvalue()
+    assert "setting up: [00:00, then 00:01 of training]" in shown
+    assert re.search(r"training: .*/100% \[00:00, 00:0[01] left, \d+ ms/it", shown) and "?" not in shown
 
 
 STOPPING = "stopping: the model is measured and saved, Ctrl-C again to quit"

@@ -80,7 +80,7 @@ def test_csv_is_clean_and_notes_go_to_standard_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("style", ["text", "markdown", "latex", "html"])
-@pytest.mark.parametrize("layout", ["paper", "means", "memory", "blocks"])
+@pytest.mark.parametrize("layout", ["paper", "means", "blocks"])
 def test_the_command_stands_under_every_table(layout: str, style: str, tmp_path: Path) -> None:
     runs = save(tmp_path, *(fake_result(m, s) for m in ("3dgs", "b") for s in ("one", "two")))
     out, err = aw_table(runs, "--layout", layout, "--format", style, "--metric", "psnr")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.harness.store import known_iterations
+from ambiguous_wild.cli.try_all import SHORTEST_S, train_within
+from ambiguous_wild.harness.result_file import read_result
 from tests.builder.capture_maker import write_capture
 from tests.command_line import aw
 
@@ -18,22 +20,72 @@ def _commands(text: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_photos_become_a_table_and_a_page(tmp_path: Path) -> None:
+def test_photos_become_a_page_that_a_larger_budget_continues(tmp_path: Path) -> None:
     raw, out = tmp_path / "walls", tmp_path / "out"
     write_capture(raw, 8)
-    words = ("try", raw, "-o", out, "--budget", "20s", "--threads", "1")
-    done = aw(*words)
+    words = ("try", raw, "-o", out, "--threads", "1")
+    done = aw(*words, "--budget", "20s")
     assert done.returncode == 0, done.stderr
-    wanted = ["screen", "build-scene", "plan", "bench", "view", "table"]
-    assert _commands(done.stderr) == wanted
-    assert (out / "view/index.html").is_file() and (out / "comparison.png").is_file()
+    assert _commands(done.stderr) == ["screen", "build-scene", "plan", "bench", "view"]
+    page, run = out / "view/index.html", out / "runs/walls/refinesplat/seed0"
+    assert f"look at it while it trains: {page}" in done.stderr
+    assert "splat file of refinesplat: " in done.stderr and "aw masks " in done.stderr
+    assert '"reload_s":0.0' in page.read_text()
+    assert f"--budget {SHORTEST_S:g}s" in done.stderr and "a sketch" in done.stderr
+    assert f"A sharp splat, by training it on: aw try {raw} --output {out} --budget " in done.stderr
+    reached = read_result(run / "metrics.json")["cost"]["iterations"]
+    again = aw(*words, "--budget", "20s")
+    assert again.returncode == 0 and again.stderr.count("finished before, kept") == 1
+    longer = aw(*words, "--budget", "75s")
+    assert longer.returncode == 0 and _commands(longer.stderr) == ["build-scene", "plan", "bench", "view"]
+    result = read_result(run / "metrics.json")
+    assert result["cost"]["iterations"] > reached
+    assert result["facts"]["length"].startswith(f"{reached} iterations, continued to")
+
+
+@pytest.mark.slow
+def test_two_methods_share_the_time_and_are_compared(tmp_path: Path) -> None:
+    raw, out = tmp_path / "walls", tmp_path / "out"
+    write_capture(raw, 8)
+    done = aw("try", raw, "-o", out, "--threads", "1", "--budget", "20s", "--method", "3dgs,refinesplat")
+    assert done.returncode == 0, done.stderr
+    wanted = ["screen", "build-scene", "plan", "bench", "view", "table", "figure"]
+    assert _commands(done.stderr) == wanted and (out / "comparison.png").is_file()
     assert "3dgs" in done.stdout and "refinesplat" in done.stdout
-    splat = out / "runs/walls/refinesplat/seed0/point_cloud.ply"
-    assert splat.is_file() and f"the splat without distractors: {splat}" in done.stderr
-    assert known_iterations(out / "runs") == 300 and "takes longer" in done.stderr
-    again = aw(*words)
-    assert again.returncode == 0 and again.stderr.count("finished before, kept") == 2
-    assert _commands(again.stderr) == wanted[1:]
+
+
+class Made(Exception):
+    pass
+
+
+def budgets(monkeypatch: pytest.MonkeyPatch, scene: Path, methods: str, seconds: float) -> dict[str, Any]:
+    """What `train_within` asks of `bench`."""
+    asked: dict[str, Any] = {}
+
+    def bench(names: list[str], of: Path, **words: Any) -> None:
+        asked.update(words, names=names)
+        raise Made
+
+    monkeypatch.setattr("ambiguous_wild.harness.benchmark.bench", bench)
+    with pytest.raises(Made):
+        out = scene.parent / "nothing"
+        train_within(methods, scene, out / "runs", out / "plan.json", out / "view", seconds, 1)
+    return asked
+
+
+def test_the_same_budget_gives_the_same_length_and_methods_share_it(
+    monkeypatch: pytest.MonkeyPatch, scene: Path
+) -> None:
+    first, again = (budgets(monkeypatch, scene, "refinesplat", 300.0) for _ in range(2))
+    assert first["budgets_s"] == again["budgets_s"] and first["train"] == again["train"]
+    assert 200 < first["budgets_s"][0] < 300 and first["overwrite"] == "longer"
+    both = budgets(monkeypatch, scene, "3dgs,refinesplat", 300.0)
+    assert both["names"] == ["3dgs", "refinesplat"]
+    assert both["budgets_s"][0] < first["budgets_s"][0] / 2
+    longer = budgets(monkeypatch, scene, "refinesplat", 900.0)
+    assert longer["budgets_s"][0] == first["budgets_s"][0] + 600.0
+    assert longer["train"]["max_gaussians"] >= first["train"]["max_gaussians"]
+    assert budgets(monkeypatch, scene, "refinesplat", 1.0)["budgets_s"] == [SHORTEST_S]
 
 
 def test_a_video_is_captured_once(tmp_path: Path) -> None:

@@ -14,8 +14,10 @@ import pytest
 
 from ambiguous_wild.builder.scene_package import list_files
 from ambiguous_wild.cli.bench import command, parse_budget
+from ambiguous_wild.harness.callbacks import outcome_line
 from ambiguous_wild.harness.cell import (
     Cell,
+    CellReport,
     code_hash,
     environment,
     installed,
@@ -52,6 +54,22 @@ def test_a_result_says_where_test_photos_may_hold_distractors(tmp_path):
     assert "every 8th photo is a test photo" in mixed.result()["facts"]["test_photos"]
     chosen = replace(cell, scene=replace(cell.scene, info={**cell.scene.info, "split": "list"}))
     assert "test_photos" not in chosen.result()["facts"]
+
+
+def test_a_result_says_why_there_are_no_masks_to_compare(tmp_path):
+    scene, length = write_tiny_scene(tmp_path / "scene"), TrainConfig(iterations=200)
+    plain, masking, graft = plan_cells(["3dgs", "robustsplat", "3dgs@mask=robustsplat"], [scene], [0], length)
+    reasons = [cell.result().get("facts").get("no_masks") for cell in (plain, masking, graft)]
+    late = "masks had not begun at 200 iterations"
+    assert reasons == ["the method makes no masks", late, late]
+    assert "at 60 iterations" in masking.result(cost={"iterations": 60})["facts"]["no_masks"]  # of a budget
+    assert "no_masks" not in masking.result(masks={"iou": 0.5})["facts"]
+    assert "no_masks" not in masking.result(error="lost")["facts"]
+    report = CellReport(tmp_path, "trained", result=masking.result())
+    assert f"{late}, a run too short" in outcome_line(report)
+    for path in (scene / "truth/distractor").iterdir():
+        path.unlink()
+    assert "no_masks" not in masking.result()["facts"]
 
 
 def test_a_plain_scene_is_known_by_its_photos_masks_and_model(tmp_path):

@@ -29,6 +29,7 @@ from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
+from ambiguous_wild.viewing.video import labelled
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH
 
 ITERATIONS = 120
@@ -180,3 +181,12 @@ def test_long_captions_stay_on_their_picture():
     )
     assert framed.shape == (9 + sheets.BAR + sheets.GAP, 40 + sheets.GAP, 3)
     assert (framed[: sheets.BAR, 40:] == 255).all() and (framed[: sheets.BAR] < 255).any()
+
+
+@pytest.mark.parametrize(
+    "draw", [sheets.cell, lambda text, image: labelled(image, text)], ids=["sheet", "video"]
+)
+def test_letters_that_the_font_lacks_are_no_question_marks(draw):
+    image = np.full((90, 320, 3), 200, np.uint8)
+    assert np.array_equal(draw("Tést_0.png ﬁ", image), draw("Test_0.png fi", image))
+    assert np.array_equal(draw("写真\n", image), draw(r"\u5199\u771f\n", image))

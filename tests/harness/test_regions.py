@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -43,7 +44,7 @@ def test_covered_is_what_was_hidden_in_at_least_half_of_the_views(tmp_path: Path
         expected, got = part_of_wall(view.camera), regions.pixels["psnr_covered"][view.name]
         assert (expected & got).sum() / (expected | got).sum() > 0.85
         assert np.array_equal(regions.pixels["psnr_uncovered"][view.name], ~got)
-    assert list(regions.missing) == ["psnr_valid"]
+    assert list(regions.missing) == ["psnr_valid", "psnr_consistent"]  # its test photos are clean
 
 
 @pytest.mark.parametrize(("hidden", "has_sparse_points"), [(3, True), (4, False)])
@@ -116,3 +117,32 @@ def test_depth_between_points_is_exact_on_a_plane_and_ignores_what_lies_behind()
     expected = (1.0 + 0.5 * ((np.arange(60) + 0.5 - 30) / 50)) / 4.0
     assert np.abs(inverse - expected[None, :]).max() < 1e-5
     assert inverse_depth(camera, wall[:4]) is None
+
+
+def test_consistent_is_what_other_photos_show_too(tmp_path: Path) -> None:
+    """A part of the wall is hidden by a distractor in one test photo alone; the photo is darker, too."""
+    root = write_tiny_scene(tmp_path / "scene", distractors=False)
+    view, other = load_scene(root).test
+    hidden = np.zeros((HEIGHT, WIDTH), bool)
+    hidden[12:36, 20:44] = True
+    photo = cv2.imread(str(view.image_path))
+    clean = (photo * 0.8).astype(np.uint8)
+    photo = np.where(hidden[..., None], (30, 240, 30), clean).astype(np.uint8)
+    cv2.imwrite(str(view.image_path), photo)
+    scene = load_scene(root)
+    assert find_regions(scene).missing["psnr_consistent"] == "test photos hold no distractors"
+    mixed = replace(scene, info={**scene.info, "split": "every-8"})
+    pixels = find_regions(mixed).pixels["psnr_consistent"]
+    assert pixels[view.name][hidden].mean() < 0.1  # without the distractor's own rim
+    inside = np.s_[4:-4, 8:-8]  # near the rim fewer than three photos look
+    assert pixels[view.name][inside][~hidden[inside]].mean() > 0.8 and pixels[other.name][inside].mean() > 0.9
+    # a model that draws the distractor, and the wall a little worse, has more PSNR than the wall itself
+    ghost, wall = np.where(hidden[..., None], photo, clean * 0.9).astype(np.uint8), clean
+    rows, missing = measure_images(
+        [(view.name, picture[..., ::-1].copy(), photo[..., ::-1].copy()) for picture in (ghost, wall)],
+        [metrics()[key] for key in ("psnr", "psnr_consistent")],
+        mixed,
+    )
+    (of_ghost, of_wall) = rows
+    assert not missing and of_ghost["psnr"] > of_wall["psnr"] + 5
+    assert of_wall["psnr_consistent"] > of_ghost["psnr_consistent"] + 5

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.main import cli
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import replay as replay_module
+from ambiguous_wild.harness.cell_run import OURS
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.harness.replay import open_run, replay
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_keep_map, read_png_rgb, write_png
+from ambiguous_wild.io.mask_reasons import read_reasons
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
@@ -122,22 +125,43 @@ def test_a_pixel_is_explained(masked):
         done = CliRunner().invoke(cli, ["explain", str(masked), photo, str(column), str(row)])
         assert done.exit_code == 0, done.output
         said[kept] = done.output
-    assert "kept\n" in said[True] and "masked\n" in said[False]
+    assert said[True].startswith("kept: ") and said[False].startswith("masked: it ")
     assert "mask: yes" in said[False] and "threshold of the scene's instances: " in said[False]
+    # what the run stores for the page is what the command says first
+    stored = read_reasons(masked / "reasons.json")
+    assert {Path(name).stem for name in stored} == {path.stem for path in (masked / "masks").rglob("*.png")}
+    reasons = next(reasons for name, reasons in stored.items() if Path(name).stem == photo)
+    for kept in (True, False):
+        row, column = (int(v) for v in np.argwhere(written == kept)[0])
+        assert said[kept].splitlines()[0] == reasons.at(column, row)
+    words = np.array(["", *(sentence.partition(":")[0] for sentence in reasons.sentences)])[reasons.regions]
+    assert ((words == "kept") == (written > 0)).all()
 
 
-def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
+def test_whatever_a_run_writes_is_replaced_with_it(masked):
+    assert {path.name for path in masked.iterdir()} <= set(OURS)
+
+
+def test_the_captures_own_mask_and_corrections_are_reasons(masked, monkeypatch):
     load = replay_module.load_train_data
 
     def with_mask(scene, **more):
         data = load(scene, **more)
         own = [torch.zeros(photo.shape[:2]) for photo in data.photos]
-        return dataclasses.replace(data, user_keep=own)
+        hand = torch.zeros_like(own[0])
+        hand[:, 1] = -1.0
+        hand[:, 2] = own[0][:, 2] = 1.0  # as `corrected` joins both
+        return dataclasses.replace(data, user_keep=[own[0]] * len(own), by_hand=[hand] * len(own))
 
     monkeypatch.setattr(replay_module, "load_train_data", with_mask)
     photo = sorted((masked / "masks").rglob("*.png"))[0].stem
-    done = CliRunner().invoke(cli, ["explain", str(masked), photo, "0", "0"])
-    assert "masked\n" in done.output and "the capture's own mask leaves it out" in done.output
+    for column, sentence in (
+        ("0", "masked: the capture's own mask leaves it out"),
+        ("1", "masked: by hand"),
+        ("2", "kept: by hand"),
+    ):
+        done = CliRunner().invoke(cli, ["explain", str(masked), photo, column, "0"])
+        assert done.output.startswith(f"{sentence}\n"), done.output
 
 
 @pytest.mark.parametrize(
@@ -145,12 +169,14 @@ def test_the_captures_own_mask_is_a_reason(masked, monkeypatch):
     [
         (("nowhere.png", "0", "0"), "unknown train photo"),
         (("{photo}", "999", "0"), "no pixel 999, 0"),
+        ((), "PHOTO, COLUMN, ROW not given: name a run, a train photo of it, and a pixel"),
+        (("{photo}", "1"), "ROW not given"),
     ],
 )
 def test_what_cannot_be_explained_is_named(masked, words, message):
     photo = sorted((masked / "masks").rglob("*.png"))[0].stem
     done = CliRunner().invoke(cli, ["explain", str(masked), *(word.format(photo=photo) for word in words)])
-    assert done.exception is not None and message in str(done.exception)
+    assert done.exit_code != 0 and message in f"{done.exception} {' '.join(done.output.split())}"
     with pytest.raises(AwError, match="is no run of 'aw bench'"):
         open_run(masked.parent)
 

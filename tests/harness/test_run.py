@@ -368,6 +368,6 @@ def test_a_render_of_another_run_is_not_shown(finished, tmp_path):
     shutil.copytree(finished, tmp_path / "runs")
     run = tmp_path / "runs" / "scene" / "3dgs" / "seed0"
     shutil.copy(run / "renders/test/test_1.png", run / "renders/test/test_0.png")
-    answer = aw("table", tmp_path / "runs", "--sheet", tmp_path / "sheet.png")
+    answer = aw("figure", tmp_path / "runs", "-o", tmp_path / "figure.png")
     assert answer.returncode == 2 and "is not the render that was measured" in answer.stderr
-    assert not (tmp_path / "sheet.png").exists()
+    assert not (tmp_path / "figure.png").exists()

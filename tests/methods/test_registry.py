@@ -1,5 +1,7 @@
 """Methods are found by name, from three places."""
 
+import sys
+
 import pytest
 
 from ambiguous_wild.core.config import with_options
@@ -40,6 +42,27 @@ def test_a_plugin_file_adds_a_method(tmp_path):
     )
     assert load_plugin(path) == ["mine"]
     assert all_methods()["mine"].summary == "my own"
+
+
+def test_a_plugin_imports_what_lies_beside_it_also_later(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "own_masks_of_mine.py").write_text("BUILD = 'ambiguous_wild.methods.threedgs:build'\n")
+    (folder / "own_late_of_mine.py").write_text("NUMBER = 7\n")
+    (folder / "json.py").write_text("raise RuntimeError('hides the module of Python')\n")
+    (folder / "reg.py").write_text(
+        "from own_masks_of_mine import BUILD\n"
+        "from ambiguous_wild.methods import MethodEntry, register\n"
+        "register(MethodEntry('mine', 'my own', BUILD))\n"
+        "def late():\n    from own_late_of_mine import NUMBER\n    return NUMBER\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert load_plugin("mine/reg.py") == ["mine"]
+    assert sys.modules["aw_plugin_reg"].late() == 7
+    assert sys.path[0] != str(folder) and sys.path[-1] == str(folder)  # later it hides nothing
+    for name in ("own_masks_of_mine", "own_late_of_mine"):
+        sys.modules.pop(name)
 
 
 def test_a_plugin_that_registers_nothing_is_refused(tmp_path):

@@ -123,7 +123,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, built: Path) -> Path:
         film.write(cv2.imread(str(path)))
     film.release()
     clean = write_tiny_scene(tmp_path_factory.mktemp("clean") / "scene", distractors=False)
-    for name in ("scene", "a", "b", "my-scene", "SCENE"):
+    for name in ("scene", "a", "b", "my-scene", "SCENE", "yard", "porch"):
         write_tiny_scene(root / name)
         shutil.copytree(clean / "images", root / name / "truth/clean")
     for name in ("scene1", "scene2", BUILT):

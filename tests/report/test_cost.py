@@ -186,6 +186,22 @@ def test_runs_of_an_ablation_are_pairs_of_their_method(tmp_path: Path) -> None:
     assert change.method == "a" and change.db.mean == 1.0
 
 
+def test_labels_name_curves_changes_and_points_in_their_order(tmp_path: Path) -> None:
+    for name, psnr, train_s in (("a", 20.0, 60.0), ("3dgs+truth", 30.0, 50.0), ("b", 22.0, 70.0)):
+        cost_run(tmp_path / "n", name, psnr=(psnr,), train_s=train_s, probes=RISING)
+    cost_run(tmp_path / "e", "a", psnr=(21.0,), effects=("exposure",), probes=RISING)
+    runs = read_cost_runs([tmp_path], labels=["3dgs+truth=Oracle", "a=Ours"])
+    report = cost_report(runs)
+    assert [point.curve for point in report.points] == ["b", "Oracle", "Ours + exposure", "Ours plain"]
+    assert [change.method for change in report.changes] == ["Ours"]
+    assert not report.points[1].pareto_front  # still known as a reference
+    draw_all(report, tmp_path)
+    drawn = (tmp_path / "front.svg").read_text(encoding="utf-8")
+    assert "<!-- Oracle -->" in drawn and "truth" not in drawn
+    with pytest.raises(AwError, match="unknown method 'c'"):
+        read_cost_runs([tmp_path], labels=["c=Ours"])
+
+
 def test_under_a_budget_both_take_as_long_and_no_rate_is_given(tmp_path: Path) -> None:
     for name, effects, psnr, seconds in (("n", (), 20.0, 60.01), ("e", ("exposure",), 21.0, 60.03)):
         cost_run(tmp_path / name, "a", psnr=(psnr,), effects=effects, train_s=seconds, budget_s=60.0)
@@ -198,10 +214,12 @@ def test_a_sweep_names_every_curve_by_its_value_and_the_default_too(tmp_path: Pa
     for method, share in {"mine": 0.8, "mine@share-0.7": 0.7, "mine@share-0.9": 0.9}.items():
         cost_run(tmp_path, method, options={"share": share, "other": 1})
     names = [curve.name for curve in curves_of(read_cost_runs([tmp_path]).runs)]
-    assert names == ["mine share=0.7", "mine share=0.8", "mine share=0.9"]
+    assert sorted(names) == ["mine share=0.7", "mine share=0.8", "mine share=0.9"]
+    labelled = curves_of(read_cost_runs([tmp_path], labels=["mine=Ours"]).runs)
+    assert {curve.name for curve in labelled} == {f"Ours share={share}" for share in (0.7, 0.8, 0.9)}
     cost_run(tmp_path, "mine@parts-none", options={"share": 0.8, "other": 0})
     names = [curve.name for curve in curves_of(read_cost_runs([tmp_path]).runs)]
-    assert names == ["mine", "mine@parts-none", "mine@share-0.7", "mine@share-0.9"]
+    assert sorted(names) == ["mine", "mine@parts-none", "mine@share-0.7", "mine@share-0.9"]
 
 
 @settings(max_examples=50, deadline=None)

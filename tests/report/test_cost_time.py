@@ -1,4 +1,4 @@
-"""Cost in reference seconds, the one-line answer, and the recommended setting."""
+"""Cost in reference seconds, what is said of it, and the recommended setting."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from ambiguous_wild.cli.cost import command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.report import cost_recommend as advice
 from ambiguous_wild.report.cost_changes import changes
-from ambiguous_wild.report.cost_curves import answers, timeline, times_to_reach
+from ambiguous_wild.report.cost_curves import timeline, times_to_reach
+from ambiguous_wild.report.cost_plots import draw_front
 from ambiguous_wild.report.cost_recommend import additive, in_words, recommend, value_at, words_of
 from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text
 from tests.report.fake_cost import ALONE, BUSY, RISING, cost_run, curves, read, rising
@@ -64,31 +65,6 @@ def test_contended_runs_are_a_range_and_never_on_the_front(tmp_path: Path) -> No
     assert data["curves"][0]["not_ranked"] or data["curves"][1]["not_ranked"]
     reach = next(row for row in report.reach if row.curve == "a + exposure" and row.reached)
     assert reach.not_ranked and reach.minutes_high * 60.0 == 230.0
-
-
-def test_one_line_says_what_most_of_the_quality_and_the_last_db_take(tmp_path: Path) -> None:
-    for seed in (0, 1):
-        cost_run(tmp_path, "fast", seed=seed, psnr=(27.0,), train_s=60.0,
-                 probes=[(20.0, 24.0), (40.0 + seed, 26.0)])  # fmt: skip
-        cost_run(tmp_path, "good", seed=seed, psnr=(30.0,), train_s=600.0,
-                 probes=[(200.0, 26.0), (400.0, 28.0), (500.0, 29.0)])  # fmt: skip
-    cost_run(tmp_path, "3dgs+truth", psnr=(40.0,), train_s=5.0, probes=[(1.0, 39.0)])
-    (answer,) = answers(curves(tmp_path))
-    assert answer.best == 30.0 and answer.best_curve == "good" and answer.ranked
-    assert answer.most_curve == "fast"  # 27 dB: at its end, sooner than the other
-    assert answer.most_s == pytest.approx(60.0) and answer.most_spread_s == 0.0
-    assert answer.last_s == pytest.approx(100.0)
-    assert answer.text == (
-        "on yard 90 % of the best PSNR (30.0 dB) takes 60 s ± 0.0 s (fast), the last dB 100 s (good)"
-    )
-    assert answer.text in to_text(cost_report(read(tmp_path)))
-
-
-def test_an_answer_says_what_was_not_measured(tmp_path: Path) -> None:
-    cost_run(tmp_path, "a", psnr=(30.0,), train_s=600.0, probes=[(100.0, 29.5)], timing=BUSY)
-    (answer,) = answers(curves(tmp_path))
-    assert answer.bound and "takes at most 100 s (a)" in answer.text
-    assert "the last dB not measured" in answer.text and "not all of these runs were alone" in answer.text
 
 
 def test_resolution_gaussians_and_parts_are_changes_of_their_own(tmp_path: Path) -> None:
@@ -255,3 +231,23 @@ def test_runs_of_another_scene_or_metric_are_neither_ranked_nor_averaged(tmp_pat
     (curve,) = (curve for curve in curves(tmp_path) if curve.method == "b")
     assert not len(timeline(curve, ("yard",))[0])
     assert "differ beside the seed" in times_to_reach([curve])[0].missing
+
+
+def test_names_in_a_plot_stand_beside_error_bars(tmp_path: Path) -> None:
+    for seed, (early, late) in enumerate(((50.0, 100.0), (70.0, 140.0))):
+        cost_run(tmp_path, "a", seed=seed, train_s=early)
+        cost_run(tmp_path, "b", seed=seed, train_s=late, psnr=(25.0,))
+    figure = draw_front(cost_report(read(tmp_path)))
+    panel = figure.axes[0]
+    names = {text.get_text(): text for text in panel.texts}
+    spread = np.std([50.0, 70.0], ddof=1)
+    assert names["a"].xy[0] == pytest.approx(60.0 + spread) and names["a"].get_ha() == "left"
+    assert names["b"].xy[0] == pytest.approx(120.0 - 2 * spread) and names["b"].get_ha() == "right"
+
+
+def test_where_test_photos_may_hold_distractors_the_report_says_so(tmp_path: Path) -> None:
+    cost_run(tmp_path, "a", facts={"test_photos": "test photos may hold distractors: every 8th photo tests"})
+    told = "every 8th photo tests (yard): a model that draws distractors gains PSNR by it"
+    assert told in to_text(cost_report(read(tmp_path)))
+    narrow = to_text(cost_report(read(tmp_path)), 60)
+    assert max(map(len, narrow.splitlines())) <= 60 and "part 1 of" in narrow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -64,6 +65,18 @@ def test_the_same_board_gives_the_same_bytes_and_copies_of_its_csvs(board: Path,
     assert sum(name.endswith(".jpg") for name in files) == 2 + 4 + 3
     aw("publish", "--board", board, "-o", tmp_path / "a")
     assert "data/reported.csv" not in content(tmp_path / "a")
+
+
+def test_the_page_shows_methods_under_their_labels(board: Path, tmp_path: Path) -> None:
+    done = aw("publish", "--board", board, "-o", tmp_path / "a", "--label", "refinesplat=Ours & co")
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "a" / "index.html").read_text(encoding="utf-8")
+    (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', page, re.S)
+    data = json.loads(text)
+    assert {run["method"] for run in data["runs"]} == {"3dgs", "robustsplat", "Ours & co", HOSTILE}
+    assert {row["method"] for row in data["images"]} >= {"Ours & co", ""} and "Ours & co" in data["methods"]
+    assert all("Ours" not in run["reproduce"] for run in data["runs"])
+    assert b"Ours" not in content(tmp_path / "a")["data/tiny.csv"]
 
 
 def test_an_interrupted_publish_leaves_the_old_page(

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,23 +15,18 @@ import pytest
 from ambiguous_wild.harness.trained_models import Viewer, view_runs
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.viewing.model import Renderer, RenderSettings
+from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.splat_arrays import SplatFile
+from ambiguous_wild.viewing.model import Renderer, RenderSettings, ViewedModel
+from ambiguous_wild.viewing.page_file import page_text
 from ambiguous_wild.viewing.video import fitted
 from tests.chromium import Browser, needs_chromium
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
-from tests.viewing.wall_runs import write_shown_run
+from tests.viewing.open_page import box, facts, mouse, settle
+from tests.viewing.wall_runs import wall_model, write_shown_run
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 HOSTILE = "</script><img src=x onerror=alert(1)>"
-SETTLED = """(() => {
-  const models = panes().filter((p) => p.choice !== PHOTO);
-  const sorted = models.every((p) => !p.spark.sorting && !p.spark.sortDirty && p.spark.activeSplats);
-  const ready = sorted && models.every((p) => p.drawn);
-  const now = models.map((p) => p.canvas.toDataURL()).join();
-  const same = ready && !wanted && window.before === now;
-  window.before = now;
-  return same;
-})()"""
 FACE = """(() => {
   const face = over.frusta.children.findLast((c) => c.visible).children[1];
   face.geometry.computeBoundingSphere();
@@ -62,7 +56,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile"), width=640, height=560, webgl=True) as page:
+    with Browser(tmp_path_factory.mktemp("profile"), width=800, height=560, webgl=True) as page:
         yield page
 
 
@@ -72,12 +66,6 @@ def page(runs: Path, browser: Browser) -> Browser:
     browser.open((runs / "view" / "index.html").as_uri() + f"#left=3dgs&right=x&mode=single&view={TEST[0]}")
     settle(browser)
     return browser
-
-
-def settle(page: Browser) -> None:
-    """Wait until models are loaded, sorted and drawn: two pictures in a row are the same."""
-    page.until("$('busy').textContent === '' && Boolean(controls)")
-    page.until(SETTLED)
 
 
 def shot(page: Browser, tmp_path: Path) -> np.ndarray:
@@ -91,17 +79,8 @@ def shot(page: Browser, tmp_path: Path) -> np.ndarray:
     return image[y : y + h, x : x + w]
 
 
-def box(page: Browser) -> tuple[int, int, int, int]:
-    values = page.run(
-        "(() => { const b = $('stage').getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })()"
-    )
-    return tuple(round(v) for v in values)  # type: ignore[return-value]
-
-
 def ours(runs: Path, label: str, view: str, size: tuple[int, int]) -> np.ndarray:
     """Our own render of what the stage shows."""
-    from ambiguous_wild.io.scene_folder import load_scene
-
     scene = load_scene(runs / "porch")
     camera = next(v.camera for v in scene.views if v.name == view)
     seed = 0 if label == "3dgs" else 1
@@ -109,16 +88,8 @@ def ours(runs: Path, label: str, view: str, size: tuple[int, int]) -> np.ndarray
     return Renderer(read_splat_ply(ply), RenderSettings())(fitted(camera, size, camera.cam_from_world))
 
 
-def mouse(page: Browser, kind: str, x: float, y: float, **more: Any) -> None:
-    page.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
-
-
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return 10 * math.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
-
-
-def facts(page: Browser, script: str) -> Any:
-    return json.loads(page.run(f"JSON.stringify({script})"))
 
 
 @pytest.mark.parametrize(("number", "label"), [(0, "3dgs"), (1, HOSTILE)])
@@ -252,7 +223,6 @@ def test_a_camera_path_is_saved_for_the_video(page: Browser, runs: Path, tmp_pat
         page.key("p")
     assert page.run("$('path').textContent") == "Path (3)"
     (tmp_path / "path.json").write_text(page.run("JSON.stringify(pathFile())"))
-    from ambiguous_wild.io.scene_folder import load_scene
     from ambiguous_wild.viewing import video
 
     scene = load_scene(runs / "porch")
@@ -263,18 +233,6 @@ def test_a_camera_path_is_saved_for_the_video(page: Browser, runs: Path, tmp_pat
         assert np.allclose(camera.cam_from_world, wanted.cam_from_world, atol=1e-4)
 
 
-def test_it_opens_with_two_models_under_the_slider_the_best_right(page: Browser, runs: Path) -> None:
-    page.open("about:blank#")
-    page.open((runs / "view" / "index.html").as_uri())
-    settle(page)
-    assert page.run("state.mode") == "cut"
-    best = facts(page, "DATA.models[state.right].mean")
-    means = facts(page, "DATA.models.map((m) => m.mean)")
-    assert best == max(means) > facts(page, "DATA.models[state.left].mean")
-    psnr = facts(page, "DATA.models[state.right].psnr")
-    assert facts(page, "DATA.views[state.view].name") == max(TEST, key=lambda name: psnr[name])
-
-
 def test_the_address_opens_a_place(page: Browser, runs: Path) -> None:
     page.open("about:blank#")
     place = f"#left=3dgs&right=photo&mode=cut&view={TRAIN[2]}&x=<b>"
@@ -282,6 +240,55 @@ def test_the_address_opens_a_place(page: Browser, runs: Path) -> None:
     settle(page)
     assert page.run("DATA.models[state.left].label") == "3dgs" and page.run("state.right") == "photo"
     assert page.run("state.mode") == "cut" and page.run("DATA.views[state.view].name") == TRAIN[2]
+
+
+def test_a_page_of_a_training_loads_itself_again_where_the_person_was(
+    runs: Path, browser: Browser, tmp_path: Path
+) -> None:
+    scene, path = load_scene(runs / "porch"), tmp_path / "index.html"
+    model = ViewedModel("3dgs", Path("3dgs"), splats=SplatFile(wall_model()))
+
+    def write(training: str, reload_s: float) -> None:
+        path.write_text(page_text(scene, [model], title="t", training=training, reload_s=reload_s)[0])
+
+    write("training: 1 iteration", 0.2)
+    browser.open(path.as_uri())
+    settle(browser)
+    # with unsaved work it stays
+    browser.key("p")
+    browser.until("$('training').textContent.includes('not refreshed')")
+    place = "camera.position.set(...[1, 2, 3].map((x, i) => x + DATA.middle[i] - 4 * (i === 2)))"
+    browser.run(f"home(), {place}, controls.update(), choose({{ mode: 'cut', right: PHOTO, masks: false }})")
+    eye = facts(browser, "camera.position.toArray()")
+    write("training: 2 iterations", 1000)
+    browser.run("state.path = []")
+    loaded = "typeof DATA === 'object' && Boolean(controls) && DATA.training === "
+    browser.until(f"{loaded}'training: 2 iterations'")
+    settle(browser)
+    assert facts(browser, "[state.mode, state.right, state.view, state.masks]") == [
+        "cut",
+        "photo",
+        None,
+        False,
+    ]
+    assert np.allclose(facts(browser, "camera.position.toArray()"), eye, atol=1e-3)
+    # a training that was killed writes no page any more
+    browser.run("sessionStorage.setItem(KEY, JSON.stringify([DATA.training, MOST_RELOADS]))")
+    browser.run("DATA.reload_s = 0.2")
+    browser.until(
+        f"{loaded}'training: 2 iterations' && $('training').textContent.includes('waits no longer')"
+    )
+    write("training: 3 iterations", 1000)
+    browser.run("location.reload()")
+    browser.until(f"{loaded}'training: 3 iterations' && $('training').textContent.includes('next state')")
+    write("", 0)  # the last page
+    browser.run("DATA.reload_s = 0.2")
+    browser.until(f"{loaded}''")
+    settle(browser)
+    assert browser.run("state.mode") == "cut" and browser.run("$('training').offsetHeight") == 0
+    browser.run("window.same = 1")
+    time.sleep(0.6)
+    assert browser.run("window.same") == 1 and browser.errors == []
 
 
 def test_a_notebook_s_frame_shows_it_too(runs: Path, browser: Browser, tmp_path: Path) -> None:
@@ -303,11 +310,19 @@ def test_nothing_hostile_ran_and_it_fits_a_phone(runs: Path, tmp_path: Path) -> 
         page.open((runs / "view" / "index.html").as_uri())
         settle(page)
         assert page.run("document.querySelectorAll('img').length") == 0
-        assert page.run("document.title") == HOSTILE
-        assert page.run("document.querySelector('h1').textContent") == HOSTILE
+        assert page.run("document.title") == f"{HOSTILE} · aw"
+        assert page.run("document.querySelector('h1').textContent") == f"{HOSTILE} · aw"
         assert page.run("document.documentElement.scrollWidth <= innerWidth")
         assert page.run("!under.renderer")
         assert page.run("document.querySelector('header').offsetHeight <= 0.15 * innerHeight")
+        # nothing is cut at the side: the other controls are behind a button
+        assert page.run("$('beside').offsetHeight") == 0
+        page.click("#more")
+        sides = "[...document.querySelectorAll('header button, header select')].filter((e) => e.offsetHeight)"
+        assert page.run(
+            f"{sides}.length > 10 && {sides}.every((e) => e.getBoundingClientRect().right <= innerWidth)"
+        )
+        page.click("#more")
         x, y, w, h = box(page)
         before = facts(page, "camera.position.toArray()")
         for kind, dx in (("touchStart", 0), ("touchMove", 30), ("touchMove", 70), ("touchEnd", None)):

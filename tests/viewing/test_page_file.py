@@ -16,18 +16,20 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.trained_models import Viewer, read_render_settings, view_runs
-from ambiguous_wild.io.files import sha256_file
-from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.files import own_json, sha256_file, write_json
+from ambiguous_wild.io.images import read_png_rgb, write_png
+from ambiguous_wild.io.mask_reasons import reasons_of, write_reasons
 from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.scene_folder import MAP, load_scene
+from ambiguous_wild.io.splat_arrays import SplatFile
 from ambiguous_wild.io.spz import decode_spz
 from ambiguous_wild.viewing import page_file
-from ambiguous_wild.viewing.model import RenderSettings
-from ambiguous_wild.viewing.page_file import importance, reduced
+from ambiguous_wild.viewing.model import RenderSettings, ViewedModel
+from ambiguous_wild.viewing.page_file import importance, opening, page_text, reduced
 from tests.command_line import aw
 from tests.report.board_runs import change_result
-from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
-from tests.viewing.wall_runs import wall_model, write_shown_run
+from tests.tiny_scene import HEIGHT, TEST, TRAIN, WIDTH, write_tiny_scene
+from tests.viewing.wall_runs import wall_model, write_mixed_scene, write_shown_run
 
 HOSTILE = '</script><img src=x onerror="alert(1)">&-->'
 
@@ -114,6 +116,14 @@ def test_the_same_runs_give_the_same_bytes(runs: Path, tmp_path: Path) -> None:
     view_runs([runs], tmp_path / "a", title="new")  # an earlier page is replaced
     (note,) = facts((tmp_path / "a/index.html").read_text())["notes"]
     assert note.startswith(HOSTILE) and "drawn as plain 3DGS" in note
+
+
+def test_models_are_named_and_ordered_by_labels(runs: Path, tmp_path: Path) -> None:
+    assert aw("view", runs, "-o", tmp_path, "--label", "3dgs=Ours & co").returncode == 0
+    named = [model["label"] for model in facts((tmp_path / "index.html").read_text())["models"]]
+    assert named == [HOSTILE, "Ours & co"]
+    wrong = aw("view", runs, "-o", tmp_path / "w", "--label", "gone=Ours")
+    assert wrong.returncode == 2 and "unknown method 'gone'" in wrong.stderr
 
 
 def test_another_page_is_not_replaced(runs: Path, tmp_path: Path) -> None:
@@ -205,7 +215,7 @@ def test_a_notebook_shows_the_page_in_a_frame(runs: Path) -> None:
     viewer = Viewer([runs])
     frame = viewer._repr_html_()
     assert frame.startswith('<iframe sandbox="allow-scripts" srcdoc="') and frame.count("<") == 2
-    assert "3dgs" in repr(viewer) and len(page_file.SCRIPTS) == 4
+    assert "3dgs" in repr(viewer)
 
 
 def test_a_stranger_s_method_name_imports_no_file(runs: Path, tmp_path: Path) -> None:
@@ -226,15 +236,145 @@ def test_photos_and_masks_stay_below_their_share_of_the_page(runs: Path, tmp_pat
         mask.parent.mkdir(exist_ok=True)
         write_png(mask, rng.integers(0, 2, (270, 480), np.uint8) * 255)
         views.append(dataclasses.replace(view, image_path=photo))
-    pictures = page_file.photo_uris(views, 200_000)
+    paths = [view.image_path for view in views]
+    pictures = page_file.photo_uris(paths, 200_000)
     masks = page_file.mask_uris(tmp_path / "masks", views, 60_000)
     for uris, most in ((pictures, 200_000), (list(masks.values()), 60_000)):
         assert len(uris) == len(views) and most / 4 < sum(map(len, uris)) <= most
         assert len({image_of(uri).shape for uri in uris}) == 1  # all of one width
-    wide = page_file.photo_uris(views, 10**9)
+    wide = page_file.photo_uris(paths, 10**9)
     assert {image_of(uri).shape[:2] for uri in wide} == {(270, 480)}  # never enlarged
-    least = page_file.photo_uris(views, 1)  # too little for any: the smallest
+    least = page_file.photo_uris(paths, 1)  # too little for any: the smallest
     assert {image_of(uri).shape[1] for uri in least} == {page_file.WIDTHS[-1]}
+
+
+def opened(runs: Path, *models: ViewedModel, mixed: bool = False) -> tuple[Any, Any, str]:
+    """What the page opens with: labels on the left and right, and the name of the view."""
+    scene = load_scene(runs.parent / "porch")
+    chosen = opening(models, scene, mixed=mixed)
+    sides = [c if c == "photo" else models[c].label for c in (chosen["left"], chosen["right"])]
+    return sides[0], sides[1], [*scene.test, *scene.train][chosen["view"]].name
+
+
+def test_it_opens_where_most_was_removed(runs: Path) -> None:
+    def masked(label: str, *counts: int, **more: Any) -> ViewedModel:
+        keeps = np.ones((len(counts), HEIGHT, WIDTH), bool)
+        for keep, rows in zip(keeps, counts):
+            keep[10 : 10 + rows, 8:24] = False
+        return ViewedModel(label, Path(label), masks=dict(zip(TRAIN, keeps)), **more)
+
+    plain = ViewedModel("3dgs", Path("3dgs"), psnr=dict.fromkeys(TEST, 30.0))
+    removes = masked("refinesplat, seed0", 4, 12, 0, psnr=dict.fromkeys(TEST, 20.0))
+    assert opened(runs, plain, removes) == ("3dgs", "refinesplat, seed0", TRAIN[1])
+    assert opened(runs, removes) == ("photo", "refinesplat, seed0", TRAIN[1])
+    place = opening([removes], load_scene(runs.parent / "porch"), mixed=True)["place"]
+    assert place == [16 / WIDTH, 10 / HEIGHT]
+    # refinesplat before other methods with masks; the others' model stands left, and one without masks first
+    assert opened(runs, masked("dronesplat", 5), removes) == ("dronesplat", "refinesplat, seed0", TRAIN[1])
+    assert opened(runs, masked("dronesplat", 5), plain, removes)[0] == "3dgs"
+    # neither a reference, nor a mask of more than half of the photo, nor one that masks nothing
+    whole = masked("refinesplat", 7)
+    whole.masks[TRAIN[2]] = np.zeros((HEIGHT, WIDTH), bool)
+    assert opened(runs, plain, whole)[1:] == ("refinesplat", TRAIN[0])
+    truth = masked("3dgs+truth", 9, reference=True)
+    assert opened(runs, plain, truth)[1] == "3dgs" and opened(runs, truth, removes)[:2] == (
+        "3dgs+truth", "refinesplat, seed0",
+    )  # fmt: skip
+    assert opened(runs, plain, masked("refinesplat", 0))[1] == "3dgs"
+
+
+def test_without_masks_it_opens_with_the_best_unless_test_photos_hold_distractors(runs: Path) -> None:
+    worse, better = (
+        ViewedModel(label, Path(label), psnr={TEST[0]: psnr, TEST[1]: psnr + more})
+        for label, psnr, more in (("a", 30.0, 1), ("b", 20.0, 2))
+    )
+    assert opened(runs, better, worse) == ("b", "a", TEST[1])
+    assert opened(runs, worse, better) == ("b", "a", TEST[1])
+    assert opened(runs, better, worse, mixed=True) == ("a", "b", TEST[0])  # PSNR decides nothing
+
+
+def test_psnr_of_mixed_test_photos_is_marked_and_names_its_fault(tmp_path: Path) -> None:
+    write_shown_run(tmp_path / "runs", write_mixed_scene(tmp_path / "scene"), "3dgs")
+    data = facts(page := view_runs([tmp_path / "runs"], tmp_path / "out").path.read_text())
+    assert data["mixed"] and data["notes"][0].startswith("* PSNR here rewards ghosts: test photos may hold")
+    assert sum("may hold distractors" in note for note in data["notes"]) == 1
+    assert f"<title>{tmp_path.name} · aw</title>" in page  # not that of the folder, which says nothing
+
+
+def test_the_panel_names_files_and_the_command_that_trains_on(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = write_tiny_scene(tmp_path / "out" / "scene")
+    run = write_shown_run(tmp_path / "out" / "runs", scene, "refinesplat", iterations=300)
+    plain = write_shown_run(tmp_path / "out" / "runs", scene, "3dgs")
+    for mask in (plain / "masks").iterdir():
+        mask.unlink()  # as a run leaves the folder of a method without masks
+    command = (
+        f"aw bench --method refinesplat --scene {scene} --seed 0 --iterations 300 --device cpu --set a.b=1"
+    )
+    change_result(run, lambda r: r.update(reproduce=command))
+    for here, above in ((tmp_path, "out/"), (tmp_path / "out", ""), (runs, "")):
+        monkeypatch.chdir(here)
+        text = view_runs([run, plain], tmp_path / "page").path.read_text()
+        data = facts(text)
+        model = data["models"][0]
+        assert model["retrain"] == (
+            f"aw bench --method refinesplat --scene {above}scene --seed 0 --set a.b=1 -o {above}runs "
+            "--iterations 450 --overwrite longer --corrections corrections.json"
+        )
+        steps = "\n".join(data["next"])
+        assert steps.count("masks of refinesplat") == 1 and "masks of 3dgs" not in steps
+        place = f"{above}{run.relative_to(tmp_path / 'out').as_posix()}"
+        assert f"`{place}/masks`" in steps and f"`aw table {above}runs`" in steps
+        assert str(tmp_path) not in text
+    chosen = facts(view_runs([run], tmp_path / "page", steps=[HOSTILE]).path.read_text())
+    assert chosen["next"] == [HOSTILE]
+    change_result(run, lambda r: r.update(reproduce='aw "'))
+    assert facts(view_runs([run], tmp_path / "page").path.read_text())["models"][0]["retrain"] == ""
+
+
+def test_reasons_of_a_run_come_with_its_masks_and_damaged_ones_do_not(runs: Path, tmp_path: Path) -> None:
+    run = write_shown_run(tmp_path / "runs", runs.parent / "porch")
+    regions = np.zeros((HEIGHT, WIDTH), int)
+    regions[14:26, 14:26] = 1
+    why = ["kept: it looks as predicted", "masked: <b>"]
+    reasons = reasons_of(regions, why)
+    write_reasons(run / "reasons.json", {TRAIN[0]: reasons, "gone.png": reasons})
+    page = view_runs([run], tmp_path / "page").path
+    ((name, stored),) = facts(page.read_text())["models"][0]["reasons"].items()
+    assert name == TRAIN[0] and stored["sentences"] == why
+    assert (image_of(stored["regions"]) == regions + 1).all()
+    record = own_json(run / "reasons.json")
+    cut = stored["regions"][:-40] + "!"
+    head = "data:image/png;base64,"
+    # cut within the header; no ASCII; and a bitmap that seems 32 px wide where a PNG has its width
+    wide = cv2.imencode(".bmp", np.zeros((16, 8192), np.uint8))[1].tobytes()
+    odd = [head + base64.b64encode(data).decode() for data in (bytes(18), wide)]
+    rows = [{"regions": uri, "sentences": why} for uri in ("https://x", cut, f"{head}é", *odd)]
+    for damaged in (*rows, {"regions": stored["regions"], "sentences": []}, 7, None):
+        write_json(run / "reasons.json", record | {"photos": {TRAIN[0]: damaged}})
+        assert facts(view_runs([run], tmp_path / "page").path.read_text())["models"][0]["reasons"] == {}
+
+
+def test_a_page_of_a_training_holds_models_and_masks_from_memory(runs: Path) -> None:
+    scene = load_scene(runs.parent / "porch")
+    keep = np.ones((HEIGHT, WIDTH), bool)
+    keep[14:26, 14:26] = False
+    model = ViewedModel("3dgs", Path("3dgs"), splats=SplatFile(wall_model()), masks={TRAIN[1]: keep})
+    sentence = "training: 1200 iterations after 1:30 of 5:00"
+    page, _ = page_text(scene, [model], title="t", training=sentence, reload_s=2.5)
+    data = facts(page)
+    assert (data["training"], data["reload_s"], data["models"][0]["mean"]) == (sentence, 2.5, None)
+    ((name, uri),) = data["models"][0]["masks"].items()
+    assert name == TRAIN[1] and ((image_of(uri) > 127) == keep).all()
+    ended = facts(page_text(scene, [model], title="t")[0])
+    assert (ended["training"], ended["reload_s"]) == ("", 0)
+    # the photos of the second page come from memory, and one that has changed does not
+    photo = scene.test[0].image_path
+    write_png(photo, 255 - read_png_rgb(photo))
+    again = facts(page_text(scene, [model], title="t")[0])
+    assert again["views"][1:] == ended["views"][1:] and again["views"][0] != ended["views"][0]
+    write_png(photo, 255 - read_png_rgb(photo))
 
 
 def test_a_map_stays_below_its_share_of_the_page_and_may_be_missing(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import signal
 from pathlib import Path
 
 import cv2
@@ -164,6 +166,32 @@ def test_frames_come_back_nearly_as_they_were(tmp_path: Path) -> None:
         write_mp4(tmp_path / "none.mp4", iter([]), 24)
     with pytest.raises(AwError, match="no frame"):
         write_gif(tmp_path / "none.gif", [], 10)
+
+
+def test_frames_until_an_interruption_are_kept_beside_an_earlier_video(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(b"an earlier video")
+    draw = video.Renderer.__call__
+    drawn: list[int] = []
+
+    def stopped(self, camera):  # type: ignore[no-untyped-def]
+        drawn.append(1)
+        if len(drawn) == 10:  # two models: in the fifth frame
+            signal.raise_signal(signal.SIGTERM)
+        return draw(self, camera)
+
+    monkeypatch.setattr(video.Renderer, "__call__", stopped)
+    done = aw("video", runs, "-o", path, "--seconds", "1")
+    part = tmp_path / "v-part.mp4"
+    assert done.returncode == 130 and f"interrupted: the first 4 frames are in {part}" in done.stderr
+    assert re.search(
+        r"drawing 24 frames of .*\nabout \d+ s; a smaller --width or --fps is faster", done.stderr
+    )
+    assert len(frames_of(part)) == 4 and path.read_bytes() == b"an earlier video"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["v-part.mp4", "v.mp4"]
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_a_label_stays_in_its_picture() -> None:

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.builder.scene_package import list_files
+from ambiguous_wild.io.files import sha256_file, write_json
 from ambiguous_wild.io.images import write_png
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.report.board_runs import change_result, write_run
-from tests.tiny_scene import HEIGHT, TRAIN, WALL_Z, WIDTH, wall_colour
+from tests.tiny_scene import HEIGHT, TRAIN, WALL_Z, WIDTH, wall_colour, write_tiny_scene
 
 SH_C0 = 0.28209479177387814
 
@@ -31,6 +32,14 @@ def wall_model(count: int = 2500, seed: int = 0) -> dict[str, np.ndarray]:
         "sh_rest": rng.normal(0, 0.03, (count, 15, 3)),
     }
     return {name: value.astype(np.float32) for name, value in arrays.items()}
+
+
+def write_mixed_scene(root: Path) -> Path:
+    """The tiny scene as `aw build-scene` describes one whose test photos were not chosen as clean."""
+    scene = write_tiny_scene(root)
+    record = {"schema_version": 1, "factor": 1, "name": root.name, "split": "every-8"}
+    write_json(scene / "scene.json", record | {"files": list_files(scene, 1)})
+    return scene
 
 
 def write_shown_run(

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.errors import AwError, similar_path, unknown
 from ambiguous_wild.datasets.foreign import ForeignScene, plain
 from ambiguous_wild.datasets.readers import (
     colmap,
@@ -66,7 +66,7 @@ def recognise(root: Path) -> tuple[str, str]:
         what = (
             "is a file; give the dataset's folder (unpack archives first)"
             if root.exists()
-            else "does not exist"
+            else "does not exist" + similar_path(root)
         )
         raise AwError(f"dataset {root} {what}")
     if (root / "scene.json").is_file():

@@ -6,11 +6,16 @@ import math
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ambiguous_wild.io.files import atomic_path
+from ambiguous_wild.io.mask_reasons import MaskReasons, reasons_of
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
-from ambiguous_wild.methods.refinesplat.masks import MaskStore, enlarge
+from ambiguous_wild.methods.refinesplat.evidence import Maps
+from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
+from ambiguous_wild.methods.refinesplat.masks import MaskStore, PhotoMasks, enlarge
 from ambiguous_wild.splat.step import Step
 from ambiguous_wild.vision.motion_maps import POINTS, draw_points
 
@@ -57,17 +62,84 @@ def panels(
     }
 
 
+def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskReasons:
+    """Return why the regions of a photo are masked or kept.
+
+    A region is the part of an instance, or of what lies in none, for which the same decided; the value in its
+    sentence is its mean, and the threshold that of the scene's instances.
+    """
+    config = store.limited.get(view, store.config.mask)
+    labels = store.labels.of_pixel[view].view(store.labels.shapes[view])
+    judged, threshold = _judged(store, view, maps, masks), float(masks.cut.threshold)
+    structure, fused = config.statistic == "structure", _is_fused(config)
+    masked = masks.keep < 0.5
+    agrees, differs = f"its {config.statistic} is low", f"its {config.statistic} is high"
+    if structure:
+        agrees = "it looks as the other photos predict"
+        differs = "it differs from what the other photos predict"
+    value, weak = "{0:.1f} of {1:.1f}", config.hold * threshold
+    limit = "but its instance as a whole does not"
+    if fused:
+        limit = f"but the mask may cover at most {100 * config.most:.0f} % of this photo"
+    sentences = [f"kept: {agrees} ({value})"]
+    kinds = torch.zeros_like(labels)
+
+    def add(where: Tensor, sentence: str) -> None:
+        kinds[where] = len(sentences)
+        sentences.append(sentence)
+
+    if math.isinf(threshold):
+        add(~masked, "kept: no region of the scene stands apart from the others")
+    add(~masked & (judged > threshold), f"kept: {differs} ({value}), {limit}")
+    add(masked, "masked: it fills a gap of a masked region, or lies at its rim")
+    if fused:
+        near = f"masked: it adjoins what differs more, and is itself above {weak:.1f} ({{0:.1f}})"
+        add(masked & (judged > weak), near)
+    else:
+        add(masked & masks.global_, "masked: it stands out from the rest of the photo")
+    add(masked & (judged > threshold), f"masked: {differs} ({value})")
+    static, seen = store.labels.static.get(view), store.pixels.seen[view]
+    if static is not None:
+        add(static & ~masked, "kept: structure from motion shows that its region does not move")
+    if view in store.maskable:
+        found = "other parts of this photo were found to move before training, and only those are masked"
+        add(~store.maskable[view], f"kept: {found}")
+    if structure and seen is not None:
+        add(~seen, "kept: too few other photos see this surface")
+    regions = (labels.long().clamp(min=0) * len(sentences) + kinds).cpu().numpy()
+    values = judged.double().nan_to_num().cpu().numpy().ravel()
+    areas = np.bincount(regions.ravel())
+    means = np.bincount(regions.ravel(), values) / np.maximum(areas, 1)
+    return reasons_of(
+        regions, [sentences[n % len(sentences)].format(mean, threshold) for n, mean in enumerate(means)]
+    )
+
+
+def _is_fused(config: MaskConfig) -> bool:
+    return config.combine == "fused" and config.use_local and config.use_global
+
+
+def _judged(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> Tensor:
+    """Return what is compared with the threshold at each pixel, [H, W]; see `make_masks`."""
+    shape = store.labels.shapes[view]
+    own = enlarge(maps.statistic, *shape)
+    of_instance = store.labels.on_pixels(view, masks.means.nan_to_num(nan=0.0), shape)
+    if not _is_fused(store.config.mask):
+        return torch.where(masks.local, of_instance, own.double())
+    inside = store.labels.of_pixel[view].view(shape) > 0
+    return torch.where(inside, (own * of_instance).clamp(min=0.0).sqrt(), own.double())
+
+
 def explain(store: MaskStore, step: Step, x: int, y: int) -> list[str]:
-    """Return what decided about a pixel of the photo, in the order in which it is asked."""
+    """Return what was measured at a pixel of the photo; empty where nothing measured decided."""
     maps, masks = store.examine(step)
-    view, config = step.view, store.config.mask
+    view, config = step.view, store.limited.get(step.view, store.config.mask)
     shape = store.labels.shapes[view]
     structure, seen = config.statistic == "structure", store.pixels.seen[view]
-    static = store.labels.static.get(view)
     if structure and seen is not None and not bool(seen[y, x]):
-        return ["too few other photos see this surface: never masked"]
+        return []
     if view in store.maskable and not bool(store.maskable[view][y, x]):
-        return ["first look at the photos before training: a crowd, but not this pixel; never masked"]
+        return []
     own = float(enlarge(maps.statistic, *shape)[y, x])
     what = "difference in structure, in units of what noise causes" if structure else config.statistic
     lines = [f"evidence of the pixel: {own:.2f} ({what})"]
@@ -75,32 +147,22 @@ def explain(store: MaskStore, step: Step, x: int, y: int) -> list[str]:
         factor = float(store.factors[view][y, x])
         lines.append(f"in it, first look at the photos before training: times {factor:.2f}")
     labels = store.labels.of_pixel[view].view(shape)
-    instance, joined = int(labels[y, x]), own
-    fused = config.combine == "fused" and config.use_local and config.use_global
+    instance = int(labels[y, x])
     if instance > 0:
         mean, pixels = float(masks.means[instance - 1]), int((labels == instance).sum())
         lines.append(f"its instance, {pixels} px: mean evidence {mean:.2f}")
-        if fused:
-            joined = math.sqrt(max(own, 0.0) * max(mean, 0.0))
+        if _is_fused(config):
+            joined = float(_judged(store, view, maps, masks)[y, x])
             lines.append(f"both joined, the root of their product: {joined:.2f}")
     else:
         lines.append("it lies in no instance and is judged alone")
     threshold = float(masks.cut.threshold)
     if math.isfinite(threshold):
+        fused = _is_fused(config)
         reach = f"; a region that exceeds it reaches down to {config.hold * threshold:.2f}" if fused else ""
         lines.append(f"threshold of the scene's instances: {threshold:.2f}{reach}")
-    else:
-        lines.append("no instance of the scene stands apart from the others")
-    if static is not None and bool(static[y, x]):
-        return [*lines, "structure from motion shows that its instance is static: never masked"]
     local, global_ = ("yes" if bool(mask[y, x]) else "no" for mask in (masks.local, masks.global_))
     lines.append(f"in the local mask: {local}; in the global mask: {global_}")
-    masked = bool(masks.keep[y, x] < 0.5)
-    if fused and not masked and joined > threshold:
-        most = store.limited.get(view, config).most
-        lines.append(f"the mask may cover {100 * most:.0f} % of the photo: only its surest pixels stay")
-    if fused and masked and joined <= config.hold * threshold:
-        lines.append("it lies in a gap or at the rim of a mask, which is filled and grown")
     return lines
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.io.keep_resize import smaller_keep
+from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, resized
 from ambiguous_wild.methods.refinesplat import mask_pictures
@@ -268,6 +269,12 @@ class RefineSplatMask(PausingMask):
         labels = self.inputs.labels[step.view]
         points = self.points.get(self.data.scene.train[step.view].name)
         return mask_pictures.panels(self.masks, step, photo, labels, points, begun=self.begun(step))
+
+    def predict_with_reasons(self, step: Step) -> tuple[Tensor | None, MaskReasons | None]:
+        if not self.begun(step):
+            return None, None
+        maps, masks = self.masks.examine(step)
+        return masks.keep, mask_pictures.reasons(self.masks, step.view, maps, masks)
 
     def explain(self, step: Step, x: int, y: int) -> list[str]:
         return mask_pictures.explain(self.masks, step, x, y)

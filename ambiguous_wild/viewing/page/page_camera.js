@@ -52,11 +52,7 @@ function pathEntry(camera) {
 
 const pathFile = () => ({ camera_type: "perspective", camera_path: state.path });
 
-function savePath() {
-  const url = URL.createObjectURL(new Blob([JSON.stringify(pathFile())], { type: "application/json" }));
-  h("a", { href: url, download: "path.json" }).click();
-  setTimeout(() => URL.revokeObjectURL(url), 1000);
-}
+const savePath = () => save("path.json", new Blob([JSON.stringify(pathFile())], { type: "application/json" }));
 
 /** A pyramid of lines for each camera, with its photo at the end. */
 function makeFrusta(T, views, size) {

@@ -2,23 +2,14 @@
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
 const PHOTO = "photo";
-const state = { ...opening(), view: null, masks: true, frusta: false, cut: 50, path: [] };
+const state = { masks: true, frusta: false, cut: 50, path: [], ...opening() };
 
-/** Two models or more open under the slider, the best on the right, references last; a phone draws one at first. */
+/** A phone draws one model at first: the one that masks what does not belong, or the best. */
 function opening() {
-  const means = DATA.models.map((m) => (m.reference ? -1000 : 0) + (m.mean ?? -100));
-  if (means.length < 2) return { left: 0, right: PHOTO, mode: "single" };
-  const best = means.indexOf(Math.max(...means));
-  const other = best ? 0 : 1;
-  if (matchMedia("(pointer: coarse)").matches) return { left: best, right: other, mode: "single" };
-  return { left: other, right: best, mode: "cut" };
-}
-
-/** The camera to open at: the test photo that the model drawn best knows best. */
-function firstView() {
-  const tests = DATA.views.flatMap((v, i) => (v.split === "test" ? [i] : []));
-  const psnr = (i) => Math.max(...DATA.models.map((m) => m.psnr[DATA.views[i].name] ?? -Infinity));
-  return tests.length ? tests.reduce((a, b) => (psnr(b) > psnr(a) ? b : a)) : DATA.views.length ? 0 : null;
+  const { left, right, view } = DATA.opening;
+  const main = right === PHOTO ? left : right;
+  const one = right === PHOTO || matchMedia("(pointer: coarse)").matches;
+  return one ? { left: main, right: main === right ? left : right, mode: "single", view } : { left, right, mode: "cut", view };
 }
 
 function h(name, attributes = {}, ...children) {
@@ -55,51 +46,30 @@ async function loadRenderer() {
 
 const shown = (value, digits = 2) => (typeof value === "number" ? value.toFixed(digits) : "—");
 
+/** Pictures that were decoded last, so that a brush need not wait for them. */
+const decoded = new Map();
+
 function image(uri) {
-  return new Promise((resolve, reject) => {
+  const known = decoded.get(uri) ?? new Promise((resolve, reject) => {
     const picture = new Image();
     picture.onload = () => resolve(picture);
     picture.onerror = () => reject(new Error("a photo of this page is damaged"));
     picture.src = uri;
   });
+  decoded.delete(uri);
+  decoded.set(uri, known);
+  if (decoded.size > 8) decoded.delete(decoded.keys().next().value);
+  return known;
 }
 
-/** Paint a view's photo into a canvas: what the method's mask leaves out turns red, features become dots. */
-async function paintPhoto(canvas, view, model) {
-  const photo = await image(view.photo);
-  canvas.width = photo.naturalWidth;
-  canvas.height = photo.naturalHeight;
-  const context = canvas.getContext("2d", { willReadFrequently: true });
-  context.drawImage(photo, 0, 0);
-  const mask = state.masks && model && model.masks[view.name];
-  if (mask) await paintMask(canvas, context, mask);
-  if (state.masks) paintPoints(canvas, context, view.points);
-  const painted = mask ? [`mask of ${model.label}`] : [];
-  if (state.masks && view.points.length) painted.push("green features stay, red ones move");
-  return painted.join("; ");
+/** Save a file as the browser saves downloads. */
+function save(name, blob) {
+  const url = URL.createObjectURL(blob);
+  h("a", { href: url, download: name.replace(/[^\p{L}\p{N}@+.,_-]+/gu, "_") }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 1000);
 }
 
-function paintPoints(canvas, context, points) {
-  const radius = Math.max(canvas.width / 320, 1);
-  for (let i = 0; i < points.length; i += 3) {
-    context.fillStyle = points[i + 2] ? "#ff2d20" : "#20c040";
-    context.beginPath();
-    context.arc(points[i] / 999 * canvas.width, points[i + 1] / 999 * canvas.height, radius, 0, 7);
-    context.fill();
-  }
-}
-
-async function paintMask(canvas, context, mask) {
-  const keep = await image(mask);
-  const pixels = context.getImageData(0, 0, canvas.width, canvas.height);
-  context.imageSmoothingEnabled = false;
-  context.drawImage(keep, 0, 0, canvas.width, canvas.height);
-  const kept = context.getImageData(0, 0, canvas.width, canvas.height).data;
-  for (let i = 0; i < kept.length; i += 4) {
-    if (kept[i] > 127) continue;
-    pixels.data[i] = 0.45 * pixels.data[i] + 0.55 * 255;
-    pixels.data[i + 1] *= 0.45;
-    pixels.data[i + 2] *= 0.45;
-  }
-  context.putImageData(pixels, 0, 0);
+/** Text in which commands and paths stand between two `. */
+function withCode(text) {
+  return text.split("`").map((part, index) => (index % 2 ? h("code", {}, part) : part));
 }

@@ -59,6 +59,7 @@ class Pane {
     const model = choice === PHOTO ? null : DATA.models[choice];
     this.label.textContent = model ? model.label : "photo";
     this.photo.hidden = choice !== PHOTO;
+    this.element.style.background = model ? "" : "#000"; // the other model does not go on beside the photo
     this.choice = choice;
     if (this.canvas) this.canvas.style.visibility = model ? "visible" : "hidden";
     if (!model || this.showing === choice) return;
@@ -91,16 +92,29 @@ class Pane {
     this.frusta.visible = state.frusta;
     for (const [index, frustum] of this.frusta.children.entries()) frustum.visible = index !== state.view;
     this.renderer.render(this.scene, camera);
+    const gl = this.renderer.getContext();
+    gl.deleteSync(this.fence ?? null);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
     this.drawn = true;
   }
 
+  /** Whether the chosen model is on the screen, its Gaussians sorted for this camera; without a GPU that takes seconds. */
+  get settled() {
+    if (this.choice === PHOTO) return true;
+    const { spark, mesh } = this, gl = this.renderer?.getContext();
+    if (this.showing !== this.choice || !this.drawn || (mesh.numSplats && !spark.activeSplats)) return false;
+    if (spark.updateTimeoutId !== -1 || spark.sorting || spark.sortDirty) return false;
+    return gl.getSyncParameter(this.fence, gl.SYNC_STATUS) === gl.SIGNALED;
+  }
+
   /** The photo lies where the model's picture of it would. */
-  async drawPhoto(view, model) {
+  async drawPhoto(view) {
     if (this.choice !== PHOTO) return;
     this.photo.style.visibility = view ? "visible" : "hidden";
     this.label.textContent = view ? "photo" : "photo: choose a camera";
     if (!view) return;
-    await paintPhoto(this.photo, view, model);
+    await paintPhoto(this.photo, view);
     const { scale, left, top } = fitted(view, this.element.clientWidth, this.element.clientHeight);
     Object.assign(this.photo.style, { left: `${left}px`, top: `${top}px`, width: `${scale * view.width}px`, height: `${scale * view.height}px` });
   }

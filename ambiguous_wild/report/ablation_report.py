@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import Facts, to_plain
+from ambiguous_wild.core.config import Facts, flatten, to_plain
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.ablation_study import (
     DIFFERENCES,
     METRICS,
@@ -31,6 +32,7 @@ from ambiguous_wild.harness.ablation_study import (
     VariantRow,
     read_outcomes,
 )
+from ambiguous_wild.harness.command_lines import option_text
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.io.files import atomic_path, write_json, write_text
 from ambiguous_wild.methods.ablation_groups import DEFAULT
@@ -40,6 +42,7 @@ from ambiguous_wild.report.cost_plots import label_points, new_figure
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell, ranks
 
+LOGARITHMIC = 20.0  # ratio of the values of an option from which their axis is logarithmic
 KEYS = tuple(m.key for m in METRICS)
 SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "model_mb")
 
@@ -54,6 +57,10 @@ def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
     """
     default = read_outcomes(study.default, output)
     rows = [_row(row, read_outcomes(row.cells, output), default) for row in study.rows]
+    for row in rows:
+        if row["variant"] == DEFAULT:
+            of = [other for other in rows if other["group"] == row["group"] and other is not row]
+            row["settings"] = _default_value(study, [other["settings"] for other in of])
     return {
         "schema": 1,
         "made_by": made_by,
@@ -102,6 +109,16 @@ def _networks(row: Planned) -> list[str]:
         return []
     options = to_plain(row.cells[0].options)
     return [f"{key}={options[key]}" for key in BACK_ENDS if key in options]
+
+
+def _default_value(study: Study, settings: Sequence[Sequence[str]]) -> list[str]:
+    """Return KEY=VALUE of the default where the variants are values of this one option."""
+    keys = {setting.partition("=")[0] for of in settings for setting in of}
+    options = flatten(to_plain(study.default[0].options))
+    if len(keys) != 1 or any(len(of) != 1 for of in settings) or not keys <= options.keys():
+        return []
+    (key,) = keys
+    return [f"{key}={option_text(options[key])}"]
 
 
 def _summary(values: list[float | None]) -> SummaryRecord:
@@ -175,7 +192,8 @@ def draw(data: StudyReport, path: Path) -> bool:
         return False
     figure, axes = new_figure(len(groups))
     for panel, (group, points) in zip(axes, groups):
-        _panel(panel, group, points)
+        key, at = _swept([row for row in data["rows"] if row["group"] == group["name"]])
+        _panel(panel, group, _over_values(data, group["name"], at) if key else points, key)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, metadata={"Software": None})
     return True
@@ -192,18 +210,54 @@ def _points(data: StudyReport, group: str) -> list[tuple[str, float, float, floa
     return [(" = ".join(names), ms, psnr, spread) for (ms, psnr), (names, spread) in merged.items()]
 
 
-def _panel(axes: Any, group: GroupFacts, points: list[tuple[str, float, float, float]]) -> None:
+def _swept(rows: Sequence[VariantRow]) -> tuple[str, dict[str, float]]:
+    """Return the option whose values the variants are, and its value by variant; "" if they are others."""
+    key, at = "", {}
+    for row in rows:
+        name, _, text = row["settings"][0].partition("=") if len(row["settings"]) == 1 else ("", "", "")
+        try:
+            at[row["variant"]] = float(text)
+        except ValueError:
+            return "", {}
+        if not name or (key and name != key) or not math.isfinite(at[row["variant"]]):
+            return "", {}
+        key = name
+    return (key, at) if len(set(at.values())) > 1 else ("", {})
+
+
+def _over_values(
+    data: StudyReport, group: str, at: dict[str, float]
+) -> list[tuple[str, float, float, float]]:
+    """Return (variant, value of the option, PSNR, spread) in the order of values, the default once."""
+    rows = [row for row in data["rows"] if row["group"] == group and row["same_as"] != DEFAULT]
+    quality = [(row["variant"], at[row["variant"]], row["values"]["psnr"]) for row in rows]
+    known = [(name, x, y["mean"], y["spread"] or 0.0) for name, x, y in quality if y["mean"] is not None]
+    return sorted(known, key=lambda point: point[1])
+
+
+def _panel(
+    axes: Any, group: GroupFacts, points: list[tuple[str, float, float, float]], swept: str = ""
+) -> None:
+    """Draw PSNR against ms per iteration, or against the values of the option that was swept."""
     ends = []
+    if swept:
+        low, high = points[0][1], points[-1][1]
+        axes.plot(
+            [x for _, x, _, _ in points], [y for _, _, y, _ in points], color="0.75", linewidth=1.0, zorder=0
+        )
+        if low > 0.0 and high >= LOGARITHMIC * low:
+            axes.set_xscale("log")
     for index, (name, ms, psnr, spread) in enumerate(points):
         is_default = name.split(" = ")[0] == DEFAULT
         colour = "k" if is_default else f"C{index % 10}"
         axes.errorbar(ms, psnr, yerr=spread or None, fmt="*" if is_default else "o", color=colour,
                       ms=13 if is_default else 7, elinewidth=1, capsize=2)  # fmt: skip
-        ends.append((name, ms, 0.0, psnr, colour))
+        if is_default or not swept:  # the axis names the others
+            ends.append((f"{DEFAULT} ({ms:g})" if swept else name, ms, 0.0, psnr, colour))
     axes.margins(0.12)
     label_points(axes, ends)
     axes.set_title(f"{group['name']}: {group['title']}", fontsize=8)
-    axes.set_xlabel("ms per iteration", fontsize=8)
+    axes.set_xlabel(plain(swept) or "ms per iteration", fontsize=8, parse_math=False)
     axes.set_ylabel("PSNR (dB)", fontsize=8)
 
 

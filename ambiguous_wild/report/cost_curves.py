@@ -73,21 +73,37 @@ def curves_of(runs: Sequence[CostRun]) -> list[Curve]:
 
 
 def _names(runs: Sequence[CostRun]) -> list[str]:
-    """Return the name of each run's curve: its method, and the settings that vary among the method's runs."""
+    """Return the name of each run's curve: its method, and the settings that vary among the method's runs.
+
+    Where variants of an ablation vary a single option, they and the default are named by its value.
+    """
     asked: dict[str, set[str]] = {}
     values: dict[tuple[str, str], set[Any]] = {}
     for run in runs:
         asked.setdefault(run.method, set()).add(run.asked)
         for key, value in run.options:
             values.setdefault((run.method, key), set()).add(value)
+    swept, shown = _swept(runs), {run.method: run.shown for run in runs}
     names = []
     for run in runs:
         effects = f"+ {run.asked}" if run.asked else "plain"
-        name = run.shown or run.method
+        name, key = run.shown or run.method, swept.get(run.base, "")
+        if key and name == run.method:  # a variant without a label of its own
+            name = shown.get(run.base) or run.base
         parts = [name, effects] if len(asked[run.method]) > 1 else [name]
-        varied = (f"{key}={value}" for key, value in run.options if len(values[run.method, key]) > 1)
+        varied = (f"{k}={value}" for k, value in run.options if k == key or len(values[run.method, k]) > 1)
         names.append(" ".join([*parts, *varied]))
     return names
+
+
+def _swept(runs: Sequence[CostRun]) -> dict[str, str]:
+    """Return by method the option in which alone the variants of its ablation and its default differ."""
+    values: dict[str, dict[str, set[Any]]] = {run.base: {} for run in runs if run.part}
+    for run in runs:
+        for key, value in run.options if run.base in values else ():
+            values[run.base].setdefault(key, set()).add(value)
+    varied = {base: [key for key, of in options.items() if len(of) > 1] for base, options in values.items()}
+    return {base: keys[0] for base, keys in varied.items() if len(keys) == 1}
 
 
 def scenes_of(curves: Iterable[Curve]) -> tuple[str, ...]:

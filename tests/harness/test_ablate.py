@@ -16,6 +16,7 @@ from ambiguous_wild.harness.result_file import write_result
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
 from ambiguous_wild.methods.ablation_groups import Group, Variant, check_groups, choose_groups
+from ambiguous_wild.report import ablation_report
 from ambiguous_wild.report.ablation_report import markdown_of, report, write_report
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.method_hooks import MethodHooks
@@ -257,7 +258,9 @@ def _at(options, key):
     return options
 
 
-def test_values_of_an_option_of_a_method_in_a_file_are_swept_without_a_registry_entry(scene, tmp_path):
+def test_values_of_an_option_of_a_method_in_a_file_are_swept_without_a_registry_entry(
+    scene, tmp_path, monkeypatch
+):
     own = tmp_path / "my.py"
     own.write_text(
         "from dataclasses import dataclass\nfrom ambiguous_wild.splat.method_hooks import MethodHooks\n"
@@ -270,4 +273,13 @@ def test_values_of_an_option_of_a_method_in_a_file_are_swept_without_a_registry_
     rows = list(csv.DictReader((tmp_path / "ablation/ablation.csv").open()))
     assert [row["variant"] for row in rows] == ["default", "0", "2", "1"] and rows[0]["group"] == "sh_degree"
     assert all(row["psnr"] for row in rows)
+    # the default says its value, and the values are the axis of the plot
+    assert [row["settings"] for row in rows] == [f"sh_degree={value}" for value in (2, 0, 2, 1)]
+    data = json.loads((tmp_path / "ablation/ablation.json").read_text())
+    panels = []
+    monkeypatch.setattr(ablation_report, "label_points", lambda axes, ends: panels.append((axes, ends)))
+    assert ablation_report.draw(data, tmp_path / "again.png")
+    ((axes, ends),) = panels
+    assert axes.get_xlabel() == "sh_degree" and [end[0] for end in ends] == ["default (2)"]
+    assert list(axes.lines[0].get_xdata()) == [0.0, 1.0, 2.0]
     assert "unknown option of --sweep 'sh_degre'" in aw(*words, "--sweep", "sh_degre=1").stderr

@@ -21,6 +21,7 @@ from ambiguous_wild.report.cost_curves import (
     Curve,
     MeanAndDeviation,
     Point,
+    curves_of,
     first_time,
     pareto,
     points,
@@ -207,6 +208,18 @@ def test_under_a_budget_both_take_as_long_and_no_rate_is_given(tmp_path: Path) -
     (change,) = changes(read(tmp_path).runs)
     assert change.db.mean == 1.0 and change.same_time and math.isnan(change.db_per_minute)
     assert "same time" in to_text(cost_report(read(tmp_path)))
+
+
+def test_a_sweep_names_every_curve_by_its_value_and_the_default_too(tmp_path: Path) -> None:
+    for method, share in {"mine": 0.8, "mine@share-0.7": 0.7, "mine@share-0.9": 0.9}.items():
+        cost_run(tmp_path, method, options={"share": share, "other": 1})
+    names = [curve.name for curve in curves_of(read_cost_runs([tmp_path]).runs)]
+    assert sorted(names) == ["mine share=0.7", "mine share=0.8", "mine share=0.9"]
+    labelled = curves_of(read_cost_runs([tmp_path], labels=["mine=Ours"]).runs)
+    assert {curve.name for curve in labelled} == {f"Ours share={share}" for share in (0.7, 0.8, 0.9)}
+    cost_run(tmp_path, "mine@parts-none", options={"share": 0.8, "other": 0})
+    names = [curve.name for curve in curves_of(read_cost_runs([tmp_path]).runs)]
+    assert sorted(names) == ["mine", "mine@parts-none", "mine@share-0.7", "mine@share-0.9"]
 
 
 @settings(max_examples=50, deadline=None)

@@ -308,14 +308,15 @@ def find_methods(
     A misspelt name is an error before torch is imported.
     """
     from ambiguous_wild.methods.entry import second_pass_name, trained_once
-    from ambiguous_wild.methods.graft import graft_name
+    from ambiguous_wild.methods.graft import ALIASES, graft_name
     from ambiguous_wild.methods.references import MASKS
-    from ambiguous_wild.methods.registry import get_method, load_plugin
+    from ambiguous_wild.methods.registry import all_methods, get_method, load_plugin
 
     for plugin in plugins:
         load_plugin(Path(plugin))
     donors: dict[str, str | None] = dict(parts.items())
-    if (mask := donors.get("mask")) and Path(mask).is_dir():
+    mask = donors.get("mask")
+    if mask and mask not in {*all_methods(), *ALIASES} and Path(mask).is_dir():
         donors["mask"] = MASKS + mask
     names = []
     for name in (one for text in methods for one in split_methods(text)):

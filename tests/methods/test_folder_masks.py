@@ -1,13 +1,14 @@
 """Masks from files: named after photos of the scene or of the capture, at any size, for any method."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.benchmark import bench
+from ambiguous_wild.harness.benchmark import bench, find_methods
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.keep_resize import smaller_keep
@@ -121,6 +122,16 @@ def test_a_method_is_trained_with_the_masks_of_a_folder(scene, tmp_path):
     write_png(folder / "train_0.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     with pytest.raises(AwError, match="3dgs@mask=sam has changed since this run"):
         train()
+
+
+def test_a_folder_takes_no_method_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("truth", "refinesplat", "mine"):
+        Path(name).mkdir()
+    for mask, donor in (("truth", "3dgs@mask=truth"), ("refinesplat", "3dgs@mask=refinesplat")):
+        assert list(find_methods(["3dgs"], (), {"mask": mask}, 1)) == [donor]
+    with pytest.raises(AwError, match="mine holds no masks"):
+        find_methods(["3dgs"], (), {"mask": "mine"}, 1)
 
 
 def test_what_is_wrong_with_a_folder_is_said(scene, tmp_path):

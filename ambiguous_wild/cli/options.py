@@ -274,6 +274,11 @@ def prepare_cpu(threads: int | None) -> None:
     calibration.prepare_cpu(threads, say)
 
 
+def threads_words(threads: int | None) -> list[str]:
+    """Return the option --threads for a command of ours, if it was given."""
+    return ["--threads", str(threads)] if threads else []
+
+
 def print_command(*words: str | Path) -> None:
     """Print a command of ours as one line to copy."""
     click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)

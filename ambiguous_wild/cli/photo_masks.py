@@ -6,7 +6,15 @@ from pathlib import Path
 
 import click
 
-from ambiguous_wild.cli.options import PathName, own_step, prepare_cpu, say, scene_name, threads_option
+from ambiguous_wild.cli.options import (
+    PathName,
+    own_step,
+    prepare_cpu,
+    say,
+    scene_name,
+    threads_option,
+    threads_words,
+)
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.mask_files import MASK_STYLES
 
@@ -62,7 +70,7 @@ def command(
         source = _trained(ctx, source, output, tool, inpaint, budget, threads)
         words = ["--for", tool] if tool else []
         words += ["--inpaint", str(inpaint)] if inpaint else []
-        own_step(ctx, "masks", source, "-o", output, *words, *_cores(threads))
+        own_step(ctx, "masks", source, "-o", output, *words, *threads_words(threads))
         return
     from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.report.full_size_masks import write_full_size_masks
@@ -78,10 +86,6 @@ def command(
     if inpaint:
         copied = f" and copied {done.copied} in which nothing is masked" if done.copied else ""
         click.echo(f"wrote {counted(done.inpainted, 'inpainted photo')}{copied} to {inpaint}")
-
-
-def _cores(threads: int | None) -> list[str]:
-    return ["--threads", str(threads)] if threads else []
 
 
 def _trained(
@@ -105,7 +109,15 @@ def _trained(
     check_before_training(photos, work, output, tool=tool, inpaint=inpaint, jobs=threads or usable_cores())
     scene, runs, plan = work / "scene", work / "runs", work / "plan.json"
     own_step(
-        ctx, "build-scene", photos, "-o", scene, "--no-test", "--name", scene_name(photos), *_cores(threads)
+        ctx,
+        "build-scene",
+        photos,
+        "-o",
+        scene,
+        "--no-test",
+        "--name",
+        scene_name(photos),
+        *threads_words(threads),
     )
     if not plan.exists():
         own_step(ctx, "plan", scene, "--no-probe", "-o", plan)

@@ -20,6 +20,7 @@ from ambiguous_wild.cli.options import (
     say,
     scene_name,
     threads_option,
+    threads_words,
 )
 from ambiguous_wild.cli.run_progress import ProgressBar
 from ambiguous_wild.core.errors import AwError, counted
@@ -75,7 +76,7 @@ def command(
     if not video:
         photos = source
     say(_announced(source, scene, seconds))
-    cores = ["--threads", str(threads)] if threads else []
+    cores = threads_words(threads)
 
     def step(*words: str | Path, done: Path | None = None) -> None:
         if done is not None and done.exists():

@@ -51,8 +51,10 @@ def as_continued(cell: Cell, folder: Path) -> Cell:
         corrections = CorrectionsFile.of(folder / CORRECTIONS)
     same = replace(cell, continued=earlier, corrections=corrections)
     keys = different_keys(config, same.config)
-    if not keys or not all(map(may_continue, keys)):
-        return same if not keys else cell
+    if not keys:
+        return same
+    if keys == ["train.max_gaussians"] or not all(map(may_continue, keys)):
+        return cell  # another run, which is refused
     if cell.method.passes > 1 or cell.method.program is not None:
         raise AwError(
             f"{folder} cannot be continued: {cell.method.name} trains twice or is an external program; "
@@ -60,8 +62,6 @@ def as_continued(cell: Cell, folder: Path) -> Cell:
         )
     state = checkpoint.load(saved)
     iteration = int(state["iteration"])
-    if keys == ["train.max_gaussians"]:
-        return cell  # of the same length: another run, which is refused
     if cell.train.share_done(iteration, float(state["elapsed_s"])) >= 1.0 and is_finished(folder):
         if any(key.startswith("corrections.") for key in keys):
             raise AwError(

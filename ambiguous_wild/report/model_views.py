@@ -32,7 +32,7 @@ from ambiguous_wild.io.splat_files import FORMATS
 from ambiguous_wild.report.cost_curves import duration
 from ambiguous_wild.splat.calibration import prepare_cpu
 from ambiguous_wild.viewing.live import LiveView
-from ambiguous_wild.viewing.model import space_of
+from ambiguous_wild.viewing.model import ViewedModel, space_of
 from ambiguous_wild.viewing.model_export import ExportedModel, ExportParts, export
 from ambiguous_wild.viewing.page_file import PAGE, check_page_folder, page_text
 from ambiguous_wild.viewing.video import (
@@ -302,6 +302,9 @@ class GrowingPage:
     def begin(self, label: str) -> None:
         """Call it before each run; `label` is the run's name on the page."""
         self._next_label = label
+        self._ended: list[ViewedModel] = []
+        with suppress(AwError):  # no run has ended yet
+            self._ended = [t.model for t in find_models([self.runs])[0] if t.model.label != label]
 
     def tick(self, trainer: Trainer) -> bool:
         """Write the page if one is due, after an iteration with the clock stopped; return whether it was."""
@@ -330,9 +333,7 @@ class GrowingPage:
         assert self._trainer is not None
         begin, scene = time.monotonic(), self._trainer.data.scene
         masks = {view.name: keep for view, keep in keep_maps(self._trainer)}
-        models = [training_model(self._trainer, self._label, masks)]
-        with suppress(AwError):  # no run has ended yet
-            models = [t.model for t in find_models([self.runs])[0] if t.model.label != self._label] + models
+        models = [*self._ended, training_model(self._trainer, self._label, masks)]
         text, _ = page_text(
             scene,
             models,

@@ -154,14 +154,10 @@ class Pace:
         self.most = self._most(data, most)
         self.levels = self._levels(data)
 
-    def progress(self, iteration: int, elapsed_s: float) -> float:
-        """Return the share of the run done after these steps and seconds of training, in [0, 1]."""
-        return self.config.share_done(iteration, elapsed_s)
-
     def marks(self, count: int, iteration: int, elapsed_s: float) -> int:
         """Return how many of `count` evenly spaced marks are passed, the last at the end of the run."""
         if self.config.budget_s is not None:
-            return int(self.progress(iteration, elapsed_s) * count)
+            return int(self.config.share_done(iteration, elapsed_s) * count)
         return min(iteration, self.config.iterations) * count // self.config.iterations
 
     def downsampling(self, progress: float) -> int:

@@ -206,7 +206,7 @@ class Trainer:
 
     def progress(self, iteration: int) -> float:
         """Return the share of the run done after `iteration` steps, in [0, 1]."""
-        return self.pace.progress(iteration, self.clock.now())
+        return self.config.share_done(iteration, self.clock.now())
 
     @property
     def done(self) -> bool:

@@ -91,7 +91,7 @@ def _dense_part(part, parts, p, m, v, g, rate, root):
 def dense(p, m, v, g, rate, root, parts):
     """Step flat arrays."""
     for part in numba.prange(parts):
-        _dense_part(part, parts, p, m, v, g, rate, root)
+        _dense_part(0 + part, parts, p, m, v, g, rate, root)
 
 
 @inner_kernel

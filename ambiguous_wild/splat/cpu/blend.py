@@ -147,8 +147,9 @@ def _forward_worker(
             records, tile_slots, starts[tile], starts[tile + 1], left, top, width, height, centres, state,
             touched,
         )  # fmt: skip
-        kept[tile, 0, :] = state[0]
-        kept[tile, 1, :] = state[5]
+        for at in range(PIXELS):  # copies of slices take 1.5 s to compile, for the text of their errors
+            kept[tile, 0, at] = state[0][at]
+            kept[tile, 1, at] = state[5][at]
         across = min(TILE, width - left)
         for y in range(min(TILE, height - top)):
             for x in range(across):
@@ -181,7 +182,7 @@ def forward(
     """
     for worker in numba.prange(workers):
         _forward_worker(
-            worker, records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha,
+            0 + worker, records, tile_slots, starts, tile_order, workers, width, height, background, image, alpha,
             depth, kept, touched,
         )  # fmt: skip
 
@@ -368,6 +369,6 @@ def backward(
     """
     for worker in numba.prange(workers):
         _backward_worker(
-            worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height,
+            0 + worker, records, tile_slots, tile_instances, starts, tile_order, workers, width, height,
             background, kept, touched, d_image, d_alpha, d_depth, d_extra, absolute, tally, sums,
         )  # fmt: skip

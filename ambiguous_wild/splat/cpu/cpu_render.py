@@ -224,7 +224,7 @@ def render_cpu(
     project.colours(means, sh0, sh_rest, sh_degree, centre, records, ids, counts, radii, base)
     slots = bins.visible_slots(ids, counts)
     shaded = None if shade is None or base is None else _shade(shade, base, ids, slots, records)
-    order = bins.depth_order(slots, records)
+    order = bins.depth_order(slots, records.view(np.uint32))
 
     columns, rows = -(-width // bins.TILE), -(-height // bins.TILE)
     instances = _pool.take("instances", (n,), np.int32)

@@ -36,14 +36,15 @@ def stride(width: int) -> int:
 
 @parallel_kernel
 def pack(image, keep, out):
-    """Copy [H, W, 3] into rows of whole vectors [H, stride], times keep [H, W] unless it is None."""
+    """Copy [H, W, 3] into rows of whole vectors [H, stride], times keep [H, W] unless it is empty."""
     height, width = image.shape[0], image.shape[1]
+    weighted = keep.shape[0] > 0
     for y in numba.prange(height):
         out[y, 3 * width :] = np.float32(0.0)
         for x in range(width):
             for c in range(3):
                 value = image[y, x, c]
-                if keep is not None:
+                if weighted:
                     value *= keep[y, x]
                 out[y, 3 * x + c] = value
 
@@ -62,7 +63,7 @@ def _statistics_row(
     zero = splat(np.float32(0.0))
     for x in range(width):
         w = np.float32(1.0)
-        if keep is not None:
+        if keep.shape[0] > 0:
             w = keep[y, x]
         weights[3 * x] = w
         weights[3 * x + 1] = w
@@ -119,7 +120,7 @@ def _statistics_row(
         difference = load(flat_x, y * length + at) - load(flat_y, y * length + at)
         sum_l1 = fma(weight, select(difference > 0.0, difference, zero - difference), sum_l1)
         sum_ssim = fma(weight, 1.0 - s, sum_ssim)
-        if ssim is not None:
+        if ssim.shape[0] > 0:
             store(ssim.reshape(-1), y * length + at, s)
         # dS/dxy, dS/dxx, and dS/dmean with E[xx], E[xy] held fixed.
         d_xy = a1 * inverse * 2.0
@@ -158,7 +159,7 @@ def _gradient_row(y, height, width, x_rows, y_rows, taps, keep, outer, l1_scale,
         store(buffers, 2 * step + PAD + at, xy)
     for x in range(width):
         w = np.float32(1.0)
-        if keep is not None:
+        if keep.shape[0] > 0:
             w = keep[y, x]
         weights[3 * x] = w
         weights[3 * x + 1] = w
@@ -182,7 +183,7 @@ def _gradient_row(y, height, width, x_rows, y_rows, taps, keep, outer, l1_scale,
     base = 3 * step + PAD
     for x in range(width):
         chain = np.float32(1.0)
-        if outer is not None:
+        if outer.shape[0] > 0:
             chain = outer[y, x]
         for c in range(3):
             out[y, x, c] = buffers[base + 3 * x + c] * chain
@@ -195,13 +196,13 @@ def photometric(x_rows, y_rows, width, taps, keep, outer, lam, parts, maps, ssim
     Args:
         x_rows, y_rows: [H, stride], from `pack`.
         taps: [11] float32.
-        keep: [H, W] weight w, or None for one.
-        outer: [H, W] factor chained onto the gradient (the pictures were multiplied by it), or None.
+        keep: [H, W] weight w; empty for one.
+        outer: [H, W] factor chained onto the gradient (the pictures were multiplied by it), or empty.
         lam: share of 1 - SSIM.
         parts: work items; the result does not depend on it.
         maps: [3, H, stride] scratch.
-        ssim: [H, stride] out, or None.
-        out: [H, W, 3] out, or None for the sums alone.
+        ssim: [H, stride] out, or empty.
+        out: [H, W, 3] out, or empty for the sums alone.
     """
     height, length = x_rows.shape
     scale = np.float32(-lam / (3.0 * height * width))
@@ -213,7 +214,7 @@ def photometric(x_rows, y_rows, width, taps, keep, outer, lam, parts, maps, ssim
             _statistics_row(
                 y, height, width, x_rows, y_rows, taps, keep, scale, buffers, maps, weights, ssim, totals
             )
-    if out is not None:
+    if out.shape[0] > 0:
         for part in numba.prange(parts):
             buffers = np.zeros(5 * (length + 2 * PAD), np.float32)
             weights = np.zeros(length, np.float32)
@@ -225,13 +226,14 @@ def photometric(x_rows, y_rows, width, taps, keep, outer, lam, parts, maps, ssim
 
 _pool = BufferPool()
 _taps = window()
+_NONE = np.empty((0, 0), np.float32)  # of the type of what it stands for, as each type is compiled anew
 
 
 def _plain(tensor: Tensor) -> np.ndarray:
     return tensor.detach().to(torch.float32).contiguous().numpy()
 
 
-def _packed(name: str, image: Tensor, keep: np.ndarray | None) -> np.ndarray:
+def _packed(name: str, image: Tensor, keep: np.ndarray) -> np.ndarray:
     rows = _pool.take(name, (image.shape[0], stride(image.shape[1])))
     pack(_plain(image), keep, rows)
     return rows
@@ -242,9 +244,8 @@ def photometric_cpu(
 ) -> tuple[float, float, Tensor]:
     """Return L1, 1 - SSIM and the gradient of their mix; arguments as for `losses.photometric`."""
     height, width = render.shape[:2]
-    mask = None if keep is None else _plain(keep)
-    inside = mask if weighting == "images" else None
-    outside = None if weighting == "images" else mask
+    mask = _NONE if keep is None else _plain(keep)
+    inside, outside = (mask, _NONE) if weighting == "images" else (_NONE, mask)
     x_rows = _packed("render", render, inside)
     y_rows = _packed("photo", photo, inside)
     maps = _pool.take("maps", (3, *x_rows.shape))
@@ -252,7 +253,7 @@ def photometric_cpu(
     out = np.empty((height, width, 3), np.float32)
     photometric(
         x_rows, y_rows, width, _taps, outside, inside, float(lambda_dssim), min(height, threads()), maps,
-        None, totals, out,
+        _NONE, totals, out,
     )  # fmt: skip
     # One serial sum over rows, so that its order, and so the bits, do not depend on the threads.
     l1, dssim = (totals.cumsum(axis=0)[-1] / (3 * height * width)).tolist()
@@ -262,11 +263,11 @@ def photometric_cpu(
 def ssim_map_cpu(a: Tensor, b: Tensor) -> Tensor:
     """Return SSIM of every pixel and channel, [H, W, 3]."""
     height, width = a.shape[:2]
-    x_rows = _packed("render", a, None)
-    y_rows = _packed("photo", b, None)
+    x_rows = _packed("render", a, _NONE)
+    y_rows = _packed("photo", b, _NONE)
     maps = _pool.take("maps", (3, *x_rows.shape))
     out = np.empty(x_rows.shape, np.float32)
     totals = np.empty((height, 2), np.float64)
     parts = min(height, threads())
-    photometric(x_rows, y_rows, width, _taps, None, None, 0.0, parts, maps, out, totals, None)
+    photometric(x_rows, y_rows, width, _taps, _NONE, _NONE, 0.0, parts, maps, out, totals, _NONE[..., None])
     return torch.from_numpy(out[:, : 3 * width].reshape(height, width, 3))

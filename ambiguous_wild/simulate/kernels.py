@@ -293,7 +293,7 @@ def _gloss(strength, sharpness, n, d, sun, sunlit, light):
 
 
 @kernel(inline="never")
-def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_others, shadow_casters):
+def shade(table, s, t, o, d, spread, atlas, light, sun, static, movers, shadow_casters):
     """Compute the colour of shape s at distance t: texture, sun with shadow, sky light from above and below.
 
     Returns the colour with and without the shadows of `shadow_casters`, equal where no shadow falls.
@@ -333,7 +333,8 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, blockers, others, use_ot
     if lit > 0.0:
         lift = 2e-3
         q = (o[0] + t * d[0] + lift * wx, o[1] + t * d[1] + lift * wy, o[2] + t * d[2] + lift * wz)
-        if _shadowed(blockers, q, sun) or (use_others and _shadowed(others, q, sun)):
+        # distractors cast no shadow on the scene
+        if _shadowed(static, q, sun) or (table[10][s] > 0 and _shadowed(movers, q, sun)):
             lit = 0.0
         else:
             darkened = _shadowed(shadow_casters, q, sun)

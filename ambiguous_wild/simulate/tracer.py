@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import cv2
@@ -129,7 +130,7 @@ def trace(
     clean, distracted = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
     owner, depth = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
     darkened = np.zeros(shape, np.bool_)
-    _trace(
+    world = (
         (
             np.ascontiguousarray(camera.cam_from_world[:3, :3]),
             camera.center,
@@ -143,6 +144,9 @@ def trace(
         (light.sun, light.sun_colour, light.sky_colour, light.ground_colour),
         (clean, distracted, owner, depth, darkened),
     )
+    # Threads of Python, as a kernel with threads of its own takes twice as long to compile.
+    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
+        list(threads.map(lambda top: _tiles(top, *world), range(0, camera.height, _TILE)))
     return TracedPhoto(clean, distracted, None if shadow_casters is None else darkened, owner, depth)
 
 
@@ -178,15 +182,13 @@ def _ray(rotation, k, u, v):
     ), z
 
 
-@kernel(parallel=True)
-def _trace(view, static, movers, shadow_casters, atlas, light, frame):
+@kernel(nogil=True)
+def _tiles(y0, view, static, movers, shadow_casters, atlas, light, frame):
+    """Render a row of tiles."""
     height, width = frame[2].shape
-    across = (width + _TILE - 1) // _TILE
-    down = (height + _TILE - 1) // _TILE
-    for tile in numba.prange(across * down):
-        x0, y0 = (tile % across) * _TILE, (tile // across) * _TILE
-        x1, y1 = min(x0 + _TILE, width), min(y0 + _TILE, height)
-        _tile(view, (x0, y0, x1, y1), static, movers, shadow_casters, atlas, light, frame)
+    for x0 in range(0, width, _TILE):
+        box = (x0, y0, min(x0 + _TILE, width), min(y0 + _TILE, height))
+        _tile(view, box, static, movers, shadow_casters, atlas, light, frame)
 
 
 @kernel(inline="never")
@@ -221,7 +223,7 @@ def _tile(view, box, static, movers, shadow_casters, atlas, light, frame):
                 seen, bright = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
                 if s >= 0:
                     seen, bright = shade(
-                        static, s, t, o, d, spread, atlas, light, sun, static, static, False, shadow_casters
+                        static, s, t, o, d, spread, atlas, light, sun, static, static, shadow_casters
                     )
                     z_sum += t * z
                 cr, cg, cb = cr + bright[0], cg + bright[1], cb + bright[2]
@@ -230,19 +232,7 @@ def _tile(view, box, static, movers, shadow_casters, atlas, light, frame):
                     tm, m = nearest(movers, near_movers, mover_count, o, d, t)
                     if m >= 0:
                         seen, _ = shade(
-                            movers,
-                            m,
-                            tm,
-                            o,
-                            d,
-                            spread,
-                            atlas,
-                            light,
-                            sun,
-                            static,
-                            movers,
-                            True,
-                            shadow_casters,
+                            movers, m, tm, o, d, spread, atlas, light, sun, static, movers, shadow_casters
                         )
                         hit = movers[10][m] if hit == 0 else hit
                 mr, mg, mb = mr + seen[0], mg + seen[1], mb + seen[2]

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import cv2
 import numba
@@ -145,9 +146,13 @@ def trace(
         (clean, distracted, owner, depth, darkened),
     )
     # Threads of Python, as a kernel with threads of its own takes twice as long to compile.
-    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        list(threads.map(lambda top: _tiles(top, *world), range(0, camera.height, _TILE)))
+    list(_pool(numba.get_num_threads()).map(lambda top: _tiles(top, *world), range(0, camera.height, _TILE)))
     return TracedPhoto(clean, distracted, None if shadow_casters is None else darkened, owner, depth)
+
+
+@lru_cache(maxsize=1)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
 
 
 @kernel(inline="never")

@@ -49,7 +49,7 @@ def kernels_meanwhile() -> Iterator[None]:
 
 def _compiled() -> bool:
     """Tell whether the kernel that is compiled last is on disk for the present source."""
-    from ambiguous_wild.splat.cpu.compile import kernel_cache
+    from ambiguous_wild.io.numba_cache import kernel_cache
 
     return any(kernel_cache().rglob("*catch_up_all*.nbi"))
 

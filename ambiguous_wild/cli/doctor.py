@@ -234,7 +234,7 @@ def _opencv() -> SystemCheck:
 def _numba(probed: Probe) -> list[SystemCheck]:
     if probed.facts is None:
         return [_core("numba", False, probed.error, _install_again("numba llvmlite"))]
-    from ambiguous_wild.splat.cpu.compile import kernel_cache
+    from ambiguous_wild.io.numba_cache import kernel_cache
 
     folder = kernel_cache()
     existing = next(p for p in (folder, *folder.parents) if p.exists())

@@ -10,9 +10,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba
-
-from ambiguous_wild.io.numba_cache import rebuild_damaged_cache
+from ambiguous_wild.io.numba_cache import kept_on_disk
 
 QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER, VOLUME = range(6)
 PLANAR, BY_FACE, DOME = range(3)  # texture mapping
@@ -22,9 +20,8 @@ _NEAR_M = 4e-4  # distance at which a ray has reached the surface
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles with these options of Numba; the result is kept on disk."""
-    compiled: Any = numba.njit(cache=True, error_model="numpy", **options)
-    return lambda function: rebuild_damaged_cache(compiled(function))
+    """Return a decorator that compiles with these options of Numba."""
+    return lambda function: kept_on_disk(function, **options)
 
 
 @kernel(inline="never")

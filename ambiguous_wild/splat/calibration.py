@@ -19,9 +19,10 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.processes import python_meanwhile
+from ambiguous_wild.io.numba_cache import cache_in_use, how_often
 from ambiguous_wild.io.terminal import clock
 from ambiguous_wild.splat import backend
-from ambiguous_wild.splat.cpu.compile import how_often, one_thread
+from ambiguous_wild.splat.cpu.compile import one_thread
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.optim import SplatAdam
@@ -178,7 +179,7 @@ def warm_up(announce: Callable[[str], None] | None = None, helper: bool = False)
         if not _cached():
             if announce is not None:
                 expected_s = COLD_IN_SAMPLES * _compile_sample()
-                announce(f"compiling CPU kernels (about {expected_s:.0f} s, {how_often()})...")
+                announce(f"compiling CPU kernels (about {expected_s:.0f} s, {how_often(cache_in_use())})...")
                 stack.enter_context(clock("compiling", expected_s))
             if helper:
                 code = f"from {__name__} import warm_losses; warm_losses()"

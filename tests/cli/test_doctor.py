@@ -13,6 +13,7 @@ import pytest
 
 from ambiguous_wild.cli import doctor
 from ambiguous_wild.cli.doctor import PROBES, Probe, SystemCheck, all_checks, other_versions, probe, unmet
+from ambiguous_wild.io.numba_cache import kernel_cache
 from tests.command_line import aw
 
 
@@ -159,8 +160,8 @@ def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "new" / "cache"))
     fresh = doctor._numba(probe_ok)[1]
     assert fresh.ok and "not compiled yet" in fresh.detail
-    (tmp_path / "new" / "cache" / "sub").mkdir(parents=True)
-    (tmp_path / "new" / "cache" / "sub" / "a.nbi").touch()
+    kernel_cache().mkdir(parents=True)
+    (kernel_cache() / "a.nbi").touch()
     assert "1 kernels compiled" in doctor._numba(probe_ok)[1].detail
     monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
     refused = doctor._numba(probe_ok)[1]

@@ -11,6 +11,7 @@ from unittest.mock import Mock
 import pytest
 
 from ambiguous_wild.cli import build_scene as kernels
+from ambiguous_wild.io.numba_cache import kernel_cache
 from ambiguous_wild.splat import calibration
 from tests.command_line import Terminal
 
@@ -31,8 +32,8 @@ def test_nothing_is_left_behind_even_after_an_error(cache):
 
 
 def test_what_is_compiled_already_is_left_alone(cache):
-    (cache / "adam_1").mkdir()
-    (cache / "adam_1" / "adam.catch_up_all-128.py311.nbi").touch()
+    kernel_cache().mkdir()
+    (kernel_cache() / "adam.catch_up_all-128.py311.nbi").touch()
     with kernels.kernels_meanwhile():
         subprocess.Popen.assert_not_called()
 

@@ -360,12 +360,22 @@ def _git() -> SystemCheck:
 
 @click.command(name="doctor")
 @json_option
-def command(as_json: bool) -> None:
+@click.option(
+    "--warm", is_flag=True,
+    help="First compile the CPU kernels, into $NUMBA_CACHE_DIR if that is set: a folder that can be copied, "
+    "also read-only, to containers and machines with such a processor.",
+)  # fmt: skip
+def command(as_json: bool, warm: bool) -> None:
     """Check this machine: packages, CPU, GPU, kernels, weights; with a command to install what is missing.
 
     Exit code 0 if the core works (optional parts may be missing), else 2.
     """
+    if warm:
+        from ambiguous_wild.simulate.photo_render import compile_tracer
+        from ambiguous_wild.splat.calibration import warm_up
 
+        warm_up(lambda line: click.echo(line, err=True), helper=True)
+        compile_tracer()
     checks = all_checks()
     broken = [c for c in checks if c.group == "core" and not c.ok]
     if as_json:

@@ -26,7 +26,7 @@ from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
 from ambiguous_wild.simulate.shapes import Shape, shape_table
 from ambiguous_wild.simulate.spec import CaptureSpec, Effects
-from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, trace
+from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, build_atlas, trace
 from ambiguous_wild.simulate.truth_records import DrawnEffects
 from ambiguous_wild.simulate.world import World
 
@@ -122,6 +122,14 @@ def depth_m(world: World, camera: Camera) -> np.ndarray:
     """Return z of the static surface in the pinhole camera, [H, W] float32, m."""
     nothing = shape_table((), world.atlas)
     return trace(camera, world.table(), nothing, world.atlas, world.light).depth_m
+
+
+def compile_tracer() -> None:
+    """Compile the kernels, which are kept on disk."""
+    atlas = build_atlas({"grey": np.ones((1, 1, 3), np.float32)})
+    nothing, black = shape_table((), atlas), np.zeros(3)
+    camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))
+    trace(camera, nothing, nothing, atlas, Light(np.ones((1, 3)), black, black, black))
 
 
 def _lasting(effects: Effects) -> Effects:

@@ -21,6 +21,7 @@ RADIUS = 5
 C1 = 0.01**2
 C2 = 0.03**2
 PAD = 16  # floats on either side of a row buffer, at least 3 * RADIUS
+_NONE = np.empty((0, 0), np.float32)  # of the type of what it stands for, as each type is compiled anew
 
 
 def window() -> np.ndarray:
@@ -226,7 +227,6 @@ def photometric(x_rows, y_rows, width, taps, keep, outer, lam, parts, maps, ssim
 
 _pool = BufferPool()
 _taps = window()
-_NONE = np.empty((0, 0), np.float32)  # of the type of what it stands for, as each type is compiled anew
 
 
 def _plain(tensor: Tensor) -> np.ndarray:

@@ -33,6 +33,7 @@ from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_arrays import SplatFile
+from ambiguous_wild.methods.graft import split_graft
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import RenderSettings, ViewedModel, file_model
@@ -298,19 +299,25 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
     An unknown method is drawn as plain 3DGS. The run may come from a stranger: no file that its name refers
     to is imported.
     """
-    name = str(config.get("method", ""))
+    name, source = str(config.get("method", "")), str(config.get("source", ""))
+    options = section(config, "options")
     try:
         if is_reference(name):
             raise AwError(f"{name} is a file")
-        entry = get_method(name)
+        host, rest = split_graft(name)
+        # Masks, also those of a folder, density control and regulariser do not change how a model is drawn.
+        as_host = rest != "" and "effects=" not in rest and not get_method(host).source_hash
+        entry = get_method(host if as_host else name)
+        if as_host:
+            source, options = "", section(options, "host")
         if entry.program is not None:
             return RenderSettings(), ""
-        chosen = from_plain(type(entry.options()), section(config, "options"), "options")
+        chosen = from_plain(type(entry.options()), options, "options")
         hooks = entry.build(chosen)
     except AwError:
         advice = "if it is a method of yours, name its file with --plugin"
         return RenderSettings(), f"{name} is an unknown method and drawn as plain 3DGS: {advice}"
-    if entry.source_hash != str(config.get("source", "")):
+    if entry.source_hash != source:
         return RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"
     antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
     behind = section(config, "scene").get("background", hooks.background)

@@ -178,7 +178,7 @@ def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None =
 
     Args:
         run: the run's folder.
-        folder: where the scene lies; None = where the run says.
+        folder: where the scene lies; None = where the run says, else beside a folder that the run is in.
         opened: verified scenes of earlier calls, which are not opened again. Who gives it measures runs, so
             the scene is asked what it is asked before training.
 
@@ -189,9 +189,12 @@ def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None =
     if not isinstance(config, dict):
         raise AwError(f"{run} has no {CONFIG} that names its scene: restore it, or run 'aw bench' again")
     path = Path(str(config.get("path"))) if folder is None else folder
+    if folder is None and not path.is_dir():  # the folder that holds scene and runs was moved or copied
+        beside = (parent / path.name for parent in run.resolve().parents)
+        path = next((place for place in beside if (place / "sparse").is_dir()), path)
     if not path.is_dir():
         raise AwError(
-            f"the scene of {run} is not at {path}: move the scene back "
+            f"the scene of {run} is not at {path}, nor beside its runs: move the scene back "
             "('aw view', 'aw video', 'aw export' and 'aw rescore' take its folder: --scene)"
         )
     factor = config.get("factor")

@@ -112,12 +112,19 @@ def _grid(runs: Sequence[_Run]) -> list[str]:
     seeds = _differing(runs, lambda run: run.result["method"], lambda of: _listed(_seeds(of), "seed"))
     lengths = _said(runs, _length, "they trained for {}", "they trained for different lengths: {}")
     sentences = [f"The results are those of {of}, with {seeds}; {lengths}."]
-    own = {
-        run.result["method"]: run.config["source"] for run in runs if run.config and run.config.get("source")
-    }
-    if own:
-        files = _listed(f"{method} {str(source)[:HASH]}" for method, source in own.items())
-        sentences.append(f"Methods in files of their own, with the SHA-256 of the file: {files}.")
+    files, masks = {}, {}
+    for run in runs:
+        if run.config and (source := str(run.config.get("source") or "")[:HASH]):
+            if "--mask" in run.words:
+                masks[run.words[run.words.index("--mask") + 1]] = source
+            else:
+                files[run.result["method"]] = source
+    if files:
+        named = _listed(map(" ".join, files.items()))
+        sentences.append(f"Methods in files of their own, with the SHA-256 of the file: {named}.")
+    if masks:
+        named = _listed(map(" ".join, masks.items()))
+        sentences.append(f"Masks given as files, with the SHA-256 of all in a folder: {named}.")
     effects = _said(
         runs, lambda run: effects_of(run.result["facts"]), "{}", "{}",
     )  # fmt: skip

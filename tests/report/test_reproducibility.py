@@ -72,6 +72,20 @@ def test_the_command_makes_the_same_cells(runs, scene: Path) -> None:
     assert [cell.identity for cell in again] == said
 
 
+def test_masks_of_a_folder_are_given_as_they_were_typed(runs, scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "sam").mkdir()
+    for photo in (scene / "images").iterdir():
+        (tmp_path / "sam" / photo.name).write_bytes(photo.read_bytes())
+    names = [f"{host}@mask=masks:{tmp_path / 'sam'}" for host in ("3dgs", "absgs")]
+    said = statement([runs(*names, reproduce=f"aw bench --method {names[0]}")])
+    (line,) = said.commands
+    assert (
+        "--method 3dgs --mask sam --method absgs" in line or "--method 3dgs --method absgs --mask sam" in line
+    )
+    assert "Masks given as files, with the SHA-256 of all in a folder: sam " in " ".join(said.sentences)
+    assert "Methods in files" not in " ".join(said.sentences)
+
+
 def test_where_runs_differ_it_says_which_have_what(runs) -> None:
     runs("3dgs")
     runs("absgs", environment=MACHINE | {"cpu": "EPYC", "commit": "cd" * 20})

@@ -51,8 +51,8 @@ class StudyFile:
         """Raise AwError if the method of a run is in a file that nobody `found`."""
         if self.run.get("source") and not found:
             raise AwError(
-                f"{self.path} is of the method {quoted(self.run.get('method'))}, which is in a file of its own: add "
-                "--plugin FILE.py, or --method FILE.py:RECIPE"
+                f"{self.path} is of the method {quoted(self.run.get('method'))}, which takes files of yours: add "
+                "--plugin FILE.py, --method FILE.py:RECIPE or --mask FOLDER"
             )
 
     def report_changes(self, cells: Sequence[Cell]) -> None:

@@ -32,6 +32,7 @@ from ambiguous_wild.harness.result_file import (
     FAILED,
     IGNORED,
     RESULT,
+    STOPPED,
     RunConfig,
     artefact_hashes,
     check_whole,
@@ -40,7 +41,7 @@ from ambiguous_wild.harness.result_file import (
 )
 from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
-from ambiguous_wild.harness.training import STOPPED, train_and_measure
+from ambiguous_wild.harness.training import train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.corrections import CORRECTIONS
 from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
@@ -163,6 +164,8 @@ def _describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
     """Return one difference in words of the command line."""
     if key == "source":
         return f"{_file_name(cell)} has changed since this run"
+    if key == "continued":
+        return f"it {'went' if before.get(key) else 'did not go'} on from a shorter one"
     default = "full" if key == "protocol" else None  # a config leaves out the full protocol
     return f"{key} was {before.get(key, default)}, is {now.get(key, default)}"
 

@@ -103,7 +103,7 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
     except AwError:
         raise AwError(
             f"{run} was trained by {method}, with a method or masks of yours: files are not loaded from a "
-            "run's record; in Python, registry.load_reference('FILE.py:NAME'), or of 'masks:FOLDER', loads them"
+            "run's record; in Python, registry.load_reference('FILE.py:NAME' or 'masks:FOLDER') loads them"
         ) from None
     if entry.passes > 1:
         raise AwError(

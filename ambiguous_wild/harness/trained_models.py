@@ -22,6 +22,7 @@ from ambiguous_wild.harness.result_file import (
     CONFIG,
     MODEL,
     RESULT,
+    STOPPED,
     RunResult,
     check_model,
     metrics_of,
@@ -214,6 +215,10 @@ def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None =
 
 
 def _read_model(run: Path) -> TrainedModel:
+    if not (run / RESULT).is_file():
+        stopped = run / STOPPED / MODEL
+        shown = f"; its model is {stopped}" if stopped.is_file() else ""
+        raise AwError(f"{run} is not finished: the command that began it continues it{shown}")
     result = read_result(run / RESULT)
     if result["status"] != "ok":
         raise AwError(f"{run} failed: {result['error']}")

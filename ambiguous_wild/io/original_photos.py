@@ -120,7 +120,7 @@ def capture_folder(scene: Path, info: Mapping[str, Any]) -> Path:
         folder = next((place for place in moved if place.is_dir()), folder)
     if not folder.is_dir():
         raise AwError(
-            f"the photos that {scene} was built from are not at {folder}: move scene or photos back, or build "
-            "the scene again"
+            f"the photos that {scene} was built from are not at {folder}: move scene or photos back, or "
+            "build the scene again"
         )
     return folder

@@ -114,7 +114,7 @@ def command_words(config: RunConfig, recorded: str = "") -> list[str]:
 
 
 def _method(config: RunConfig, recorded: str) -> list[str]:
-    """Return --method, of an own method as it was given, --plugin and --mask; files are named without folders."""
+    """Return --method, of an own method as it was given, --plugin or --mask; files without their folders."""
     method = config["method"]
     if not config["source"]:
         return ["--method", method]

@@ -59,7 +59,7 @@ def test_each_photo_gets_the_mask_of_its_pixels(made, tmp_path):
     """Oracle: the exact masks, as they were drawn on the photos before these were undistorted and halved."""
     done = write_full_size_masks(made / "runs", tmp_path / "masks")
     assert done.masks == 6 and sorted(done.white) == ["test/p01.jpg", "test/p04.jpg"]
-    assert done.lines() == ["nothing is masked in test/p01.jpg, test/p04.jpg: the run was not trained on it"]
+    assert done.lines() == ["nothing is masked in test/p01.jpg, test/p04.jpg: not among the train photos"]
     for name in TRAIN[1:]:
         truth = read_gray(made / "raw/truth/distractor" / f"{name}.png") > 0
         mask = read_gray(tmp_path / "masks/train" / f"{name}.png")

@@ -160,7 +160,7 @@ def _is_our_config(path: Path) -> bool:
         return True
 
 
-def _describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
+def describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
     """Return one difference in words of the command line."""
     if key == "source":
         return f"{_file_name(cell)} has changed since this run"
@@ -225,7 +225,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         return
     now = flatten(dict(cell.config))
     keys = different_keys(before, now)
-    changes = ", ".join(_describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
+    changes = ", ".join(describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
     how = "changed" if made_anew(folder, "changed", cell.config) else "always"
     longer = ", continue it with --overwrite longer" if keys and all(map(may_continue, keys)) else ""
     raise AwError(

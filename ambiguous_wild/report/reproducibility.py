@@ -125,6 +125,8 @@ def _grid(runs: Sequence[_Run]) -> list[str]:
     if masks:
         named = _listed(map(" ".join, masks.items()))
         sentences.append(f"Masks given as files, with the SHA-256 of all in a folder: {named}.")
+    if corrected := [run for run in runs if run.config and run.config.get("corrections")]:
+        sentences.append(f"Masks of {_which(corrected, runs)} were corrected by hand.")
     effects = _said(
         runs, lambda run: effects_of(run.result["facts"]), "{}", "{}",
     )  # fmt: skip
@@ -197,12 +199,13 @@ def _repeats(runs: Sequence[_Run]) -> str:
     def repeats(run: _Run) -> bool:
         train = section(dict(run.config), "train") if run.config else {}
         cpu = str(run.result["cost"].get("device", "")).startswith("cpu")
-        return cpu and bool(train) and train.get("budget_s") is None
+        continued = run.config is not None and run.config.get("continued")
+        return cpu and bool(train) and train.get("budget_s") is None and not continued
 
     exact = [run for run in runs if repeats(run)]
     if len(exact) == len(runs):
         return "The commands repeat bit for bit on a processor of this kind, for any number of threads."
-    others = "end by the clock, or on a GPU or in another program"
+    others = "end by the clock, went on from shorter ones, or are of a GPU or another program"
     if not exact:
         return f"The runs {others}, and do not repeat bit for bit."
     rest = [run for run in runs if not repeats(run)]

@@ -232,4 +232,4 @@ def test_the_method_of_a_run_in_a_file_must_be_given(project: Path, planned) -> 
     shutil.copy(project / "own" / "recipe.py", changed)
     changed.write_text(changed.read_text() + "# edited\n")
     done = aw("bench", config, "--method", f"{changed}:build", "-o", "other", cwd=project)
-    assert "not the same run as" in done.stderr and "source was" in done.stderr
+    assert "not the same run as" in done.stderr and "recipe.py has changed since" in done.stderr

@@ -207,7 +207,7 @@ def command(
             )
         iterations, budgets = (iterations, ()) if "iterations" in typed else (None, budgets)
     if study is not None:
-        study.check_method(bool(given["plugins"]) or _typed_in(ctx, "methods"))
+        study.check_method(any(_typed_in(ctx, name) for name in ("plugins", "methods", "mask")))
         settings = (*study.settings, *settings) if _typed_in(ctx, "settings") else settings
     recorded = {**ctx.params, "iterations": iterations, "budgets": budgets, "settings": settings}
     seconds = [parse_budget(budget) for budget in budgets]
@@ -286,7 +286,8 @@ class _Recorded(ProgressBar):
         if not self.written:
             self.written = True
             if path := write_study(self.ctx, self.values, self.output):
-                say(f"wrote {path}: 'aw bench {shlex.quote(str(path))}' makes these runs again")
+                longer = " --overwrite longer" if self.values["overwrite"] == "longer" else ""
+                say(f"wrote {path}: 'aw bench {shlex.quote(str(path))}{longer}' makes these runs again")
 
 
 def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], list[str]]:

@@ -156,6 +156,8 @@ def finish(report: BenchReport, as_json: bool) -> None:
     compare = f"compare them with: aw {'cost' if len(folders) > 1 else 'table'} {output}"
     if len(folders) > 1:
         compare += f", or one folder with: aw table {shlex.quote(str(folders[0]))}"
+    else:
+        compare += f", look at them with: aw view {output}"
     summary = ", ".join(f"{n} {outcome}" for outcome, n in report.outcomes.items())
     say(f"{count} run{'s' if count > 1 else ''}: {summary}; {compare}")
     if failed:

@@ -51,18 +51,18 @@ class StudyFile:
         """Raise AwError if the method of a run is in a file that nobody `found`."""
         if self.run.get("source") and not found:
             raise AwError(
-                f"{self.path} is of the method {quoted(self.run.get('method'))}, which is in a file of its own: add "
-                "--plugin FILE.py, or --method FILE.py:RECIPE"
+                f"{self.path} is of the method {quoted(self.run.get('method'))}, which takes files of yours: add "
+                "--plugin FILE.py, --method FILE.py:RECIPE or --mask FOLDER"
             )
 
     def report_changes(self, cells: Sequence[Cell]) -> None:
         """Say in what the planned run differs from the run that was given back."""
         if not self.run or not cells or cells[0].identity == self.run.get("config_hash"):
             return
-        from ambiguous_wild.harness.cell_run import different_keys
+        from ambiguous_wild.harness.cell_run import describe_change, different_keys
 
         before, now = flatten(dict(self.run)), flatten(dict(cells[0].config))
-        changes = (f"{k} was {before.get(k)}, is {now.get(k)}" for k in different_keys(before, now))
+        changes = (describe_change(key, before, now, cells[0]) for key in different_keys(before, now))
         say(f"not the same run as {self.path}: {shortlist(changes)}")
 
     def report_others(self, cells: Sequence[Cell], output: Path) -> None:

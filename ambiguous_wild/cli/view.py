@@ -194,7 +194,7 @@ def video_command(runs: tuple[Path, ...], output: Path, path: str, **options: An
             done = video_runs(runs, output, path=path, **options, say=say, tick=tick)
     finally:
         signal.signal(signal.SIGTERM, before)
-    say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {', '.join(done.labels)}")
+    say(f"wrote {done.path}: {done.frames} frames, {done.seconds:.1f} s, {'; '.join(done.labels)}")
     if done.gif is not None:
         say(f"wrote {done.gif}: {done.gif.stat().st_size / 1e6:.1f} MB")
 

@@ -51,12 +51,14 @@ def export_scene(
         masks: keep masks of train photos by name, at their size in training, in place of the scene's.
 
     Raises:
-        AwError: no scene, an unknown layout, or an output that exists.
+        AwError: no scene, an unknown layout, masks for one that holds none, or an output that exists.
     """
     if form not in WRITERS:
         raise unknown("layout", form, WRITERS)
     scene = load_scene(path, raw=True)
     if masks is not None:
+        if form == "on-the-go":
+            raise AwError(f"{form} holds no masks: leave them out, or choose another layout")
         views = tuple(replace(v, keep_path=masks.get(v.name, v.keep_path)) for v in scene.views)
         scene = replace(scene, views=views)
         _check_sizes(scene.train)

@@ -32,6 +32,7 @@ from ambiguous_wild.harness.result_file import (
     FAILED,
     IGNORED,
     RESULT,
+    STOPPED,
     RunConfig,
     artefact_hashes,
     check_whole,
@@ -40,7 +41,7 @@ from ambiguous_wild.harness.result_file import (
 )
 from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
-from ambiguous_wild.harness.training import STOPPED, train_and_measure
+from ambiguous_wild.harness.training import train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.corrections import CORRECTIONS
 from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
@@ -159,10 +160,12 @@ def _is_our_config(path: Path) -> bool:
         return True
 
 
-def _describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
+def describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
     """Return one difference in words of the command line."""
     if key == "source":
         return f"{_file_name(cell)} has changed since this run"
+    if key == "continued":
+        return f"it {'went' if before.get(key) else 'did not go'} on from a shorter one"
     default = "full" if key == "protocol" else None  # a config leaves out the full protocol
     return f"{key} was {before.get(key, default)}, is {now.get(key, default)}"
 
@@ -222,7 +225,7 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
         return
     now = flatten(dict(cell.config))
     keys = different_keys(before, now)
-    changes = ", ".join(_describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
+    changes = ", ".join(describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
     how = "changed" if made_anew(folder, "changed", cell.config) else "always"
     longer = ", continue it with --overwrite longer" if keys and all(map(may_continue, keys)) else ""
     raise AwError(

@@ -102,8 +102,8 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
         entry = get_method(method)
     except AwError:
         raise AwError(
-            f"{run} was trained by {method}, not a method of this package, and code is not loaded from a "
-            "run's record; in Python, registry.load_reference('FILE.py:NAME') loads it"
+            f"{run} was trained by {method}, with a method or masks of yours: files are not loaded from a "
+            "run's record; in Python, registry.load_reference('FILE.py:NAME' or 'masks:FOLDER') loads them"
         ) from None
     if entry.passes > 1:
         raise AwError(

@@ -45,6 +45,7 @@ SCHEMA = 1
 RESULT = "metrics.json"
 FAILED = "failed.json"  # same schema, status "failed"; counts where there is no metrics.json
 MODEL = "point_cloud.ply"
+STOPPED = "stopped"  # folder with the model as it was when Ctrl-C came; removed when the run ends
 CONFIG = "config.yaml"
 RENDERS = Path("renders") / "test"
 RESTORE = "restore it, or train again with --overwrite always"

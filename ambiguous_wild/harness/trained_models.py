@@ -22,6 +22,7 @@ from ambiguous_wild.harness.result_file import (
     CONFIG,
     MODEL,
     RESULT,
+    STOPPED,
     RunResult,
     check_model,
     metrics_of,
@@ -33,6 +34,7 @@ from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_arrays import SplatFile
+from ambiguous_wild.methods.graft import split_graft
 from ambiguous_wild.methods.references import is_reference
 from ambiguous_wild.methods.registry import get_method, knows_truth
 from ambiguous_wild.viewing.model import RenderSettings, ViewedModel, file_model
@@ -177,7 +179,7 @@ def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None =
 
     Args:
         run: the run's folder.
-        folder: where the scene lies; None = where the run says.
+        folder: where the scene lies; None = where the run says, else beside a folder that the run is in.
         opened: verified scenes of earlier calls, which are not opened again. Who gives it measures runs, so
             the scene is asked what it is asked before training.
 
@@ -188,9 +190,12 @@ def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None =
     if not isinstance(config, dict):
         raise AwError(f"{run} has no {CONFIG} that names its scene: restore it, or run 'aw bench' again")
     path = Path(str(config.get("path"))) if folder is None else folder
+    if folder is None and not path.is_dir():  # the folder that holds scene and runs was moved or copied
+        beside = (parent / path.name for parent in run.resolve().parents)
+        path = next((place for place in beside if (place / "sparse").is_dir()), path)
     if not path.is_dir():
         raise AwError(
-            f"the scene of {run} is not at {path}: move the scene back "
+            f"the scene of {run} is not at {path}, nor beside its runs: move the scene back "
             "('aw view', 'aw video', 'aw export' and 'aw rescore' take its folder: --scene)"
         )
     factor = config.get("factor")
@@ -210,6 +215,10 @@ def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None =
 
 
 def _read_model(run: Path) -> TrainedModel:
+    if not (run / RESULT).is_file():
+        stopped = run / STOPPED / MODEL
+        shown = f"; its model is {stopped}" if stopped.is_file() else ""
+        raise AwError(f"{run} is not finished: the command that began it continues it{shown}")
     result = read_result(run / RESULT)
     if result["status"] != "ok":
         raise AwError(f"{run} failed: {result['error']}")
@@ -298,19 +307,25 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
     An unknown method is drawn as plain 3DGS. The run may come from a stranger: no file that its name refers
     to is imported.
     """
-    name = str(config.get("method", ""))
+    name, source = str(config.get("method", "")), str(config.get("source", ""))
+    options = section(config, "options")
     try:
         if is_reference(name):
             raise AwError(f"{name} is a file")
-        entry = get_method(name)
+        host, rest = split_graft(name)
+        # Masks, also those of a folder, density control and regulariser do not change how a model is drawn.
+        as_host = rest != "" and "effects=" not in rest and not get_method(host).source_hash
+        entry = get_method(host if as_host else name)
+        if as_host:
+            source, options = "", section(options, "host")
         if entry.program is not None:
             return RenderSettings(), ""
-        chosen = from_plain(type(entry.options()), section(config, "options"), "options")
+        chosen = from_plain(type(entry.options()), options, "options")
         hooks = entry.build(chosen)
     except AwError:
         advice = "if it is a method of yours, name its file with --plugin"
         return RenderSettings(), f"{name} is an unknown method and drawn as plain 3DGS: {advice}"
-    if entry.source_hash != str(config.get("source", "")):
+    if entry.source_hash != source:
         return RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"
     antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
     behind = section(config, "scene").get("background", hooks.background)

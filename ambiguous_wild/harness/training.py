@@ -24,7 +24,7 @@ from ambiguous_wild.harness.cell import Cell, RunOptions
 from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.measures import ImageRow
 from ambiguous_wild.harness.meter import Meter
-from ambiguous_wild.harness.result_file import Cost, RunFacts, RunResult
+from ambiguous_wild.harness.result_file import MODEL, STOPPED, Cost, RunFacts, RunResult
 from ambiguous_wild.harness.run_cost import (
     both_passes,
     cost_of,
@@ -48,7 +48,6 @@ LOG = logging.getLogger(__name__)
 FOLDER = "first-pass"  # in the run folder; holds a checkpoint while it trains, then masks/ and cost.json
 COST, MASKS = "cost.json", "masks"
 HASHES = "masks_sha256"  # in cost.json, in the order of the train views
-STOPPED = "stopped"  # folder with the model as it was when Ctrl-C came; removed when the run ends
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,8 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
         if cell.method.passes > 1:
             first = first_pass(cell, folder, options.cache_dir, tick)
         trainer = _make_trainer(cell, folder, options.cache_dir, truth, first)
-        trainer.resume()
+        if trainer.resume():
+            LOG.info("going on after %s", counted(trainer.iteration, "iteration"))
         recorder = pictures.Recorder(trainer, folder) if options.pictures else None
         ticks = [call for call in (recorder, tick) if call is not None]
 
@@ -199,7 +199,7 @@ def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto])
     end = "run the same command again to resume"
     try:
         with atomic_dir(folder / STOPPED) as kept:
-            _write_model(trainer, kept / "point_cloud.ply")
+            _write_model(trainer, kept / MODEL)
             rows, missing = _measured_views(cell, trainer, truth, kept / "renders")
             state = {"iteration": trainer.iteration, "train_s": trainer.clock.now()}
             write_json(kept / "measured.json", {**state, "per_image": rows, "missing": missing})

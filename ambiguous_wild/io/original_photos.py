@@ -112,10 +112,15 @@ def capture_folder(scene: Path, info: Mapping[str, Any]) -> Path:
     """
     if "capture" not in info:
         raise AwError(f"{scene} does not say where its photos are, as packed scenes do not: {AGAIN}")
-    folder = (scene.resolve() / str(info["capture"])).resolve()
+    where = Path(str(info["capture"]))
+    folder = (scene.resolve() / where).resolve()
+    below = Path(*(part for part in where.parts if part != ".."))
+    if not folder.is_dir() and below.parts:  # the scene was moved, its photos were not
+        moved = (above / below for above in scene.resolve().parents)
+        folder = next((place for place in moved if place.is_dir()), folder)
     if not folder.is_dir():
         raise AwError(
-            f"the photos that {scene} was built from are not at {folder}: move them back, or build the scene "
-            "again where they are"
+            f"the photos that {scene} was built from are not at {folder}: move scene or photos back, or "
+            "build the scene again"
         )
     return folder

@@ -18,6 +18,9 @@ from ambiguous_wild.harness.command_lines import option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import own_json
+from ambiguous_wild.methods.entry import trained_once
+from ambiguous_wild.methods.graft import graft_name, graft_pairs, split_graft
+from ambiguous_wild.methods.references import MASKS
 from ambiguous_wild.report.board import Entry, hidden_in
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec_file import plain_spec
@@ -102,6 +105,7 @@ def command_words(config: RunConfig, recorded: str = "") -> list[str]:
     ):
         words += [flag, value] if value != usual else []
     words += ["--start", "START.ply"] if config.get("start") else []
+    words += ["--corrections", "CORRECTIONS.json"] if config.get("corrections") else []
     words += ["--effects", ",".join(map(str, config.get("effects") or ["none"]))]
     for key, value in _changed(config).items():
         words += ["--set", f"{key}={value}"]
@@ -110,7 +114,7 @@ def command_words(config: RunConfig, recorded: str = "") -> list[str]:
 
 
 def _method(config: RunConfig, recorded: str) -> list[str]:
-    """Return --method, of an own method as it was given, and --plugin; files are named without folders."""
+    """Return --method, of an own method as it was given, --plugin or --mask; files without their folders."""
     method = config["method"]
     if not config["source"]:
         return ["--method", method]
@@ -118,6 +122,11 @@ def _method(config: RunConfig, recorded: str) -> list[str]:
         words = shlex.split(recorded)
     except ValueError:
         words = []
+    if any(f"mask={MASKS}" in word for word in words):  # named after their folder
+        once = trained_once(method)
+        donors = dict(graft_pairs(once))
+        folder, host = donors.pop("mask", ""), split_graft(once)[0]
+        return ["--method", graft_name(host, donors) + method.removeprefix(once), "--mask", folder]
     given = {flag: re.sub(r"^(external:)?.*/", r"\1", word) for flag, word in pairwise(words)}
     reference, plugin = given.get("--method", ""), given.get("--plugin", "")
     # the name of an ablation's variant says more than the reference

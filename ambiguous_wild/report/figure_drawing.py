@@ -160,12 +160,12 @@ def _size_that_fits(texts: Sequence[str], cell: float, size: float) -> float:
 
 
 def _width(text: str, size: float) -> float:
-    """Return the width of a line in inches."""
+    """Return the width of a line in inches, at most: PNG letters stand on whole pixels."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 
     width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
-    return float(width) * POINT
+    return 1.04 * float(width) * POINT
 
 
 class _Drawing:

@@ -45,7 +45,7 @@ from ambiguous_wild.report.inpainting import Inpainting
 RADIUS = 3.0  # of the filter, in pixels of the mask
 EDGE = 1e-3  # variance of colours in [0, 1] that the filter takes for an edge
 _STRIP = 2_000_000  # px that are filtered at a time
-UNTRAINED = "the run was not trained on it"
+UNTRAINED = "not among the train photos"
 _BACK = {6: 8, 8: 6}  # EXIF orientations that another one undoes; the others undo themselves
 _ORIENTATION = 0x0112  # EXIF
 _QUALITY = 95  # of JPEGs

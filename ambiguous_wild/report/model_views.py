@@ -229,7 +229,7 @@ def video_runs(
     cameras = _cameras(shown.scene, path, frames, width)
     prepare_cpu(threads, say)
     labels = tuple(model.label for model in shown.models)
-    say(f"drawing {frames} frames of {', '.join(labels)}")
+    say(f"drawing {frames} frames of {'; '.join(labels)}")
     begin = time.perf_counter()
     kept: list[Frame] = []
     chosen = {

@@ -21,7 +21,7 @@ from ambiguous_wild.metrics.stats import Interval
 from ambiguous_wild.report.comparison import comparison, quality_columns
 from ambiguous_wild.report.notes import incomparable, metric_versions, scenes_apart
 from ambiguous_wild.report.plain_formats import UNEQUAL, shortest, to_csv
-from ambiguous_wild.report.table_layout import ARROWS, SHOWN, State, Table, TableCell, text_table
+from ambiguous_wild.report.table_layout import ARROWS, DOUBTFUL, SHOWN, State, Table, TableCell, text_table
 
 NONE = Interval(math.nan, math.nan, math.nan, 0)
 CSV_HEAD = (
@@ -124,6 +124,7 @@ class MethodPair:
     state: State
     images: Interval = NONE  # over images and seeds of these scenes
     scenes: Interval = NONE  # over scenes
+    doubtful: bool = False  # distractors in test photos count as truth: not compared, a note says so
     p_holm: float = math.nan  # p of `scenes`, corrected for the methods of this measure
     won_scenes: Counts = Counts(0, 0, 0)
     won_images: Counts = Counts(0, 0, 0)
@@ -152,11 +153,12 @@ def compared(
     apart = [scene for scene in by_scene if scene in scenes_apart(runs)]
     unranked = incomparable(runs.runs, columns) | metric_versions(runs.runs).keys()
     # where test photos may hold distractors, a model gains by drawing them
-    unranked |= {c.measure.key for table in tables for c in table.columns if c.doubtful}
+    doubtful = {c.measure.key for table in tables for c in table.columns if c.doubtful}
     values, pairs = PairedValues(runs), []
     for i, measure in enumerate(columns):
-        fair = not apart and measure.key not in unranked
+        fair, doubt = not apart and measure.key not in unranked | doubtful, measure.key in doubtful
         of = [_pair(values, tables[0], by_scene, i, first, other, fair=fair) for other in others]
+        of = [replace(pair, doubtful=doubt) for pair in of]
         pairs += [replace(p, p_holm=q) for p, q in zip(of, stats.holm([p.scenes.p for p in of]))]
     return pairs, (*_reading(runs, pairs, len(by_scene)), *tables[-1].notes)
 
@@ -246,7 +248,7 @@ def _reading(runs: Runs, pairs: Sequence[MethodPair], scenes: int) -> Iterator[s
         yield "one scene says nothing of other scenes: no p, and no interval over scenes"
     counted_unit = "scenes" if scenes > 1 else "test images"
     yield f"w/t/l: {counted_unit} on which {first} is better, equal as printed, and worse"
-    if any(pair.state != "ok" for pair in pairs):
+    if any(pair.state != "ok" and not pair.doubtful for pair in pairs):
         yield "not compared: results are missing, failed or measured otherwise (below); --only chooses scenes"
     seeds = runs.runs.groupby(["method", "scene"])["seed"].nunique().groupby("method").min()
     if alone := [name for name in runs.rows() if seeds[name] < 2]:
@@ -262,7 +264,8 @@ def pair_table(pairs: Sequence[MethodPair], notes: Sequence[str]) -> Table:
 
 
 def _texts(pair: MethodPair) -> list[str]:
-    name = f"{pair.other}, {pair.measure.label}{ARROWS[pair.measure.better]}"
+    mark = DOUBTFUL if pair.doubtful else ""
+    name = f"{pair.other}, {pair.measure.label}{mark}{ARROWS[pair.measure.better]}"
     if pair.state != "ok":
         return [name, SHOWN[pair.state], "", "", "", ""]
     digits = pair.measure.digits

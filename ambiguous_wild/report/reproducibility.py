@@ -112,12 +112,21 @@ def _grid(runs: Sequence[_Run]) -> list[str]:
     seeds = _differing(runs, lambda run: run.result["method"], lambda of: _listed(_seeds(of), "seed"))
     lengths = _said(runs, _length, "they trained for {}", "they trained for different lengths: {}")
     sentences = [f"The results are those of {of}, with {seeds}; {lengths}."]
-    own = {
-        run.result["method"]: run.config["source"] for run in runs if run.config and run.config.get("source")
-    }
-    if own:
-        files = _listed(f"{method} {str(source)[:HASH]}" for method, source in own.items())
-        sentences.append(f"Methods in files of their own, with the SHA-256 of the file: {files}.")
+    files, masks = {}, {}
+    for run in runs:
+        if run.config and (source := str(run.config.get("source") or "")[:HASH]):
+            if "--mask" in run.words:
+                masks[run.words[run.words.index("--mask") + 1]] = source
+            else:
+                files[run.result["method"]] = source
+    if files:
+        named = _listed(map(" ".join, files.items()))
+        sentences.append(f"Methods in files of their own, with the SHA-256 of the file: {named}.")
+    if masks:
+        named = _listed(map(" ".join, masks.items()))
+        sentences.append(f"Masks given as files, with the SHA-256 of all in a folder: {named}.")
+    if corrected := [run for run in runs if run.config and run.config.get("corrections")]:
+        sentences.append(f"Masks of {_which(corrected, runs)} were corrected by hand.")
     effects = _said(
         runs, lambda run: effects_of(run.result["facts"]), "{}", "{}",
     )  # fmt: skip
@@ -190,12 +199,13 @@ def _repeats(runs: Sequence[_Run]) -> str:
     def repeats(run: _Run) -> bool:
         train = section(dict(run.config), "train") if run.config else {}
         cpu = str(run.result["cost"].get("device", "")).startswith("cpu")
-        return cpu and bool(train) and train.get("budget_s") is None
+        continued = run.config is not None and run.config.get("continued")
+        return cpu and bool(train) and train.get("budget_s") is None and not continued
 
     exact = [run for run in runs if repeats(run)]
     if len(exact) == len(runs):
         return "The commands repeat bit for bit on a processor of this kind, for any number of threads."
-    others = "end by the clock, or on a GPU or in another program"
+    others = "end by the clock, went on from shorter ones, or are of a GPU or another program"
     if not exact:
         return f"The runs {others}, and do not repeat bit for bit."
     rest = [run for run in runs if not repeats(run)]

@@ -216,11 +216,20 @@ def test_the_method_of_a_run_in_a_file_must_be_given(project: Path, planned) -> 
     config = project / "config.yaml"
     config.write_text(yaml.safe_dump(planned.config | {"config_hash": first[0][1]}))
     done = aw("bench", config, "-o", "again", cwd=project)
-    assert done.returncode == 2 and "add --plugin FILE.py, or --method FILE.py:RECIPE" in done.stderr
+    assert (
+        done.returncode == 2
+        and "add --plugin FILE.py, --method FILE.py:RECIPE or --mask FOLDER" in done.stderr
+    )
     assert planned(config, "--method", "own/recipe.py:build", "-o", "again", cwd=project) == first
+    shutil.copytree(project / "scene" / "images", project / "sam")  # any pictures under the photos' names
+    words = ("--scene", "scene", "--iterations", 5, "--effects", "none")
+    masked = planned("--method", "refinesplat", "--mask", "sam", *words, cwd=project)
+    other = project / "masked.yaml"
+    other.write_text(yaml.safe_dump(planned.config | {"config_hash": masked[0][1]}))
+    assert planned(other, "--mask", "sam", "-o", "masked", cwd=project) == masked
     changed = project / "changed" / "recipe.py"
     changed.parent.mkdir()
     shutil.copy(project / "own" / "recipe.py", changed)
     changed.write_text(changed.read_text() + "# edited\n")
     done = aw("bench", config, "--method", f"{changed}:build", "-o", "other", cwd=project)
-    assert "not the same run as" in done.stderr and "source was" in done.stderr
+    assert "not the same run as" in done.stderr and "recipe.py has changed since" in done.stderr

@@ -58,6 +58,7 @@ def test_a_shorter_run_goes_on_and_says_so(scene, tmp_path):
         run(scene, out, iterations=9)
     report = run(scene, out, iterations=9, overwrite="longer")
     assert report.outcomes == {"trained": 1}
+    assert "going on after 6 iterations" in (folder / "log.txt").read_text()
     result, config = report.runs[0].result, yaml.safe_load((folder / "config.yaml").read_text())
     assert result["cost"]["iterations"] == 9 and [c["iteration"] for c in config["continued"]] == [6]
     assert result["facts"]["length"] == "6 iterations, continued to 9 iterations"
@@ -67,7 +68,7 @@ def test_a_shorter_run_goes_on_and_says_so(scene, tmp_path):
     for shorter in (9, 5):
         assert run(scene, out, iterations=shorter, overwrite="longer").outcomes == {"kept": 1}
     assert run(scene, out, iterations=11, overwrite="longer").outcomes == {"trained": 1}
-    with pytest.raises(AwError, match="continued was"):
+    with pytest.raises(AwError, match=r"\(it went on from a shorter one\)"):
         run(scene, out, iterations=11)
     with pytest.raises(AwError, match="was continued from a shorter run"):
         verify(folder, None)

@@ -59,7 +59,7 @@ def test_each_photo_gets_the_mask_of_its_pixels(made, tmp_path):
     """Oracle: the exact masks, as they were drawn on the photos before these were undistorted and halved."""
     done = write_full_size_masks(made / "runs", tmp_path / "masks")
     assert done.masks == 6 and sorted(done.white) == ["test/p01.jpg", "test/p04.jpg"]
-    assert done.lines() == ["nothing is masked in test/p01.jpg, test/p04.jpg: the run was not trained on it"]
+    assert done.lines() == ["nothing is masked in test/p01.jpg, test/p04.jpg: not among the train photos"]
     for name in TRAIN[1:]:
         truth = read_gray(made / "raw/truth/distractor" / f"{name}.png") > 0
         mask = read_gray(tmp_path / "masks/train" / f"{name}.png")
@@ -246,6 +246,22 @@ def test_masks_go_with_an_exported_scene(made, tmp_path):
             made / "scene", "colmap", tmp_path / "small", masks={"p05.png": made / "scene/images/p05.png"}
         )
     assert not (tmp_path / "small").exists()
+    words = ("export-scene", made / "scene", "--masks", made / "runs", "-o", tmp_path / "small")
+    refused = aw(*words, "--as", "on-the-go")
+    assert refused.returncode == 2 and "on-the-go holds no masks" in refused.stderr
+    assert not (tmp_path / "small").exists()
+
+
+def test_scene_and_photos_are_found_where_scene_and_run_were_moved(case, tmp_path):
+    """First everything moves, then all but the photos, as a folder of 'aw try' that is put away."""
+    (case / "all").mkdir()
+    for name in ("raw", "scene", "runs"):
+        (case / name).rename(case / "all" / name)
+    assert masks_of_run(case / "all/runs")[1].root == case / "all/scene"
+    (case / "all/old").mkdir()
+    for name in ("scene", "runs"):
+        (case / "all" / name).rename(case / "all/old" / name)
+    assert write_full_size_masks(case / "all/old/runs", tmp_path / "masks").masks == 6
 
 
 def test_masks_of_an_imported_scene_fit_its_photos(scene, tmp_path):

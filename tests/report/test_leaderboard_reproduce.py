@@ -80,6 +80,8 @@ def test_a_default_that_depends_on_the_machine_is_named(method: str, named: set[
     }
     words = shlex.split(command(config))
     assert {words[i + 1] for i, word in enumerate(words) if word == "--set"} == named
+    corrected = command(config | {"corrections": {"sha256": "a" * 64}})
+    assert "--corrections CORRECTIONS.json" in corrected and "--corrections" not in words
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,9 @@ def test_photos_with_distractors_compare_nobody(tmp_path: Path) -> None:
     (fair,) = [pair for pair in pairs if pair.state == "ok"]
     assert fair.scenes.mean == pytest.approx(4.0)
     assert any("gains by it" in note for note in notes)
+    assert not any("results are missing" in note for note in notes)
+    names = [row.name for row in pair_table(pairs, notes).rows]
+    assert names[0] == "3dgs, PSNR†↑"
 
 
 def test_one_scene_has_an_interval_over_images_and_no_p(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import yaml
 
 from ambiguous_wild.harness.grid import plan_cells
-from ambiguous_wild.harness.result_file import write_result
+from ambiguous_wild.harness.result_file import config_identity, write_result
 from ambiguous_wild.report.reproducibility import statement, to_latex, to_markdown, to_text
 from ambiguous_wild.splat.pace import TrainConfig
 from tests.command_line import aw
@@ -72,6 +73,20 @@ def test_the_command_makes_the_same_cells(runs, scene: Path) -> None:
     assert [cell.identity for cell in again] == said
 
 
+def test_masks_of_a_folder_are_given_as_they_were_typed(runs, scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "sam").mkdir()
+    for photo in (scene / "images").iterdir():
+        (tmp_path / "sam" / photo.name).write_bytes(photo.read_bytes())
+    names = [f"{host}@mask=masks:{tmp_path / 'sam'}" for host in ("3dgs", "absgs")]
+    said = statement([runs(*names, reproduce=f"aw bench --method {names[0]}")])
+    (line,) = said.commands
+    assert (
+        "--method 3dgs --mask sam --method absgs" in line or "--method 3dgs --method absgs --mask sam" in line
+    )
+    assert "Masks given as files, with the SHA-256 of all in a folder: sam " in " ".join(said.sentences)
+    assert "Methods in files" not in " ".join(said.sentences)
+
+
 def test_where_runs_differ_it_says_which_have_what(runs) -> None:
     runs("3dgs")
     runs("absgs", environment=MACHINE | {"cpu": "EPYC", "commit": "cd" * 20})
@@ -85,6 +100,22 @@ def test_where_runs_differ_it_says_which_have_what(runs) -> None:
     assert "70 iterations for 3dgs and absgs; 60 s for gs-w" in text
     assert "3dgs and absgs repeat bit for bit; gs-w end by the clock" in text
     assert len(said.commands) == 2 and "--budget 60s" in said.commands[1]
+
+
+def test_runs_that_went_on_with_corrections_do_not_repeat(runs) -> None:
+    for path in (folder := runs("3dgs")).rglob("config.yaml"):
+        more = {"continued": [{"iteration": 9, "config_hash": "a"}], "corrections": {"sha256": "a" * 64}}
+        config = yaml.safe_load(path.read_text()) | more
+        config["config_hash"] = config_identity(config)
+        path.write_text(yaml.safe_dump(config))
+        result = json.loads((path.parent / "metrics.json").read_text())
+        write_result(path.parent / "metrics.json", result | {"config_hash": config["config_hash"]})
+    runs("absgs")
+    said = statement([folder])
+    text = " ".join(said.sentences)
+    assert "Masks of 3dgs were corrected by hand." in text
+    assert "absgs repeat bit for bit; 3dgs end by the clock, went on from shorter ones" in text
+    assert ["--corrections CORRECTIONS.json" in line for line in said.commands] == [True, False]
 
 
 def test_failures_and_runs_without_settings_are_named(runs, tmp_path: Path) -> None:

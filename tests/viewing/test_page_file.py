@@ -387,3 +387,16 @@ def test_a_map_stays_below_its_share_of_the_page_and_may_be_missing(tmp_path: Pa
 
 def image_of(uri: str) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",", 1)[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_runs_with_masks_of_a_folder_are_drawn_as_their_method(tmp_path: Path) -> None:
+    config = {
+        "method": "mip-splatting@mask=sam",
+        "source": "hash of the masks",
+        "options": {"host": {}, "mask": {}},
+    }
+    look, note = read_render_settings(config)
+    own, _ = read_render_settings({"method": "mip-splatting"})
+    assert (look, note) == (own, "")
+    assert "unknown method" in read_render_settings({"method": "mine@mask=sam"})[1]
+    assert "unknown method" in read_render_settings({"method": "3dgs@effects=sam"})[1]

@@ -121,7 +121,7 @@ def test_a_video_of_two_methods(runs: Path, tmp_path: Path) -> None:
         "--gif", tmp_path / "v.gif",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "12 frames, 1.0 s, 3dgs, refinesplat" in done.stderr.partition("drawing 12 frames of 3dgs, ")[2]
+    assert "12 frames, 1.0 s, 3dgs; refinesplat" in done.stderr.partition("drawing 12 frames of 3dgs; ")[2]
     frames = frames_of(tmp_path / "v.mp4")
     assert len(frames) == 12 and frames[0].shape == (72, 196, 3)
     left, right = frames[5][20:, :96].astype(float), frames[5][20:, 100:].astype(float)

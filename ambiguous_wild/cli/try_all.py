@@ -22,7 +22,7 @@ from ambiguous_wild.cli.options import (
     threads_option,
     threads_words,
 )
-from ambiguous_wild.cli.run_progress import ProgressBar
+from ambiguous_wild.cli.study_file import Recorded
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import check_output, own_json
 
@@ -156,9 +156,9 @@ def train_within(
     here_s = REFINESPLAT_TIME * expected_s(1, pixels, most) * slowness()
     say("")
     say(_budget_line(budget_s, budget_s / here_s, len(names)))
-    words = ["bench", "--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
+    words = ["--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
     words += ["--max-gaussians", str(most), "--effects", str(plan), "--overwrite", "longer", "-o", str(runs)]
-    print_command(*words)
+    print_command("bench", *words)
     growing = GrowingPage(page, runs)
     try:
         report = bench(
@@ -170,7 +170,7 @@ def train_within(
             plan=plan,
             overwrite="longer",
             threads=threads,
-            callbacks=_ProgressAndPage(growing),
+            callbacks=_ProgressAndPage(growing, words),
         )
     except KeyboardInterrupt:
         if growing.end():
@@ -182,12 +182,16 @@ def train_within(
     return len(names)
 
 
-class _ProgressAndPage(ProgressBar):
-    """A bar for each run, and the page that grows while it trains."""
+class _ProgressAndPage(Recorded):
+    """Also writes the page that grows while a run trains."""
 
-    def __init__(self, page: GrowingPage) -> None:
-        super().__init__()
-        self.page, self.written = page, False
+    def __init__(self, page: GrowingPage, words: list[str]) -> None:
+        """`words`: of the 'aw bench' that makes the runs."""
+        from ambiguous_wild.cli.bench import command as bench_command
+
+        ctx = bench_command.make_context("bench", words)
+        super().__init__(ctx, ctx.params, None, page.runs)
+        self.page, self.shown = page, False
 
     def started(self, cell: Cell, folder: Path) -> None:
         super().started(cell, folder)
@@ -195,8 +199,8 @@ class _ProgressAndPage(ProgressBar):
 
     def tick(self, trainer: Trainer) -> None:
         super().tick(trainer)
-        if self.page.tick(trainer) and not self.written:
-            self.written = True
+        if self.page.tick(trainer) and not self.shown:
+            self.shown = True
             self.bar.write(
                 f"    look at it while it trains: {self.page.folder / 'index.html'}", file=sys.stderr
             )

@@ -143,7 +143,7 @@ def page_text(
         facts.append(_model_facts(model, element, views, scene.train, shares))
         facts[-1]["whole"] = shown == given
     for line in page_notes:
-        say(line)
+        say(line.removeprefix("* "))  # the page marks figures with it
     space = space_of(scene)
     capture_map = map_uri(scene.root / MAP)
     if views[0].image_path == NO_PHOTO:

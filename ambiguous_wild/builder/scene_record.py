@@ -115,7 +115,7 @@ def scene_record(
             *_focal_warnings(cameras, photos),
             *_parallax_warnings(model),
             *part_lines(mapping["components"], sources, settings.part),
-            *_provisional_warnings([sources[name] for name in mapping["provisional"]]),
+            *provisional_warnings([sources[name] for name in mapping["provisional"]]),
             *mask_warnings(results.masks),
             *split.warnings,
             *map_warnings(results.map),
@@ -315,7 +315,8 @@ def part_lines(components: Sequence[Sequence[str]], sources: Mapping[str, str], 
     ]
 
 
-def _provisional_warnings(photos: Sequence[str]) -> list[str]:
+def provisional_warnings(photos: Sequence[str]) -> list[str]:
+    """Return one warning that names the provisional photos of a capture, if there are any."""
     if not photos:
         return []
     return [

@@ -309,14 +309,15 @@ class Recorded(ProgressBar):
                 self.study.report_others(cells, self.output)
 
     def started(self, cell: Cell, folder: Path) -> None:
-        self._write()
+        self.record()
         super().started(cell, folder)
 
     def ended(self, cell: Cell, report: CellReport) -> None:
-        self._write()  # with Ray nothing tells that a run begins
+        self.record()  # with Ray nothing tells that a run begins
         super().ended(cell, report)
 
-    def _write(self) -> None:
+    def record(self) -> None:
+        """Write the study, once."""
         if not self.written:
             self.written = True
             if path := write_study(self.ctx, self.values, self.output):

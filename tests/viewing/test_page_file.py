@@ -328,7 +328,9 @@ def test_without_masks_it_opens_with_the_best_unless_test_photos_hold_distractor
 
 def test_psnr_of_mixed_test_photos_is_marked_and_names_its_fault(tmp_path: Path) -> None:
     write_shown_run(tmp_path / "runs", write_mixed_scene(tmp_path / "scene"), "3dgs")
-    data = facts(page := view_runs([tmp_path / "runs"], tmp_path / "out").path.read_text())
+    lines: list[str] = []
+    data = facts(page := view_runs([tmp_path / "runs"], tmp_path / "out", say=lines.append).path.read_text())
+    assert lines[1].startswith("PSNR here rewards ghosts: ")  # without the * of the page's figures
     assert data["mixed"] and data["notes"][0].startswith("* PSNR here rewards ghosts: test photos may hold")
     assert sum("may hold distractors" in note for note in data["notes"]) == 1
     assert f"<title>{tmp_path.name} · aw</title>" in page  # not that of the folder, which says nothing

@@ -37,9 +37,8 @@ SCENE_S = (3.0, 1.2)
 # set-up, pages, measuring and masks: seconds for each method, and for each photo
 AROUND_S = (14.0, 1.2)
 SHORTEST_S = 30.0  # of training, for each method
-REFINESPLAT_TIME = (
-    1.6  # an iteration of refinesplat over one of 3dgs: 1.3 to 1.9 (docs/refinesplat.md), in the mean 1.6
-)
+# an iteration of refinesplat takes 1.3 to 1.9 times one of 3dgs (docs/refinesplat.md), in the mean of five captures
+REFINESPLAT_TIME = 1.6
 FULL_GROWTH, LEAST_GROWTH = 8000, 0.3  # iterations of a run with one Gaussian a pixel; least share of it
 GOOD, SHARP = 3000, 10_000  # iterations from which most of a scene is clear, and fine texture is
 

@@ -256,8 +256,8 @@ def opening(models: Sequence[ViewedModel], scene: Scene, *, mixed: bool) -> dict
             )
             return {"left": left, "right": right, "view": view, "place": top if points else None}
     means = [_mean_psnr(model) if not mixed else 0.0 for model in models]
-    rewarded = masking[:1] if mixed else []  # PSNR would choose the model that shows distractors
-    best = max(range(len(models)), key=lambda n: (not models[n].reference, n in rewarded, means[n]))
+    masked = masking[:1] if mixed else []  # PSNR would choose the model that shows distractors
+    best = max(range(len(models)), key=lambda n: (not models[n].reference, n in masked, means[n]))
     # the test photo that the best model knows best
     known = {view.name: max(m.psnr.get(view.name, -np.inf) for m in models) for view in scene.test}
     view = max(range(len(scene.test)), key=lambda n: 0.0 if mixed else known[scene.test[n].name], default=0)

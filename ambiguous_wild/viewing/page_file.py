@@ -258,9 +258,10 @@ def opening(models: Sequence[ViewedModel], scene: Scene, *, mixed: bool) -> dict
     means = [_mean_psnr(model) if not mixed else 0.0 for model in models]
     masked = masking[:1] if mixed else []  # PSNR would choose the model that shows distractors
     best = max(range(len(models)), key=lambda n: (not models[n].reference, n in masked, means[n]))
-    # the test photo that the best model knows best
+    # the test photo that the best model knows best, else one that photos on both sides support
     known = {view.name: max(m.psnr.get(view.name, -np.inf) for m in models) for view in scene.test}
-    view = max(range(len(scene.test)), key=lambda n: 0.0 if mixed else known[scene.test[n].name], default=0)
+    view = max(range(len(scene.test)), key=lambda n: known[scene.test[n].name], default=0)
+    view = (len(scene.test) - 1) // 2 if mixed and scene.test else view
     left = next((n for n in range(len(models)) if n != best), PHOTO)
     if left == PHOTO and best not in masking:
         return {"left": best, "right": PHOTO, "view": view, "place": None}

@@ -321,7 +321,7 @@ class CaptureReport:
 
     @property
     def warnings(self) -> list[CaptureCheck]:
-        """The checks that failed."""
+        """The checks that warn."""
         return [c for c in self.checks if c.state == "warning"]
 
     def overlap_map(self) -> CaptureMap:
@@ -371,11 +371,11 @@ def _files_check(skipped: list[SkippedPhoto], total: int) -> CaptureCheck:
 
 
 def refuse_failed(report: CaptureReport) -> None:
-    """Raise AwError, in one line, with every check that failed."""
+    """Raise AwError, in one line, with every check that warns."""
     if report.warnings:
         reasons = "; ".join(f"{c.name}: {c.finding} ({c.advice})" for c in report.warnings)
         raise AwError(
-            f"{report.root} fails {len(report.warnings)} of {len(report.checks)} capture checks: {reasons}"
+            f"{report.root}: {len(report.warnings)} of {len(report.checks)} capture checks warn: {reasons}"
         )
 
 

@@ -45,6 +45,7 @@ FOCAL_DIFFERENCE = 0.1  # relative; EXIF is rounded to millimetres
 MUCH_MISSING = 1 / 3  # of the readable photos; then the scene lacks a part of the place
 ENOUGH_PHOTOS = 20  # with fewer, most of a place is seen in one or two of them
 MIN_PARALLAX_DEG = 1.5  # COLMAP's own limit for a point
+NO_TEST_SET = "no test set given"
 SFM_STAGES = ("features", "matches", "mapping")
 
 
@@ -114,7 +115,7 @@ def scene_record(
             *_focal_warnings(cameras, photos),
             *_parallax_warnings(model),
             *part_lines(mapping["components"], sources, settings.part),
-            *_provisional_warnings([sources[name] for name in mapping["provisional"]]),
+            *provisional_warnings([sources[name] for name in mapping["provisional"]]),
             *mask_warnings(results.masks),
             *split.warnings,
             *map_warnings(results.map),
@@ -177,8 +178,8 @@ def parallax_deg(model: ColmapModel) -> float:
     return math.degrees(float(np.median(angles))) if len(angles) else math.nan
 
 
-def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
-    """Return one line with the counts and the next command."""
+def verdict(info: SceneRecord, size: tuple[int, int], scene: Path | None) -> str:
+    """Return one line with the counts and, if `scene` is given, the command that trains on it."""
     counts = info["counts"]
     points = f"{counts['points']:,}".replace(",", " ")
     named = f", {len(info['lost'])} left out" if info["lost"] else ""
@@ -189,22 +190,26 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path) -> str:
         ready = (
             f"not whole: what the {out} photos left out show is missing ('aw screen' says where to take more)"
         )
+    command = "" if scene is None else f"aw bench --method refinesplat --scene {shlex.quote(str(scene))}"
     return (
         f"registered {counts['registered']} of {counts['photos']}{named}, {points} points, "
-        f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: {ready}; "
-        f"next: aw bench --method refinesplat --scene {shlex.quote(str(scene))} -o runs"
+        f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: {ready}"
+        + (f"; next: {command} -o runs" if command else "")
     )
 
 
-def summary_lines(info: SceneRecord) -> list[str]:
-    """Return the lines about the split, the lost photos and every warning."""
+def summary_lines(info: SceneRecord, *, test_advice: bool = True) -> list[str]:
+    """Return the lines about the split, the lost photos and every warning.
+
+    Without `test_advice` that of `NO_TEST_SET` is left out: for commands that take no test photos.
+    """
     counts = info["counts"]
     lines = [f"{counts['train']} training and {counts['test']} test photos (split: {info['split']})"]
     if info["lost"]:
         reasons = shortlist([f"{p['source']} ({p['reason']})" for p in info["lost"]], 4)
         lines.append(f"{len(info['lost'])} not placed: {reasons}")
     lines += fixed_lines(info["fixed_to_camera"])
-    return lines + [f"warning: {w}" for w in info["warnings"]]
+    return lines + [f"warning: {w}" for w in info["warnings"] if test_advice or not w.startswith(NO_TEST_SET)]
 
 
 def fixed_lines(fixed: Sequence[FixedRecord]) -> list[str]:
@@ -310,12 +315,14 @@ def part_lines(components: Sequence[Sequence[str]], sources: Mapping[str, str], 
     ]
 
 
-def _provisional_warnings(photos: Sequence[str]) -> list[str]:
+def provisional_warnings(photos: Sequence[str]) -> list[str]:
+    """Return one warning that names the provisional photos of a capture, if there are any."""
     if not photos:
         return []
     return [
         f"{counted(len(photos), 'photo')} placed with little evidence, perhaps imprecisely or wrongly "
-        f"('provisional' in scene.json): {shortlist(photos)}"
+        f"('provisional' in scene.json): {shortlist(photos)}; take more photos beside these, or leave them "
+        "out if they blur the model"
     ]
 
 

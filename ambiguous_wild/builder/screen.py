@@ -37,7 +37,6 @@ ONE_COLOUR = 8  # largest difference of codes within a border
 MIN_BORDER, MAX_BORDER = 4, 0.4  # px; share of a photo's side that is looked at
 MOST_HAVE = 0.8  # share of the photos that have a border of one width, where it is not the sky
 NEAR_DUPLICATE = 0.995  # correlation of 32 x 32 thumbnails
-EXPOSURE_STOPS = 1.0
 FOCAL_RATIO = 1.01  # longest over shortest focal length of a camera that counts as zoomed
 _THUMBNAIL = 32
 More = TypeVar("More")
@@ -252,7 +251,10 @@ def thumbnail(
 
 
 def drift_warnings(photos: Sequence[ScreenedPhoto]) -> list[str]:
-    """Warn of blurred photos, and of camera settings that changed within the capture."""
+    """Warn of blurred photos, and of camera settings that changed within the capture.
+
+    Exposure is left to `aw screen` and `aw plan`: settings may follow the light, and these compare surfaces.
+    """
     warnings = []
     sharp = np.array([photo.sharpness for photo in photos])
     limit = BLUR_RATIO * float(np.median(sharp))
@@ -261,11 +263,6 @@ def drift_warnings(photos: Sequence[ScreenedPhoto]) -> list[str]:
         warnings.append(
             f"{len(soft)} photos are blurred (Laplacian variance under {limit:.0f}, a fifth of the "
             f"capture's median): {shortlist(soft)}"
-        )
-    stops = [s for photo in photos if (s := exposure_stops(photo.exif)) is not None]
-    if stops and max(stops) - min(stops) > EXPOSURE_STOPS:
-        warnings.append(
-            f"exposure settings span {max(stops) - min(stops):.1f} stops: appearance changes between photos"
         )
     balances = {photo.exif["white_balance"] for photo in photos if "white_balance" in photo.exif}
     if len(balances) > 1:

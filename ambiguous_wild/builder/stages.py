@@ -353,8 +353,8 @@ def split_photos(photos: Sequence[ScreenedPhoto], registered: set[str], tests: s
         how, test = f"every-{TEST_EVERY}", [photo.name for photo in inside[::TEST_EVERY]]
         wanted = len(test)
         warnings.append(
-            f"no test set given, so every {TEST_EVERY}th photo is a test photo: distractors in it count "
-            "as truth in the scores; give clean photos in test/, or --test-list FILE"
+            f"{scene_record.NO_TEST_SET}, so every {TEST_EVERY}th photo is a test photo: distractors in it "
+            "count as truth in the scores; give clean photos in test/, or --test-list FILE"
         )
     train = [photo.name for photo in inside if photo.name not in test]
     if wanted and not test:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import (
     PathName,
@@ -21,15 +19,14 @@ from ambiguous_wild.cli.options import (
     metric_file_option,
     training_options,
 )
-from ambiguous_wild.cli.run_progress import ProgressBar, finish
-from ambiguous_wild.cli.study_file import StudyFile, decisive, is_plan, read_study, write_study
+from ambiguous_wild.cli.run_progress import finish
+from ambiguous_wild.cli.study_file import Recorded, StudyFile, is_plan, read_study, typed_in
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.harness.benchmark import Engine, bench
 from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.cell import Cell, CellReport
     from ambiguous_wild.report.suite import PreparedSuite
 
 SUITES = ("ambiguous-wild", "on-the-go", "robustnerf", "photo-tourism", "drone")
@@ -200,15 +197,15 @@ def command(
       engine.transfer_limit=4000   with Ray: MB of the largest scene or run
     """
     if iterations is not None and budgets:
-        typed = {name for name in ("iterations", "budgets") if _typed_in(ctx, name)}
+        typed = {name for name in ("iterations", "budgets") if typed_in(ctx, name)}
         if study is None or len(typed) != 1:
             raise AwError(
                 "--iterations and --budget exclude each other: a run is as long as one of them says"
             )
         iterations, budgets = (iterations, ()) if "iterations" in typed else (None, budgets)
     if study is not None:
-        study.check_method(any(_typed_in(ctx, name) for name in ("plugins", "methods", "mask")))
-        settings = (*study.settings, *settings) if _typed_in(ctx, "settings") else settings
+        study.check_method(any(typed_in(ctx, name) for name in ("plugins", "methods", "mask")))
+        settings = (*study.settings, *settings) if typed_in(ctx, "settings") else settings
     recorded = {**ctx.params, "iterations": iterations, "budgets": budgets, "settings": settings}
     seconds = [parse_budget(budget) for budget in budgets]
     prepared = None
@@ -243,51 +240,13 @@ def command(
         train=train,  # type: ignore[arg-type]
         protocol=protocol,  # type: ignore[arg-type]
         engine=Engine(**engine, **rare["engine"]),
-        callbacks=_Recorded(ctx, recorded, study, output),
+        callbacks=Recorded(ctx, recorded, study, output),
         **given,
     )
     if prepared is not None and not as_json:
         for folder in report.folders:
             _print_tables(prepared, folder)
     finish(report, as_json)
-
-
-def _typed_in(ctx: click.Context, name: str) -> bool:
-    """Whether the parameter stands on the command line; it is not a study's, nor a default."""
-    return ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
-
-
-class _Recorded(ProgressBar):
-    """Also writes the options of the command beside its runs, when the first run begins."""
-
-    def __init__(
-        self, ctx: click.Context, values: Mapping[str, Any], study: StudyFile | None, output: Path
-    ) -> None:
-        super().__init__()
-        self.ctx, self.values, self.study, self.output = ctx, values, study, output
-        self.written = False
-
-    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
-        super().planned(cells, one_by_one)
-        if self.study is not None:
-            self.study.report_changes(cells)
-            if not self.study.run and not any(_typed_in(self.ctx, name) for name in decisive(self.ctx)):
-                self.study.report_others(cells, self.output)
-
-    def started(self, cell: Cell, folder: Path) -> None:
-        self._write()
-        super().started(cell, folder)
-
-    def ended(self, cell: Cell, report: CellReport) -> None:
-        self._write()  # with Ray nothing tells that a run begins
-        super().ended(cell, report)
-
-    def _write(self) -> None:
-        if not self.written:
-            self.written = True
-            if path := write_study(self.ctx, self.values, self.output):
-                longer = " --overwrite longer" if self.values["overwrite"] == "longer" else ""
-                say(f"wrote {path}: 'aw bench {shlex.quote(str(path))}{longer}' makes these runs again")
 
 
 def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], list[str]]:

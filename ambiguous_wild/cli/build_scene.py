@@ -13,6 +13,7 @@ import click
 from ambiguous_wild.cli.options import (
     PathName,
     SectionedCommand,
+    is_own_step,
     json_option,
     license_option,
     name_option,
@@ -164,13 +165,13 @@ def command(
     info = result.info
     first = next(iter(sorted((result.scene / info["images"]).iterdir())))
     size = image_size(first)
-    verdict = scene_record.verdict(info, size, output)
+    verdict = scene_record.verdict(info, size, None if is_own_step() else output)
     if as_json:
         click.echo(json.dumps(_facts(result, size, verdict), indent=2, ensure_ascii=False))
         return
     if result.up_to_date:
         say(f"{output} is up to date", out=True)
-    for line in scene_record.summary_lines(info):
+    for line in scene_record.summary_lines(info, test_advice=not is_own_step()):
         say(line, out=True)
     if not result.up_to_date:
         spent = ", ".join(f"{stage} {s:.1f}" for stage, s in info["seconds"].items())

@@ -6,13 +6,14 @@ import dataclasses
 import json
 import re
 import shlex
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from ambiguous_wild.cli.options import FiniteFloat, PathName, json_option, threads_option
-from ambiguous_wild.core.errors import AwError, similar_path
+from ambiguous_wild.core.errors import AwError, counted, similar_path
 from ambiguous_wild.core.machine import usable_cores
 from ambiguous_wild.io.terminal import say
 
@@ -97,7 +98,7 @@ _WORDS = {"ok": ("ok", "green"), "warning": ("WARNING", "red"), "unknown": ("unk
 @click.command("screen")
 @click.argument("raw", type=PathName(), nargs=-1, required=True)
 @click.option("-o", "--output", type=PathName(dir_okay=False), help="Picture of which photos overlap, a PNG.")
-@click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) if a check fails.")
+@click.option("--strict", is_flag=True, help="Refuse the capture (exit code 2) at a warning.")
 @threads_option
 @json_option
 def screen_command(
@@ -137,7 +138,8 @@ def _print(report: CaptureReport) -> None:
         say(line, out=True, fg=colour, only=word)
         if check.advice:
             say(f"{'':<{width}}           -> {check.advice}", out=True)
-    bad = len(report.warnings)
-    verdict = "all checks passed" if not bad else f"{bad} of {len(report.checks)} checks failed"
-    unknown = sum(c.state == "unknown" for c in report.checks)
-    say(f"{report.photos} photos: {verdict}" + (f", {unknown} unknown" if unknown else ""), out=True)
+    count = Counter(check.state for check in report.checks)
+    verdict = f"{count['ok']} of {len(report.checks)} checks passed"
+    verdict += f", {counted(count['warning'], 'warning')}" if count["warning"] else ""
+    verdict += f", {count['unknown']} unknown" if count["unknown"] else ""
+    say(f"{report.photos} photos: {verdict}", out=True)

@@ -292,13 +292,19 @@ def own_step(ctx: click.Context, *words: str | Path) -> None:
     """
     print_command(*words)
     try:
-        ctx.find_root().command.main(list(map(str, words)), prog_name="aw", standalone_mode=False)
+        root, text = ctx.find_root().command, list(map(str, words))
+        root.main(text, prog_name="aw", standalone_mode=False, obj=ctx.info_name)
     except AwError as error:
         if "--overwrite" not in str(error):
             raise
         raise AwError(
             f"{error} ('aw {ctx.info_name}' has no such option: give it to the step printed above)"
         ) from None
+
+
+def is_own_step() -> bool:
+    """Whether another command of ours runs the present one by `own_step`, and says itself what comes next."""
+    return click.get_current_context().obj is not None
 
 
 def scene_name(photos: Path) -> str:

@@ -19,6 +19,7 @@ from ambiguous_wild.io.terminal import line_width, say
 if TYPE_CHECKING:
     from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan
 
+NOTHING = "—"  # a cell without a value; a column of them is not printed
 COLUMNS = 100  # of the sentences, at most
 MASKS = (
     "masks: no effect to switch on; a method makes them while it trains (aw bench --method refinesplat, or "
@@ -112,13 +113,16 @@ def _check_overwrite(path: Path, probe: bool) -> None:
 def table(plan: EffectsPlan) -> list[str]:
     """Return the plan as lines: a table, and a sentence for each effect."""
     columns = min(line_width() or COLUMNS, COLUMNS)
-    head = ("effect", "decision", "found", "limit", "gain on held-back pixels", "ms/iteration")
+    head = ("effect", "decision", "measured", "limit", "gain on held-back pixels", "ms/iteration")
     rows = [head, *(_row(d) for d in plan.decisions)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+    shown = [k for k in range(len(head)) if any(row[k] != NOTHING for row in rows[1:])]
+    rows = [tuple(row[k] for k in shown) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows)]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths)).rstrip() for row in rows]
     for d in plan.decisions:
-        unit = f", {d.unit}" if d.unit.startswith("of ") else ""
-        sentence = f"{d.effect} {d.decision}: {d.why} ({d.evidence}{unit})"
+        unit = f", % {d.unit}" if d.unit.startswith("of ") else ""
+        evidence = f"measured: {d.evidence}{unit}" if d.unit else d.evidence
+        sentence = f"{d.effect} {d.decision}: {d.why} ({evidence})"
         lines += textwrap.wrap(sentence, columns, subsequent_indent="  ")
     if any(d.effect == "masks" for d in plan.decisions):
         lines += textwrap.wrap(MASKS, columns, subsequent_indent="  ")
@@ -126,10 +130,13 @@ def table(plan: EffectsPlan) -> list[str]:
 
 
 def _row(d: Decision) -> tuple[str, ...]:
-    found = "—" if math.isnan(d.value) else f"{d.value:.3g}"
-    gain = "—" if d.gain_db is None else f"{d.gain_db:+.2f} ± {d.error_db:.2f} dB"
-    cost = "—" if d.cost_ms is None else f"{d.cost_ms:+.2f}"
-    limit = (
-        f"{'at most' if d.effect in ('dense', 'skybox') and d.unit != 'times' else 'from'} {d.threshold:g}"
-    )
-    return d.effect, d.decision, found, limit, gain, cost
+    measured = NOTHING if math.isnan(d.value) or not d.unit else _with_unit(d.value, d.unit)
+    side = "up to" if d.unit == "photos" else "from"
+    limit = f"{side} {_with_unit(d.threshold, d.unit)}" if d.unit else NOTHING
+    gain = NOTHING if d.gain_db is None else f"{d.gain_db:+.2f} ± {d.error_db:.2f} dB"
+    cost = NOTHING if d.cost_ms is None else f"{d.cost_ms:+.2f}"
+    return d.effect, d.decision, measured, limit, gain, cost
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{100 * value:.3g} %" if unit.startswith("of ") else f"{value:.3g} {unit}"

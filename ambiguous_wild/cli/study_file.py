@@ -8,6 +8,7 @@ the folder of the file.
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
@@ -16,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import yaml
+from click.core import ParameterSource
 
 from ambiguous_wild.cli.options import PathName, say
+from ambiguous_wild.cli.run_progress import ProgressBar
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import AwError, counted, shortlist, unknown
 from ambiguous_wild.core.names import plain, quoted
@@ -26,7 +29,7 @@ from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.files import patient_lock, write_text
 
 if TYPE_CHECKING:
-    from ambiguous_wild.harness.cell import Cell
+    from ambiguous_wild.harness.cell import Cell, CellReport
 
 NAME = "study"
 HEADER = "# What 'aw bench' made here; 'aw bench FILE' makes it again. Paths are relative to this file.\n"
@@ -281,6 +284,45 @@ def write_study(ctx: click.Context, values: Values, folder: Path) -> Path | None
             write_text(path, _written(new))
             return path
     raise AssertionError  # count() does not end
+
+
+def typed_in(ctx: click.Context, name: str) -> bool:
+    """Whether the parameter stands on the command line; it is not a study's, nor a default."""
+    return ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
+
+
+class Recorded(ProgressBar):
+    """A bar for each run; writes the options of the command beside its runs, when the first one begins."""
+
+    def __init__(
+        self, ctx: click.Context, values: Mapping[str, Any], study: StudyFile | None, output: Path
+    ) -> None:
+        super().__init__()
+        self.ctx, self.values, self.study, self.output = ctx, values, study, output
+        self.written = False
+
+    def planned(self, cells: Sequence[Cell], one_by_one: bool) -> None:
+        super().planned(cells, one_by_one)
+        if self.study is not None:
+            self.study.report_changes(cells)
+            if not self.study.run and not any(typed_in(self.ctx, name) for name in decisive(self.ctx)):
+                self.study.report_others(cells, self.output)
+
+    def started(self, cell: Cell, folder: Path) -> None:
+        self.record()
+        super().started(cell, folder)
+
+    def ended(self, cell: Cell, report: CellReport) -> None:
+        self.record()  # with Ray nothing tells that a run begins
+        super().ended(cell, report)
+
+    def record(self) -> None:
+        """Write the study, once."""
+        if not self.written:
+            self.written = True
+            if path := write_study(self.ctx, self.values, self.output):
+                longer = " --overwrite longer" if self.values["overwrite"] == "longer" else ""
+                say(f"wrote {path}: 'aw bench {shlex.quote(str(path))}{longer}' makes these runs again")
 
 
 def _converted(ctx: click.Context, texts: Mapping[str, Any]) -> Values:

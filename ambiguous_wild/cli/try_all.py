@@ -22,7 +22,7 @@ from ambiguous_wild.cli.options import (
     threads_option,
     threads_words,
 )
-from ambiguous_wild.cli.run_progress import ProgressBar
+from ambiguous_wild.cli.study_file import Recorded
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import check_output, own_json
 
@@ -37,7 +37,8 @@ SCENE_S = (3.0, 1.2)
 # set-up, pages, measuring and masks: seconds for each method, and for each photo
 AROUND_S = (14.0, 1.2)
 SHORTEST_S = 30.0  # of training, for each method
-REFINESPLAT_TIME = 1.6  # of an iteration under a budget, in that of 3dgs
+# an iteration of refinesplat takes 1.3 to 1.9 times one of 3dgs (docs/refinesplat.md), in the mean of five captures
+REFINESPLAT_TIME = 1.6
 FULL_GROWTH, LEAST_GROWTH = 8000, 0.3  # iterations of a run with one Gaussian a pixel; least share of it
 GOOD, SHARP = 3000, 10_000  # iterations from which most of a scene is clear, and fine texture is
 
@@ -156,9 +157,9 @@ def train_within(
     here_s = REFINESPLAT_TIME * expected_s(1, pixels, most) * slowness()
     say("")
     say(_budget_line(budget_s, budget_s / here_s, len(names)))
-    words = ["bench", "--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
+    words = ["--method", methods, "--scene", str(scene), "--budget", f"{budget_s:g}s"]
     words += ["--max-gaussians", str(most), "--effects", str(plan), "--overwrite", "longer", "-o", str(runs)]
-    print_command(*words)
+    print_command("bench", *words)
     growing = GrowingPage(page, runs)
     try:
         report = bench(
@@ -170,7 +171,7 @@ def train_within(
             plan=plan,
             overwrite="longer",
             threads=threads,
-            callbacks=_ProgressAndPage(growing),
+            callbacks=_ProgressAndPage(growing, words),
         )
     except KeyboardInterrupt:
         if growing.end():
@@ -182,12 +183,16 @@ def train_within(
     return len(names)
 
 
-class _ProgressAndPage(ProgressBar):
-    """A bar for each run, and the page that grows while it trains."""
+class _ProgressAndPage(Recorded):
+    """Also writes the page that grows while a run trains."""
 
-    def __init__(self, page: GrowingPage) -> None:
-        super().__init__()
-        self.page, self.written = page, False
+    def __init__(self, page: GrowingPage, words: list[str]) -> None:
+        """`words`: of the 'aw bench' that makes the runs."""
+        from ambiguous_wild.cli.bench import command as bench_command
+
+        ctx = bench_command.make_context("bench", words)
+        super().__init__(ctx, ctx.params, None, page.runs)
+        self.page, self.shown = page, False
 
     def started(self, cell: Cell, folder: Path) -> None:
         super().started(cell, folder)
@@ -195,8 +200,8 @@ class _ProgressAndPage(ProgressBar):
 
     def tick(self, trainer: Trainer) -> None:
         super().tick(trainer)
-        if self.page.tick(trainer) and not self.written:
-            self.written = True
+        if self.page.tick(trainer) and not self.shown:
+            self.shown = True
             self.bar.write(
                 f"    look at it while it trains: {self.page.folder / 'index.html'}", file=sys.stderr
             )

@@ -72,8 +72,10 @@ def from_plain(cls: type[T], data: Mapping[str, Any], where: str = "config") -> 
     return cls(**values)
 
 
-def with_options(config: T, options: Mapping[str, str], where: str = "option") -> T:
+def with_options(config: T, options: Mapping[str, str], where: str = "option", hint: str = "") -> T:
     """Return the config with ``key=value`` strings of the command line applied; dots reach nested configs.
+
+    `hint` ends the message of an unknown key: how to list those that there are.
 
     Raises:
         AwError: unknown key, a value that does not parse as the key's type, or a negative value for a key
@@ -86,7 +88,7 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
     for key, text in options.items():
         head, _, rest = key.partition(".")
         if head not in names:
-            raise unknown(where, key, names)
+            raise unknown(where, key, names, hint)
         if rest:
             nested.setdefault(head, {})[rest] = text
             continue
@@ -98,7 +100,7 @@ def with_options(config: T, options: Mapping[str, str], where: str = "option") -
         if not dataclasses.is_dataclass(inner):
             key = f"{head}.{next(iter(inside))}"
             raise AwError(f"{where} {key!r}: {head!r} has no keys of its own")
-        values[head] = with_options(inner, inside, f"{where} {head}")
+        values[head] = with_options(inner, inside, f"{where} {head}", hint)
     # Apply all options at once: limits between two of them hold for the result only.
     changed = dataclasses.replace(config, **values)  # type: ignore[type-var]
     for name, value in values.items():

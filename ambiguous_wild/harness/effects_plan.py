@@ -221,7 +221,7 @@ class Decision:
     evidence: str  # what was measured, in words
     value: float  # NaN: it could not be measured
     threshold: float
-    unit: str
+    unit: str  # empty: another decision decides
     decision: Answer
     why: str
     how: str  # the option that switches the effect
@@ -352,7 +352,8 @@ def _skybox(dense: Decision) -> Decision:
         if taken
         else "haze must not explain what lies behind"
     )
-    return Decision("skybox", "number of dense starts", float(taken), 0.0, "dense starts",
+    evidence = "a dense start" if taken else "no dense start"
+    return Decision("skybox", evidence, float(taken), 0.0, "",
                     "off" if taken else "on", why, "--effects skybox")  # fmt: skip
 
 

@@ -121,7 +121,7 @@ def plan_cells(
     named = _by_name(methods)
     by_method = _settings_by_method(settings, list(named.values()))
     resolved = [  # options are checked before a plan is made: making one trains
-        (entry, with_options(entry.options(), by_method[name], f"option of {entry.name}"))
+        (entry, with_options(entry.options(), by_method[name], f"option of {entry.name}", _listed(entry)))
         for name, entry in named.items()
     ]
     distinct = list({path.resolve(): path for path in scenes}.values())
@@ -171,6 +171,12 @@ def _by_name(methods: Sequence[str | MethodEntry]) -> dict[str, MethodEntry]:
         if other.source_hash != entry.source_hash:
             raise AwError(f"two methods are called {entry.name}: their runs would share a folder; rename one")
     return named
+
+
+def _listed(entry: MethodEntry) -> str:
+    """Return where the keys of --set are listed."""
+    own = f"'aw methods {entry.name}' lists them; " if dataclasses.fields(entry.options()) else ""
+    return f"{own}for every method: train.KEY and engine.KEY of 'aw bench --help'"
 
 
 def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry]) -> dict[str, dict[str, str]]:

@@ -258,13 +258,15 @@ def _write_into(source: Path, target: Path) -> None:
 def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
     """Yield a temporary folder beside `path`; rename it to `path` on success, replacing an older folder.
 
-    If `path` is a link, its target is replaced, not the link.
+    If `path` is a link, its target is replaced, not the link. After an error no folder above it stays that
+    was not there before.
 
     Raises:
         AwError: `path` is a file or a link to nowhere; without `replace`, it was created meanwhile.
     """
     target = Path(os.path.realpath(place_of(path)[0]))
     refuse_file(path)
+    above = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     start = target.parent / f".{target.name}."
     with _named_errors(start, target):
@@ -285,6 +287,9 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
                 replace_folder(temporary, target)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
+            for folder in above:
+                with contextlib.suppress(OSError):  # another command has written into it
+                    folder.rmdir()
             raise
 
 

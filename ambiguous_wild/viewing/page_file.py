@@ -18,7 +18,7 @@ from ambiguous_wild.io.files import check_output, refuse_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.mask_reasons import WIDTH as REASONS_WIDTH
 from ambiguous_wild.io.mask_reasons import read_reasons, regions_uri
-from ambiguous_wild.io.motion_points import read_motion_points
+from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.scene_folder import MAP
 from ambiguous_wild.io.splat_arrays import finite, sigmoid
@@ -44,6 +44,9 @@ _MASK_WIDTH = 480  # px; largest width of masks
 PHOTO = "photo"  # in place of the index of a model
 _PREFERRED = "refinesplat"  # shown first among methods with masks
 _MOST_REMOVED = 0.5  # larger shares of a photo are no distractor, but a mask gone wrong
+# Least number in a masked region, above that of static ones: a distractor in each of 35 photos has 40 to 97,
+# regions of static captures have none.
+_MOVING_FEATURES = 3
 _NEAR = 0.01  # nearest depth, as in training
 _MARGIN = 0.15  # share of the picture beyond each side that is still counted
 
@@ -140,7 +143,7 @@ def page_text(
         facts.append(_model_facts(model, element, views, scene.train, shares))
         facts[-1]["whole"] = shown == given
     for line in page_notes:
-        say(line)
+        say(line.removeprefix("* "))  # the page marks figures with it
     space = space_of(scene)
     capture_map = map_uri(scene.root / MAP)
     if views[0].image_path == NO_PHOTO:
@@ -222,35 +225,47 @@ def _reason_facts(path: Path, train: Sequence[View], most_bytes: int) -> dict[st
 
 
 def opening(models: Sequence[ViewedModel], scene: Scene, *, mixed: bool) -> dict[str, object]:
-    """Choose what the page opens with: where a method that masks distractors removed most, if one does.
+    """Choose what the page opens with: where a method masks what moves, if it does anywhere.
+
+    Methods also mask what they cannot learn, such as leaves in front of the sky. On real captures neither
+    areas nor colours of other photos told that from distractors; features that move do. In a scene without
+    them (motion.npz) it opens where most is masked, and claims nothing.
 
     Returns:
-        `left` and `right`, indices of models or "photo"; `view`, an index among test and train views, or
-        None; `place`, x and y of the upper edge of what was removed as shares of the photo, or None.
+        `left` and `right`, indices of models or "photo"; `view`, an index among test and train views;
+        `place`, x and y of the upper edge of what moves as shares of the photo, or None.
     """
     masking = [n for n, model in enumerate(models) if model.masks is not None and not model.reference]
     masking.sort(key=lambda n: not models[n].label.startswith(_PREFERRED))
+    points = read_motion_points(scene.root)
+    places = {view.name: number for number, view in enumerate((*scene.test, *scene.train))}
     for right in masking:
         masks = models[right].masks
         assert masks is not None
-        shares = {name: 1.0 - float(keep.mean()) for name, keep in _keep_maps(masks, scene.train)}
-        shares = {name: share for name, share in shares.items() if 0.0 < share <= _MOST_REMOVED}
-        if shares:
-            name = max(shares, key=lambda n: shares[n])
-            ((_, keep),) = _keep_maps(masks, [view for view in scene.train if view.name == name])
-            view = len(scene.test) + [view.name for view in scene.train].index(name)
-            others = sorted(
-                set(range(len(models))) - {right}, key=lambda n: (models[n].reference, n in masking)
+        regions = [
+            (*_surest_region(~keep, points.get(name)), places[name])
+            for name, keep in _keep_maps(masks, scene.train)
+            if 1.0 - _MOST_REMOVED <= keep.mean() < 1.0 and (name in points or not points)
+        ]
+        evidence, top, view = max(regions, default=(0.0, [], 0))
+        if evidence >= _MOVING_FEATURES or (regions and not points):
+            left = min(
+                set(range(len(models))) - {right},
+                key=lambda n: (models[n].reference, n in masking, n),
+                default=PHOTO,
             )
-            left = others[0] if others else PHOTO
-            return {"left": left, "right": right, "view": view, "place": _top_of_largest(~keep)}
+            return {"left": left, "right": right, "view": view, "place": top if points else None}
     means = [_mean_psnr(model) if not mixed else 0.0 for model in models]
-    best = max(range(len(models)), key=lambda n: (not models[n].reference, means[n]))
-    # the test photo that the best model knows best
+    masked = masking[:1] if mixed else []  # PSNR would choose the model that shows distractors
+    best = max(range(len(models)), key=lambda n: (not models[n].reference, n in masked, means[n]))
+    # the test photo that the best model knows best, else one that photos on both sides support
     known = {view.name: max(m.psnr.get(view.name, -np.inf) for m in models) for view in scene.test}
-    view = max(range(len(scene.test)), key=lambda n: 0.0 if mixed else known[scene.test[n].name], default=0)
-    left = next((n for n in range(len(models)) if n != best), best)
-    return {"left": left, "right": best if left != best else PHOTO, "view": view, "place": None}
+    view = max(range(len(scene.test)), key=lambda n: known[scene.test[n].name], default=0)
+    view = (len(scene.test) - 1) // 2 if mixed and scene.test else view
+    left = next((n for n in range(len(models)) if n != best), PHOTO)
+    if left == PHOTO and best not in masking:
+        return {"left": best, "right": PHOTO, "view": view, "place": None}
+    return {"left": left, "right": best, "view": view, "place": None}
 
 
 def _mean_psnr(model: ViewedModel) -> float:
@@ -258,13 +273,24 @@ def _mean_psnr(model: ViewedModel) -> float:
     return float(np.mean(finite_values)) if finite_values else -100.0
 
 
-def _top_of_largest(masked: np.ndarray) -> list[float]:
-    """Return x and y of the upper edge's middle of the largest region [H, W] bool, as shares of the photo."""
+def _surest_region(masked: np.ndarray, points: MotionPoints | None) -> tuple[float, list[float]]:
+    """Find the masked region [H, W] bool with the strongest evidence that it moves.
+
+    Returns:
+        its features that move minus those that are static; without `points`, its share of the photo.
+        x and y of the middle of its upper edge, as shares of the photo.
+    """
     import cv2
 
-    _, _, stats, _ = cv2.connectedComponentsWithStats(masked.astype(np.uint8))
-    left, top, width, _, _ = stats[1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])].tolist()
-    return [(left + width / 2) / masked.shape[1], top / masked.shape[0]]
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(masked.astype(np.uint8))
+    evidence: np.ndarray = stats[:, cv2.CC_STAT_AREA] / masked.size
+    if points is not None:
+        column, row = (points.xy * masked.shape[::-1]).astype(int).T
+        inside = labels[np.minimum(row, masked.shape[0] - 1), np.minimum(column, masked.shape[1] - 1)]
+        evidence = np.bincount(inside, np.where(points.moves, 1.0, -1.0), minlength=len(stats))
+    surest = 1 + int(np.argmax(evidence[1:]))
+    left, top, width = stats[surest, :3].tolist()
+    return float(evidence[surest]), [(left + width / 2) / masked.shape[1], top / masked.shape[0]]
 
 
 def _points(scene: Scene, views: Sequence[View]) -> list[list[int]]:

@@ -107,7 +107,7 @@ def test_strict_names_every_failed_check(clean: list[np.ndarray], tmp_path: Path
     refuse_failed(check_capture(tmp_path / "raw"))
     (tmp_path / "raw/z.png").write_bytes(b"no photo")
     with pytest.raises(
-        AwError, match=r"fails 1 of 11 capture checks: files: 1 of 9 photos are left out: z\.png"
+        AwError, match=r"raw: 1 of 11 capture checks warn: files: 1 of 9 photos are left out: z\.png"
     ):
         refuse_failed(check_capture(tmp_path / "raw"))
 

@@ -7,7 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.scene_record import verdict
+from ambiguous_wild.builder.scene_record import (
+    NO_TEST_SET,
+    provisional_warnings,
+    summary_lines,
+    verdict,
+)
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.builder.capture_maker import write_capture
 from tests.command_line import aw
@@ -85,6 +90,23 @@ def test_the_verdict_says_whether_the_photos_are_enough(photos, word):
         {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1}, (4, 3), Path("s")
     )
     assert word in line and ("ready" in line) == (photos >= 20)
+
+
+def test_a_step_of_another_command_advises_nothing_that_is_not_its_own():
+    """'aw try' trains itself, and takes no test photos."""
+    counts = dict.fromkeys(("registered", "photos", "readable", "train", "test", "points"), 30)
+    info = {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1, "split": "every-8",
+            "fixed_to_camera": [], "warnings": [f"{NO_TEST_SET}, so ...", "soft"]}  # fmt: skip
+    assert "; next: aw bench --method refinesplat --scene s -o runs" in verdict(info, (4, 3), Path("s"))
+    assert verdict(info, (4, 3), None).endswith(": ready")
+    assert summary_lines(info)[1:] == [f"warning: {NO_TEST_SET}, so ...", "warning: soft"]
+    assert summary_lines(info, test_advice=False)[1:] == ["warning: soft"]
+
+
+def test_photos_placed_with_little_evidence_come_with_an_advice():
+    assert provisional_warnings([]) == []
+    (line,) = provisional_warnings(["a.jpg", "b.jpg"])
+    assert line.startswith("2 photos placed with little evidence") and ": a.jpg, b.jpg; take more" in line
 
 
 @pytest.mark.parametrize(("placed", "missing"), [(13, 11), (24, None), (20, None)])

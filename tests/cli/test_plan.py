@@ -1,7 +1,10 @@
 """`aw plan` and `aw bench --effects` as they are typed."""
 
 import json
+import re
 
+from ambiguous_wild.cli.plan import table
+from ambiguous_wild.harness.effects_plan import Evidence, decide
 from tests.command_line import aw
 
 
@@ -45,3 +48,21 @@ def test_a_file_that_is_no_plan_is_not_replaced(scene, tmp_path):
     assert photo.read_bytes() == b"\xff\xd8 mine"
     for _ in range(2):  # an earlier plan is
         assert aw("plan", scene, "-o", tmp_path / "plan.json", "--no-probe").returncode == 0
+
+
+def test_without_probe_no_column_is_empty_and_limits_have_units(monkeypatch):
+    monkeypatch.setattr("ambiguous_wild.cli.plan.line_width", lambda: 80)
+    lines = table(decide("scene", Evidence(0.024, 0.01, 1.2, 0.0, 900, photos=10)))
+    assert lines[0].split() == ["effect", "decision", "measured", "limit"]
+    cells = {line.split()[0]: re.split(r"  +", line)[2:] for line in lines[1:6]}
+    assert cells == {
+        "appearance": ["1 %", "from 4.3 %"],
+        "exposure": ["2.4 %", "from 5 %"],
+        "antialias": ["1.2 times", "from 1.5 times"],
+        "skybox": ["—", "—"],  # another decision decides
+        "dense": ["10 photos", "up to 24 photos"],
+    }
+    assert max(map(len, lines)) <= 80 and "gains at the same points, % of the colour range)" in " ".join(
+        line.strip() for line in lines
+    )
+    assert "skybox off: a dense start fills the room for first Gaussians (a dense start)" in lines

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from ambiguous_wild.cli.bench import command as bench_command
+from ambiguous_wild.cli.bench import parse_budget
 from ambiguous_wild.cli.try_all import SHORTEST_S, train_within
 from ambiguous_wild.harness.result_file import read_result
 from tests.builder.capture_maker import write_capture
@@ -29,6 +31,11 @@ def test_photos_become_a_page_that_a_larger_budget_continues(tmp_path: Path) -> 
     assert _commands(done.stderr) == ["screen", "build-scene", "plan", "bench", "view"]
     page, run = out / "view/index.html", out / "runs/walls/refinesplat/seed0"
     assert f"look at it while it trains: {page}" in done.stderr
+    # of the test photos it speaks once, and neither of the next command nor of options that it does not have
+    said = done.stdout + done.stderr
+    assert said.count("test photos may hold distractors") == 1 and "* PSNR" not in said
+    assert "--test-list" not in said and "next: aw bench" not in said
+    assert (out / "runs/study.yaml").is_file()
     assert "splat file of refinesplat: " in done.stderr and "aw masks " in done.stderr
     assert '"reload_s":0.0' in page.read_text()
     assert f"--budget {SHORTEST_S:g}s" in done.stderr and "a sketch" in done.stderr
@@ -86,6 +93,27 @@ def test_the_same_budget_gives_the_same_length_and_methods_share_it(
     assert longer["budgets_s"][0] == first["budgets_s"][0] + 600.0
     assert longer["train"]["max_gaussians"] >= first["train"]["max_gaussians"]
     assert budgets(monkeypatch, scene, "refinesplat", 1.0)["budgets_s"] == [SHORTEST_S]
+
+
+def test_it_writes_the_study_that_bench_reads(monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
+    asked = budgets(monkeypatch, scene, "3dgs,refinesplat", 300.0)
+    recorded, runs = asked["callbacks"], asked["output"]
+    recorded.written = False
+    recorded.record()
+    study = runs / "study.yaml"
+    words = bench_command.make_context("bench", [str(study)]).params
+    assert words["methods"] == ("3dgs", "refinesplat") and [s.resolve() for s in words["scenes"]] == [scene]
+    assert [parse_budget(text) for text in words["budgets"]] == asked["budgets_s"]
+    assert words["max_gaussians"] == asked["train"]["max_gaussians"]
+    assert Path(words["effects"][0]).resolve() == asked["plan"].resolve()
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "walk.mp4"])
+def test_a_file_that_is_no_video_leaves_nothing(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("text")
+    done = aw("try", name, "-o", "above/out", cwd=tmp_path)
+    assert done.returncode == 2 and f"{name} is no video that can be read" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_video_is_captured_once(tmp_path: Path) -> None:

@@ -63,6 +63,17 @@ def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["d"]
 
 
+def test_a_failed_folder_leaves_none_above_it_that_was_not_there(tmp_path):
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(RuntimeError), atomic_dir(tmp_path / "mine" / "new" / "deep" / "out"):
+        raise RuntimeError
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"] and not any((tmp_path / "mine").iterdir())
+    with pytest.raises(RuntimeError), atomic_dir(tmp_path / "new" / "deep" / "out"):
+        (tmp_path / "new" / "other").touch()  # of somebody else, meanwhile
+        raise RuntimeError
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["other"]
+
+
 def test_a_lock_is_freed_after_an_error(tmp_path):
     with pytest.raises(AwError), folder_lock(tmp_path / "run", "first"):
         raise AwError("x")

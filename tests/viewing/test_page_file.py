@@ -256,31 +256,64 @@ def opened(runs: Path, *models: ViewedModel, mixed: bool = False) -> tuple[Any, 
     return sides[0], sides[1], [*scene.test, *scene.train][chosen["view"]].name
 
 
-def test_it_opens_where_most_was_removed(runs: Path) -> None:
-    def masked(label: str, *counts: int, **more: Any) -> ViewedModel:
-        keeps = np.ones((len(counts), HEIGHT, WIDTH), bool)
-        for keep, rows in zip(keeps, counts):
-            keep[10 : 10 + rows, 8:24] = False
-        return ViewedModel(label, Path(label), masks=dict(zip(TRAIN, keeps)), **more)
+def masked(label: str, *counts: int, **more: Any) -> ViewedModel:
+    """A model with masks of `counts` rows, from row 10 and column 8, of the first train photos."""
+    keeps = np.ones((len(counts), HEIGHT, WIDTH), bool)
+    for keep, rows in zip(keeps, counts):
+        keep[10 : 10 + rows, 8:24] = False
+    return ViewedModel(label, Path(label), masks=dict(zip(TRAIN, keeps)), **more)
 
-    plain = ViewedModel("3dgs", Path("3dgs"), psnr=dict.fromkeys(TEST, 30.0))
+
+PLAIN = ViewedModel("3dgs", Path("3dgs"), psnr=dict.fromkeys(TEST, 30.0))
+
+
+def test_without_features_it_opens_where_most_is_masked_and_claims_nothing(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_file, "read_motion_points", lambda root: {})
     removes = masked("refinesplat, seed0", 4, 12, 0, psnr=dict.fromkeys(TEST, 20.0))
-    assert opened(runs, plain, removes) == ("3dgs", "refinesplat, seed0", TRAIN[1])
+    assert opened(runs, PLAIN, removes) == ("3dgs", "refinesplat, seed0", TRAIN[1])
     assert opened(runs, removes) == ("photo", "refinesplat, seed0", TRAIN[1])
-    place = opening([removes], load_scene(runs.parent / "porch"), mixed=True)["place"]
-    assert place == [16 / WIDTH, 10 / HEIGHT]
+    assert opening([removes], load_scene(runs.parent / "porch"), mixed=True)["place"] is None
     # refinesplat before other methods with masks; the others' model stands left, and one without masks first
     assert opened(runs, masked("dronesplat", 5), removes) == ("dronesplat", "refinesplat, seed0", TRAIN[1])
-    assert opened(runs, masked("dronesplat", 5), plain, removes)[0] == "3dgs"
+    assert opened(runs, masked("dronesplat", 5), PLAIN, removes)[0] == "3dgs"
     # neither a reference, nor a mask of more than half of the photo, nor one that masks nothing
     whole = masked("refinesplat", 7)
     whole.masks[TRAIN[2]] = np.zeros((HEIGHT, WIDTH), bool)
-    assert opened(runs, plain, whole)[1:] == ("refinesplat", TRAIN[0])
+    assert opened(runs, PLAIN, whole)[1:] == ("refinesplat", TRAIN[0])
     truth = masked("3dgs+truth", 9, reference=True)
-    assert opened(runs, plain, truth)[1] == "3dgs" and opened(runs, truth, removes)[:2] == (
+    assert opened(runs, PLAIN, truth)[1] == "3dgs" and opened(runs, truth, removes)[:2] == (
         "3dgs+truth", "refinesplat, seed0",
     )  # fmt: skip
-    assert opened(runs, plain, masked("refinesplat", 0))[1] == "3dgs"
+    assert opened(runs, PLAIN, masked("refinesplat", 0))[1] == "3dgs"
+
+
+def test_it_opens_where_masked_features_move_else_with_an_ordinary_view(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def features(moving: int, static: int) -> MotionPoints:
+        """Some in the columns that are masked, and as many that move in those that are not."""
+        moves = np.array([1] * moving + [0] * static + [1] * 9, np.uint8)
+        xy = np.tile(np.array([12.5, 11.5], np.float32) / [WIDTH, HEIGHT], (len(moves), 1))
+        xy[moving + static :, 0] = 0.9
+        return MotionPoints(xy.astype(np.float32), 1 - moves, moves, moves.astype(np.int16))
+
+    scene, removes = load_scene(runs.parent / "porch"), masked("refinesplat", 4, 12)
+    points = {TRAIN[0]: features(5, 1), TRAIN[1]: features(5, 4)}
+    monkeypatch.setattr(page_file, "read_motion_points", lambda root: points)
+    assert opened(runs, PLAIN, removes) == (
+        "3dgs",
+        "refinesplat",
+        TRAIN[0],
+    )  # though more of the next is masked
+    assert opening([removes], scene, mixed=True)["place"] == [16 / WIDTH, 10 / HEIGHT]
+    points[TRAIN[0]] = features(1, 0)
+    assert opened(runs, removes, mixed=True) == ("photo", "refinesplat", TEST[0])
+    assert opening([removes], scene, mixed=True)["place"] is None
+    # PSNR would choose 3dgs, but rewards what should be masked
+    assert opened(runs, PLAIN, removes, mixed=True) == ("3dgs", "refinesplat", TEST[0])
+    assert opened(runs, PLAIN, removes)[1] == "3dgs"
 
 
 def test_without_masks_it_opens_with_the_best_unless_test_photos_hold_distractors(runs: Path) -> None:
@@ -295,7 +328,9 @@ def test_without_masks_it_opens_with_the_best_unless_test_photos_hold_distractor
 
 def test_psnr_of_mixed_test_photos_is_marked_and_names_its_fault(tmp_path: Path) -> None:
     write_shown_run(tmp_path / "runs", write_mixed_scene(tmp_path / "scene"), "3dgs")
-    data = facts(page := view_runs([tmp_path / "runs"], tmp_path / "out").path.read_text())
+    lines: list[str] = []
+    data = facts(page := view_runs([tmp_path / "runs"], tmp_path / "out", say=lines.append).path.read_text())
+    assert lines[1].startswith("PSNR here rewards ghosts: ")  # without the * of the page's figures
     assert data["mixed"] and data["notes"][0].startswith("* PSNR here rewards ghosts: test photos may hold")
     assert sum("may hold distractors" in note for note in data["notes"]) == 1
     assert f"<title>{tmp_path.name} · aw</title>" in page  # not that of the folder, which says nothing

@@ -15,6 +15,7 @@ import pytest
 from ambiguous_wild.harness.trained_models import view_runs
 from ambiguous_wild.io.images import read_gray, write_png
 from ambiguous_wild.io.mask_reasons import reasons_of, write_reasons
+from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.io.spz import decode_spz
 from tests.chromium import Browser, needs_chromium
@@ -38,6 +39,10 @@ def removed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """3dgs without masks, and refinesplat with masks and their reasons; test photos may hold distractors."""
     root = tmp_path_factory.mktemp("removed")
     scene = write_mixed_scene(root / "porch")
+    some = np.ones(4, np.uint8)
+    xy = np.array([[45, 9], [50, 12], [55, 16], [50, 20]], np.float32) / [WIDTH, HEIGHT]
+    moving = MotionPoints(xy.astype(np.float32), 0 * some, some, some.astype(np.int16))
+    write_motion_points(scene / FILE, {TRAIN[1]: moving})
     shutil.rmtree(write_shown_run(root / "runs", scene, "3dgs") / "masks")
     run = write_shown_run(root / "runs", scene, "refinesplat", 1)
     keep = read_gray(run / "masks" / TRAIN[1])
@@ -83,7 +88,7 @@ def press(page: Browser, *spots: tuple[float, float]) -> None:
     mouse(page, "mouseReleased", *spots[-1], button="left", clickCount=1)
 
 
-def test_it_opens_where_most_was_removed_with_the_method_that_masks_right(masked: Browser) -> None:
+def test_it_opens_where_most_moves_with_the_method_that_masks_right(masked: Browser) -> None:
     assert facts(masked, "[DATA.models[state.left].label, DATA.models[state.right].label]") == [
         "3dgs", "refinesplat",
     ]  # fmt: skip

@@ -37,7 +37,6 @@ SCENE_S = (3.0, 1.2)
 # set-up, pages, measuring and masks: seconds for each method, and for each photo
 AROUND_S = (14.0, 1.2)
 SHORTEST_S = 30.0  # of training, for each method
-# an iteration of refinesplat takes 1.3 to 1.9 times one of 3dgs (docs/refinesplat.md), in the mean of five captures
 # Time of an iteration under a budget over one of 3dgs at full size: masks cost time, the smaller photos at the
 # begin save some. Five captures at 'aw try --budget 2m': 1.0 to 1.5.
 REFINESPLAT_TIME = 1.28

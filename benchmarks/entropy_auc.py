@@ -46,8 +46,8 @@ from ambiguous_wild.methods.refinesplat.threshold import contrast, entropy, surp
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.vision.backends import CONV, make_features, make_instances
 

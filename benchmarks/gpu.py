@@ -40,8 +40,8 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.gpu_kernels import photometric_fused
 from ambiguous_wild.splat.gsplat_seam import gsplat
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.stress import stress_table
 from ambiguous_wild.stress.case import run

@@ -39,7 +39,7 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 
 root, method = sys.argv[1:3]

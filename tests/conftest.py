@@ -45,7 +45,7 @@ def scene(tmp_path_factory):
 def finished(scene, tmp_path_factory):
     """The runs folder of a short run of 3dgs on the tiny scene; nobody changes it."""
     from ambiguous_wild.harness.grid import plan_cells, run_cells
-    from ambiguous_wild.splat.pace import TrainConfig
+    from ambiguous_wild.splat.train_config import TrainConfig
     from tests.shared import made_once
 
     def make(root):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -244,9 +246,8 @@ def test_core_needs_numpy_alone() -> None:
         assert {m.split(".")[0] for m, _, _ in imports(path)} <= allowed | late.get(path.name, set()), path
 
 
-def test_help_and_the_list_of_methods_import_nothing_heavy() -> None:
-    """One interpreter runs them all: a package is named with the first command that imports it."""
-    calls = [["--help"], *([name, "--help"] for name in COMMANDS), ["methods", "--json"]]
+def imported_by(calls: list[list[str]], folder: Path) -> tuple[str, list[set[str]]]:
+    """Run commands in one interpreter; return their output, and what of `HEAVY` each imports first."""
     code = (
         "import sys\n"
         "from ambiguous_wild.cli.main import cli\n"
@@ -254,13 +255,52 @@ def test_help_and_the_list_of_methods_import_nothing_heavy() -> None:
         f"for words in {calls!r}:\n"
         "    try:\n"
         "        cli.main(words, prog_name='aw', standalone_mode=False)\n"
-        "    except SystemExit:\n"
-        "        pass\n"
-        f"    for name in {HEAVY!r}:\n"
-        "        if name in sys.modules and name not in known:\n"
-        "            known.add(name)\n"
-        "            sys.stderr.write(f'aw {\" \".join(words)} imports {name}\\n')\n"
+        "    except SystemExit as end:\n"
+        "        assert not end.code, words\n"
+        f"    new = set({HEAVY!r}) & set(sys.modules) - known\n"
+        "    known |= new\n"
+        "    print('IMPORTS', *new, file=sys.stderr)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.count("Usage: aw") == len(COMMANDS) + 1
-    assert done.stderr == ""
+    command = [sys.executable, "-c", code]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
+    assert done.returncode == 0, done.stderr
+    lines = [line.split()[1:] for line in done.stderr.splitlines() if line.startswith("IMPORTS")]
+    return done.stdout, [set(names) for names in lines]
+
+
+def test_help_and_the_list_of_methods_import_nothing_heavy(tmp_path: Path) -> None:
+    calls = [["--help"], *([name, "--help"] for name in COMMANDS), ["methods", "--json"]]
+    printed, imported = imported_by(calls, tmp_path)
+    assert printed.count("Usage: aw") == len(COMMANDS) + 1
+    assert {" ".join(words): names for words, names in zip(calls, imported, strict=True) if names} == {}
+
+
+# What commands that only read may import. One interpreter runs those of a row, in this order: a package
+# counts for the first that imports it.
+READERS: tuple[dict[str, set[str]], ...] = (
+    {
+        "simulate": set(),
+        "fetch": set(),
+        "table RUNS": {"pandas", "scipy"},  # scipy.special: intervals
+        "table RUNS --layout means --format latex": set(),
+    },
+    {
+        "cost RUNS -o cost --json": {"matplotlib"},
+        "plan SCENE --no-probe -o plan.json": {"cv2"},  # SciPy only where points have tracks
+        "audit": {"scipy"},
+        "figure RUNS -o figure.png": {"pandas"},
+    },
+    {"statement RUNS": {"torch", "cv2", "scipy"}},  # the defaults of a method stand in its recipe
+)
+
+
+@pytest.mark.parametrize("readers", READERS, ids=lambda row: "+".join(text.split()[0] for text in row))
+def test_what_only_reads_imports_what_it_needs(
+    readers: dict[str, set[str]], scene: Path, finished: Path, tmp_path: Path
+) -> None:
+    paths = {"RUNS": str(finished), "SCENE": str(scene)}
+    calls = [[paths.get(word, word) for word in text.split()] for text in readers]
+    _, imported = imported_by(calls, tmp_path)
+    unneeded = {text: names - readers[text] for text, names in zip(readers, imported, strict=True)}
+    assert {text: names for text, names in unneeded.items() if names} == {}

@@ -94,12 +94,12 @@ def command(
 
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.cli.run_progress import ProgressBar
-    from ambiguous_wild.harness.ablation_study import earlier_groups, plan_study
+    from ambiguous_wild.harness.ablation_study import earlier_groups, plan_study, report
     from ambiguous_wild.harness.cell import RunOptions
     from ambiguous_wild.harness.grid import run_cells
     from ambiguous_wild.io.files import check_output
-    from ambiguous_wild.report.ablation_report import markdown_of, report, write_report
-    from ambiguous_wild.splat.pace import TrainConfig
+    from ambiguous_wild.report.ablation_report import markdown_of, write_report
+    from ambiguous_wild.splat.train_config import TrainConfig
 
     on = choose_device(device)
     train = TrainConfig(

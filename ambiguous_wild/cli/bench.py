@@ -271,7 +271,7 @@ def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], 
         texts[owner][key] = text
     values: dict[str, dict[str, Any]] = {owner: {} for owner in RARE}
     if texts["train"]:
-        from ambiguous_wild.splat.pace import TrainConfig
+        from ambiguous_wild.splat.train_config import TrainConfig
 
         values["train"] = _typed(TrainConfig(), "train", texts["train"])
     if texts["engine"]:

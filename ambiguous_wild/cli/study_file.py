@@ -205,7 +205,7 @@ def _options_of_run(path: Path, run: Mapping[str, Any]) -> dict[str, Any]:
     from ambiguous_wild.harness.cell import changed_settings
     from ambiguous_wild.methods.graft import graft_pairs, split_graft
     from ambiguous_wild.methods.registry import get_method
-    from ambiguous_wild.splat.pace import TrainConfig
+    from ambiguous_wild.splat.train_config import TrainConfig
 
     try:
         method, train, scene = str(run["method"]), dict(run["train"]), dict(run["scene"])

@@ -256,10 +256,11 @@ def _layouts(
     reported: Path | bool | None,  # True: the numbers of the package
 ) -> list[Table]:
     from ambiguous_wild.report import papers
-    from ambiguous_wild.report.ablation_report import ablation
     from ambiguous_wild.report.papers import datasets_of, read_reported, with_reported
 
     if loaded is None:
+        from ambiguous_wild.report.ablation_report import ablation
+
         return ablation(runs, tuple(metrics))
     if layout == "blocks":
         return papers.in_blocks(loaded, metrics=metrics, scenes=scenes)

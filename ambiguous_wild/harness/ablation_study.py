@@ -9,18 +9,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import Any, Literal
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain, with_options
+from ambiguous_wild.harness.ablation_records import (
+    DIFFERENCES,
+    METRICS,
+    REPORT,
+    StudyFacts,
+    StudyReport,
+    SummaryRecord,
+    VariantRow,
+)
 from ambiguous_wild.harness.cell import Cell
+from ambiguous_wild.harness.command_lines import option_text
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.measures import MASK_LABELS, Measure, measure
+from ambiguous_wild.harness.measures import MASK_LABELS, Measure
 from ambiguous_wild.harness.result_file import (
     FAILED,
     RESULT,
     RunResult,
-    TrainRecord,
     mask_scores,
     mean_of,
 )
@@ -29,67 +38,10 @@ from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.methods.ablation_groups import DEFAULT, Group, Variant, choose_groups, folder_name
 from ambiguous_wild.methods.describe import BACK_ENDS
 from ambiguous_wild.methods.registry import MethodEntry, get_method
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.metrics import stats
+from ambiguous_wild.splat.train_config import TrainConfig
 
-REPORT = "ablation.json"
-# The columns of the tables; keys as in ablation.json.
-METRICS = (
-    *map(measure, ("psnr", "ssim", "lpips_alex")),
-    *(Measure(key, f"mask {label}", "higher", 3) for key, label in MASK_LABELS.items()),
-    *map(measure, ("gaussians", "model_mb", "ms_per_iteration", "setup_s")),
-    Measure("total_s", "total s", "lower", 1, per_image=False, timed=True),
-)
-DIFFERENCES = tuple(m for m in METRICS if m.key in ("psnr", "iou", "ms_per_iteration"))
-
-
-class StudyFacts(TypedDict):
-    """Facts in which two studies must agree before one report can hold both."""
-
-    method: str
-    settings: list[str]  # that replace defaults in every row
-    train: TrainRecord
-    scenes: list[str]
-    seeds: list[int]
-
-
-class GroupFacts(TypedDict):
-    """A group of variants."""
-
-    name: str
-    title: str
-    source: str  # table or section of the paper; empty if there is none
-
-
-class SummaryRecord(TypedDict):
-    """Mean and sample deviation over the runs of a variant; None = missing."""
-
-    mean: float | None
-    spread: float | None
-
-
-class VariantRow(TypedDict):
-    """A variant: its values, its differences to the default, its runs."""
-
-    group: str
-    variant: str
-    settings: list[str]
-    text: str
-    status: Literal["ok", "failed", "missing"]
-    reason: str  # why the status is not ok
-    same_as: str  # the row that has the same runs; empty if there is none
-    values: dict[str, SummaryRecord]  # by the keys of `METRICS`
-    differences: dict[str, SummaryRecord]  # by the keys of `DIFFERENCES`
-    runs: list[Facts]  # scene, seed, folder, error, untimed (why times are not ranked), and `METRICS`
-
-
-class StudyReport(StudyFacts):
-    """The content of ablation.json."""
-
-    schema: int
-    made_by: str  # the command
-    note: NotRequired[str]  # of the method, about itself
-    groups: list[GroupFacts]
-    rows: list[VariantRow]
+_KEYS = tuple(m.key for m in METRICS)
 
 
 @dataclass(frozen=True)
@@ -322,3 +274,87 @@ def read_outcomes(cells: Sequence[Cell], output: Path) -> list[VariantResult]:
         else:
             outcomes.append(VariantResult(*where, None, str(result["error"])))
     return outcomes
+
+
+def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
+    """Return the study as plain data: for each variant its values, differences and runs.
+
+    Args:
+        study: the study; its runs may be unfinished.
+        output: the folder of its runs.
+        made_by: the command that makes the report again.
+    """
+    default = read_outcomes(study.default, output)
+    rows = [_row(row, read_outcomes(row.cells, output), default) for row in study.rows]
+    for row in rows:
+        if row["variant"] == DEFAULT:
+            of = [other for other in rows if other["group"] == row["group"] and other is not row]
+            row["settings"] = _default_value(study, [other["settings"] for other in of])
+    return {
+        "schema": 1,
+        "made_by": made_by,
+        "note": study.note,
+        **study.facts(),
+        "groups": [{"name": g.name, "title": g.title, "source": g.source} for g in study.groups],
+        "rows": rows,
+    }
+
+
+def _row(row: Planned, outcomes: list[VariantResult], default: list[VariantResult]) -> VariantRow:
+    failed = [o for o in outcomes if o.result is None]
+    status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
+    reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
+    values = {key: _summary([o.value(key) for o in outcomes]) for key in _KEYS}
+    pairs = list(zip(outcomes, default, strict=False))
+    differences = {m.key: _summary([_minus(m, o, d) for o, d in pairs]) for m in DIFFERENCES}
+    return {
+        "group": row.group,
+        "variant": row.variant.name,
+        "settings": [*row.variant.settings, *_networks(row)],
+        "text": row.variant.text,
+        "status": status,
+        "reason": reason,
+        "same_as": row.same_as,
+        "values": values,
+        "differences": differences,
+        "runs": [_run_row(outcome) for outcome in outcomes],
+    }
+
+
+def _minus(m: Measure, o: VariantResult, default: VariantResult) -> float | None:
+    """Return the difference of two runs; None if a value is missing, or a time cannot be compared."""
+    a, b = o.value(m.key), default.value(m.key)
+    return None if a is None or b is None or (m.timed and (o.untimed or default.untimed)) else a - b
+
+
+def _run_row(o: VariantResult) -> Facts:
+    row: Facts = {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
+    return row | {"untimed": o.untimed} | {key: o.value(key) for key in _KEYS}
+
+
+def _networks(row: Planned) -> list[str]:
+    """Return the features and instances of a variant that is another method."""
+    if not row.variant.method or not row.cells:
+        return []
+    options = to_plain(row.cells[0].options)
+    return [f"{key}={options[key]}" for key in BACK_ENDS if key in options]
+
+
+def _default_value(study: Study, settings: Sequence[Sequence[str]]) -> list[str]:
+    """Return KEY=VALUE of the default where the variants are values of this one option."""
+    keys = {setting.partition("=")[0] for of in settings for setting in of}
+    options = flatten(to_plain(study.default[0].options))
+    if len(keys) != 1 or any(len(of) != 1 for of in settings) or not keys <= options.keys():
+        return []
+    (key,) = keys
+    return [f"{key}={option_text(options[key])}"]
+
+
+def _summary(values: list[float | None]) -> SummaryRecord:
+    numbers = [math.nan if v is None else float(v) for v in values]
+    mean, spread = stats.mean(numbers), stats.sample_std(numbers)
+    return {"mean": _number(mean), "spread": _number(spread)}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -238,7 +238,7 @@ def bench(
         from ambiguous_wild.harness.training import check_passes
         from ambiguous_wild.io.files import check_output
         from ambiguous_wild.splat.calibration import prepare_cpu
-        from ambiguous_wild.splat.pace import TrainConfig
+        from ambiguous_wild.splat.train_config import TrainConfig
 
         used_device = session.device(device)
         config = TrainConfig(

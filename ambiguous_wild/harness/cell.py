@@ -49,7 +49,7 @@ from ambiguous_wild.io.motion_points import FILE as MOTION
 from ambiguous_wild.methods.graft import Graft
 from ambiguous_wild.methods.references import reference_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 
 Overwrite = Literal["never", "missing", "longer", "changed", "always"]
 Protocol = Literal["full", "half"]

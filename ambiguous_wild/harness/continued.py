@@ -14,7 +14,7 @@ from ambiguous_wild.harness.result_file import Continued
 from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.io.corrections import CORRECTIONS, CorrectionsFile
 from ambiguous_wild.splat import checkpoint
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 
 
 def with_corrections(cells: Sequence[Cell], path: Path) -> list[Cell]:

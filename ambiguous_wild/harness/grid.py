@@ -39,7 +39,7 @@ from ambiguous_wild.io.scene_folder import ALL_TRAINED, load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.effects import check_effects
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 
 
 def try_recipes(cells: Sequence[Cell]) -> list[str]:

@@ -31,7 +31,7 @@ from ambiguous_wild.methods.entry import trained_once
 from ambiguous_wild.methods.graft import graft_pairs, split_graft
 from ambiguous_wild.methods.references import MASKS, NERFBASELINES, reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 
 # A node that is lost keeps its lock until the file server forgets it (NFS: 90 s by default).
 LOCK_WAIT_S = 150.0

@@ -21,7 +21,7 @@ from ambiguous_wild.io.files import own_json
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, REPORT, NonFinite
 

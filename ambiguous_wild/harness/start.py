@@ -18,7 +18,7 @@ from ambiguous_wild.io.splat_files import read_splats
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.method_hooks import MethodHooks
-    from ambiguous_wild.splat.pace import TrainConfig
+    from ambiguous_wild.splat.train_config import TrainConfig
 
 _NEAR = 0.05  # of a point's distance to the nearest train camera
 # Shares of near points below which a start is refused, and warned of. Models of the scene had 0.59 to 1; with

@@ -9,9 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash, flatten
@@ -37,6 +35,9 @@ from ambiguous_wild.harness.timing import timing_of
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 from ambiguous_wild.io.ply import splat_count
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Columns of `Runs.runs` that hold words, beside scene and method.
 TEXT_OF_RUNS = (
@@ -447,6 +448,8 @@ def _missing_rows(results: list[FolderResult]) -> Iterator[TableRow]:
 
 
 def _frame(rows: Iterator[TableRow], columns: list[str]) -> pd.DataFrame:
+    import pandas as pd
+
     listed = list(rows)
     return pd.DataFrame(listed) if listed else pd.DataFrame(columns=columns)
 

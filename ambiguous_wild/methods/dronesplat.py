@@ -23,7 +23,8 @@ from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.losses import ssim_map
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 from ambiguous_wild.vision.backends import check_instances, make_instances
 from ambiguous_wild.vision.precompute import instance_labels
 

@@ -40,7 +40,8 @@ from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 from ambiguous_wild.vision.backends import check_features
 
 CODE, SHIFT = 32, 4.0  # length of codes; offset of the drawn uncertainty, because the renderer clamps at 0

@@ -20,7 +20,8 @@ from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,8 @@ from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, 
 from ambiguous_wild.splat.effects.geometry import SceneNormaliser, in_picture, mean_of_seen, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData, ViewContext
+from ambiguous_wild.splat.step import TrainData, ViewContext
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 
 PARTS = 8  # parallel parts of the positions
 PRIMES = (1, 2_654_435_761, 805_459_861)  # as in Instant-NGP

@@ -43,7 +43,8 @@ from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 from ambiguous_wild.vision.backends import check_features, make_features
 from ambiguous_wild.vision.precompute import photo_features
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.srgb import srgb_to_linear
@@ -154,6 +153,8 @@ def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _blur(x: np.ndarray) -> np.ndarray:
+    from scipy.ndimage import correlate1d
+
     weights = window()
     rows = correlate1d(x, weights, axis=0, mode="constant", cval=0.0)
     return correlate1d(rows, weights, axis=1, mode="constant", cval=0.0)
@@ -310,5 +311,7 @@ def _strength(luminance: np.ndarray, kernel: np.ndarray, smooth: np.ndarray) -> 
 
 def _separable(image: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:
     """Filter along both axes; border pixels are repeated."""
+    from scipy.ndimage import correlate1d
+
     rows = correlate1d(image, down, axis=0, mode="nearest")
     return correlate1d(rows, across, axis=1, mode="nearest")

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtr, stdtrit
 
 from ambiguous_wild.core import AwError
 
@@ -130,6 +129,8 @@ def _seed_variance(values: np.ndarray) -> float:
 def _t_interval(mean: float, variance: float, freedom: float, count: int) -> Interval:
     if not variance:  # all values are equal
         return Interval(mean, mean, mean, count, p=float(mean == 0.0))
+    from scipy.special import stdtr, stdtrit
+
     error = math.sqrt(variance)
     half = float(stdtrit(freedom, (1.0 + LEVEL) / 2.0)) * error
     return Interval(mean, mean - half, mean + half, count, p=2.0 * float(stdtr(freedom, -abs(mean) / error)))

@@ -15,120 +15,27 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.core.config import Facts, flatten, to_plain
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
-from ambiguous_wild.harness.ablation_study import (
+from ambiguous_wild.harness.ablation_records import (
     DIFFERENCES,
     METRICS,
     REPORT,
     GroupFacts,
-    Planned,
-    Study,
     StudyReport,
-    SummaryRecord,
-    VariantResult,
     VariantRow,
-    read_outcomes,
 )
-from ambiguous_wild.harness.command_lines import option_text
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.io.files import atomic_path, write_json, write_text
 from ambiguous_wild.methods.ablation_groups import DEFAULT
-from ambiguous_wild.methods.describe import BACK_ENDS
-from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_plots import label_points, new_figure
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell, ranks
 
 LOGARITHMIC = 20.0  # ratio of the values of an option from which their axis is logarithmic
-KEYS = tuple(m.key for m in METRICS)
 SHOWN = ("psnr", "ssim", "lpips_alex", "iou", "ms_per_iteration", "gaussians", "model_mb")
-
-
-def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
-    """Return the study as plain data: for each variant its values, differences and runs.
-
-    Args:
-        study: the study; its runs may be unfinished.
-        output: the folder of its runs.
-        made_by: the command that makes the report again.
-    """
-    default = read_outcomes(study.default, output)
-    rows = [_row(row, read_outcomes(row.cells, output), default) for row in study.rows]
-    for row in rows:
-        if row["variant"] == DEFAULT:
-            of = [other for other in rows if other["group"] == row["group"] and other is not row]
-            row["settings"] = _default_value(study, [other["settings"] for other in of])
-    return {
-        "schema": 1,
-        "made_by": made_by,
-        "note": study.note,
-        **study.facts(),
-        "groups": [{"name": g.name, "title": g.title, "source": g.source} for g in study.groups],
-        "rows": rows,
-    }
-
-
-def _row(row: Planned, outcomes: list[VariantResult], default: list[VariantResult]) -> VariantRow:
-    failed = [o for o in outcomes if o.result is None]
-    status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
-    reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
-    values = {key: _summary([o.value(key) for o in outcomes]) for key in KEYS}
-    pairs = list(zip(outcomes, default, strict=False))
-    differences = {m.key: _summary([_minus(m, o, d) for o, d in pairs]) for m in DIFFERENCES}
-    return {
-        "group": row.group,
-        "variant": row.variant.name,
-        "settings": [*row.variant.settings, *_networks(row)],
-        "text": row.variant.text,
-        "status": status,
-        "reason": reason,
-        "same_as": row.same_as,
-        "values": values,
-        "differences": differences,
-        "runs": [_run_row(outcome) for outcome in outcomes],
-    }
-
-
-def _minus(m: Measure, o: VariantResult, default: VariantResult) -> float | None:
-    """Return the difference of two runs; None if a value is missing, or a time cannot be compared."""
-    a, b = o.value(m.key), default.value(m.key)
-    return None if a is None or b is None or (m.timed and (o.untimed or default.untimed)) else a - b
-
-
-def _run_row(o: VariantResult) -> Facts:
-    row: Facts = {"scene": o.scene, "seed": o.seed, "folder": str(o.folder), "error": o.error or None}
-    return row | {"untimed": o.untimed} | {key: o.value(key) for key in KEYS}
-
-
-def _networks(row: Planned) -> list[str]:
-    """Return the features and instances of a variant that is another method."""
-    if not row.variant.method or not row.cells:
-        return []
-    options = to_plain(row.cells[0].options)
-    return [f"{key}={options[key]}" for key in BACK_ENDS if key in options]
-
-
-def _default_value(study: Study, settings: Sequence[Sequence[str]]) -> list[str]:
-    """Return KEY=VALUE of the default where the variants are values of this one option."""
-    keys = {setting.partition("=")[0] for of in settings for setting in of}
-    options = flatten(to_plain(study.default[0].options))
-    if len(keys) != 1 or any(len(of) != 1 for of in settings) or not keys <= options.keys():
-        return []
-    (key,) = keys
-    return [f"{key}={option_text(options[key])}"]
-
-
-def _summary(values: list[float | None]) -> SummaryRecord:
-    numbers = [math.nan if v is None else float(v) for v in values]
-    mean, spread = stats.mean(numbers), stats.sample_std(numbers)
-    return {"mean": _number(mean), "spread": _number(spread)}
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def write_report(data: StudyReport, folder: Path) -> list[Path]:

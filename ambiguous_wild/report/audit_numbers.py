@@ -213,7 +213,7 @@ def repeated(numbers: list[PrintedNumber]) -> list[AuditFinding]:
 
 def _repeating(lines: dict[Key, Line]) -> Iterator[list[Pair]]:
     """Yield pairs of numbers of two lines that share too many, compared metric by metric."""
-    from scipy.stats import poisson
+    from scipy.special import pdtrc  # scipy.stats takes 0.5 s to import
 
     trials = []
     for (_, a), (_, b) in combinations(sorted(lines.items()), 2):
@@ -232,7 +232,7 @@ def _repeating(lines: dict[Key, Line]) -> Iterator[list[Pair]]:
                 sum(a.value != b.value and _near(a, b, w) for a, b in pairs) for w in (NEAR, CLOSE)
             )
             expected = max((near + 1) / (2 * NEAR), close / (2 * CLOSE))
-            if poisson.sf(distinct - 1, expected) * tested < ODDS:
+            if pdtrc(distinct - 1, expected) * tested < ODDS:
                 equal += same
         if equal:
             yield equal
@@ -370,14 +370,14 @@ def _unusual(scenes: Scenes, place: tuple[str, str, str], method: str) -> bool |
 
 
 def _columns(scenes: Scenes) -> Iterator[AuditFinding]:
-    from scipy.stats import spearmanr
-
     for place, entries in scenes.items():
         if len(entries) < OTHERS:
             continue
         votes = [v for m in entries if (v := _unusual(scenes, place, m)) is not None]
         if len(votes) < OTHERS or not all(votes):
             continue
+        from scipy.stats import spearmanr  # seldom reached, and it takes 0.5 s to import
+
         psnr, ssim, lpips = ([e[f].value for e in entries.values()] for f in ("psnr", "ssim", "lpips"))
         if len(set(psnr)) > 1 and spearmanr(psnr, ssim)[0] < spearmanr(psnr, lpips)[0]:
             involved = [e[f] for e in entries.values() for f in ("ssim", "lpips")]

@@ -37,7 +37,7 @@ from ambiguous_wild.simulate.cutouts import (
     read_cutouts,
     truth,
 )
-from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
+from ambiguous_wild.simulate.fixed_things import fixed_layer, laid_over
 from ambiguous_wild.simulate.placement import (
     LONGEST,
     PREVIEW_PX,
@@ -47,6 +47,7 @@ from ambiguous_wild.simulate.placement import (
     longest_side,
     natural_heights,
 )
+from ambiguous_wild.simulate.spec import FixedThing
 from ambiguous_wild.simulate.truth_records import summary
 
 _TEST_EVERY = 6  # every sixth photo is a test photo; also the smallest number of photos

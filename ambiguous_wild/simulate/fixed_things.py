@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import cv2
 import numpy as np
 
-FixedThing = Literal["bonnet", "stamp"]
+from ambiguous_wild.simulate.spec import FixedThing
+
 _BONNET = 0.22  # height of the bonnet's middle, over the photo's
 _BULGE = 0.06  # by which its corners are lower, over the photo's height
 _PAINT = ((0.10, 0.10, 0.11), (0.30, 0.31, 0.33))  # linear light at the upper edge and at the bottom

@@ -21,11 +21,11 @@ from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.srgb import linear_to_srgb
 from ambiguous_wild.simulate import image_effects as fx
 from ambiguous_wild.simulate.distractors import DistractorPose, movers
-from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
+from ambiguous_wild.simulate.fixed_things import fixed_layer, laid_over
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
 from ambiguous_wild.simulate.shapes import Shape, shape_table
-from ambiguous_wild.simulate.spec import CaptureSpec, Effects
+from ambiguous_wild.simulate.spec import CaptureSpec, Effects, FixedThing
 from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, build_atlas, trace
 from ambiguous_wild.simulate.truth_records import DrawnEffects
 from ambiguous_wild.simulate.world import World

@@ -22,7 +22,7 @@ from ambiguous_wild.simulate.cutouts import (
     layer,
     project,
 )
-from ambiguous_wild.simulate.fixed_things import FixedThing
+from ambiguous_wild.simulate.spec import FixedThing
 
 _DRAWS = 24  # positions drawn for a cut-out, of which the best is taken
 _NEARER = (0.90, 0.98)  # depth of the cut-out relative to that of the point behind it

@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ambiguous_wild.simulate.fixed_things import FixedThing
-
 Kind = Literal[
     "visitor",
     "twin",
@@ -28,10 +26,18 @@ Kind = Literal[
 ]
 ThingKind = Literal["box", "ball", "column", "board", "figure", "bust", "knot", "hound", "spire", "car"]
 Place = Literal["courtyard", "room", "yard"]
+FixedThing = Literal["bonnet", "stamp"]  # a car's bonnet, a burnt-in time stamp
 Ambiguity = Literal["colour", "semantic", "none"]
 Colour = tuple[float, float, float]  # linear light
 FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 x 24 mm, what `focal_35mm` is an equivalent on
 STATUES = ("bust", "knot", "hound", "spire")  # signed-distance shapes, in the world and as distractors
+POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
+# Textures of objects and distractors; `brick` and `gravel` also cover the courtyard's walls and ground,
+# `plaster` the room's walls, `asphalt` the yard's ground. Each is drawn by the function of its name.
+TEXTURES = (
+    "stone", "foliage", "timber", "clay", "skin", "brick", "gravel", "vivid", "cloth", "plaster", "asphalt",
+    "enamel",
+)  # fmt: skip
 SURFACE_NAMES = ("ground", "wall_back", "wall_left", "wall_right", "wall_front")
 
 

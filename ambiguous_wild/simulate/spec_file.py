@@ -19,6 +19,8 @@ from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
     PLANS,
+    POSTERS,
+    TEXTURES,
     CaptureSpec,
     Distractor,
     Effects,
@@ -26,7 +28,6 @@ from ambiguous_wild.simulate.spec import (
     LensDistortion,
     Thing,
 )
-from ambiguous_wild.simulate.world import POSTERS, SHEETS
 
 PICTURES = tuple(f"poster_{name}" for name in POSTERS)
 MAX_DISTRACTORS = 255  # the ray caster stores a pixel's distractor in a byte
@@ -199,7 +200,7 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
         if not spec.effects.specular.textures:
             raise AwError("effects.specular.textures: name at least one, or leave the effect out")
         for name in spec.effects.specular.textures:
-            _texture("effects.specular.textures", name, (*SHEETS, *plan.surfaces))
+            _texture("effects.specular.textures", name, (*TEXTURES, *plan.surfaces))
     if spec.effects.lens_distortion is not None:
         _lens(spec, spec.effects.lens_distortion)
     return spec
@@ -219,12 +220,12 @@ def _lens(spec: CaptureSpec, lens: LensDistortion) -> None:
 
 
 def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
-    known = (*SHEETS, *PICTURES, *plan.surfaces) if d.kind == "placard" else SHEETS
+    known = (*TEXTURES, *PICTURES, *plan.surfaces) if d.kind == "placard" else TEXTURES
     _texture(f"{where}texture", d.texture, known)
     if d.head:
         if d.kind != "visitor":
             raise AwError(f"{where}head: only a visitor has one, not a {d.kind}")
-        _texture(f"{where}head", d.head, SHEETS)
+        _texture(f"{where}head", d.head, TEXTURES)
     _within(where, d, _DISTRACTOR)
     if d.path == "walk" and len(d.waypoints) < 2:
         raise AwError(f"{where}waypoints: a walk needs two corners or more, [[x, y], [x, y]] in metres")
@@ -238,7 +239,7 @@ def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
 
 
 def _thing(where: str, thing: Thing, plan: GroundPlan) -> None:
-    known = (*SHEETS, *PICTURES, *plan.surfaces) if thing.kind == "board" else SHEETS
+    known = (*TEXTURES, *PICTURES, *plan.surfaces) if thing.kind == "board" else TEXTURES
     _texture(f"{where}texture", thing.texture, known)
     _within(where, thing, _THING)
     for axis, value, limits in zip("xyz", thing.at_m, (plan.x_m, plan.y_m, (0.0, 4.0))):

@@ -17,7 +17,8 @@ from torch import Tensor
 from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.splat.gaussians import Gaussians, rotation_matrices
 from ambiguous_wild.splat.rendered import Gradients
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData
+from ambiguous_wild.splat.step import Step, TrainData
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 from ambiguous_wild.splat.training_records import DensityLog
 
 if TYPE_CHECKING:

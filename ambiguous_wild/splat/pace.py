@@ -10,14 +10,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ambiguous_wild.core import AwError
-from ambiguous_wild.splat.method_hooks import Schedule
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, TrainData
-from ambiguous_wild.splat.watchdog import OnNonFinite
+from ambiguous_wild.splat.train_config import TrainConfig
+
+if TYPE_CHECKING:
+    from ambiguous_wild.splat.method_hooks import Schedule
+    from ambiguous_wild.splat.step import TrainData
 
 # share of the run at which full resolution is reached at the latest; measured on simulated captures, see
 # docs/training.md
@@ -90,32 +91,6 @@ def _spectrum_share(photo: np.ndarray, factor: int) -> float:
     height, width = spectrum.shape
     h, w = max(height // (2 * factor), 1), max(width // (2 * factor), 1)
     return float(spectrum[height // 2 - h : height // 2 + h, width // 2 - w : width // 2 + w].sum())
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Length, resolution and checkpointing of a run; the method (`MethodHooks`) sets the rest."""
-
-    iterations: int = NOMINAL_ITERATIONS
-    budget_s: float | None = None  # seconds of training instead of a number of iterations
-    seed: int = 0
-    resolution: Literal["auto", "full", "coarse-to-fine"] = "auto"  # auto: coarse-to-fine under a budget
-    max_gaussians: int | None = None  # None: the limit of the method
-    torch_threads: int = 1  # fixed for all machines: how a sum is split decides its last bits
-    checkpoint_every_s: float = 60.0
-    probes: int = 8  # how often the test PSNR is measured, with the clock stopped
-    # stop, or go back to the last checkpoint and leave the photo out, see watchdog.py
-    on_nonfinite: OnNonFinite = "stop"
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.iterations <= 100_000_000:  # months on a GPU
-            raise AwError(f"--iterations {self.iterations} is not from 1 to 100 000 000")
-
-    def share_done(self, iteration: int, elapsed_s: float) -> float:
-        """Return the share of the run done after these steps and seconds of training, in [0, 1]."""
-        if self.budget_s is not None:
-            return min(elapsed_s / self.budget_s, 1.0)
-        return min(iteration / self.iterations, 1.0)
 
 
 def cap(

@@ -16,8 +16,7 @@ from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.splat.backend import Backend, backend_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import Rendered
-
-NOMINAL_ITERATIONS = 30_000  # schedules are written for this length and scale with that of the run
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 
 
 @dataclass(frozen=True)

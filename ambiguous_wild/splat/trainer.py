@@ -27,7 +27,7 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.method_hooks import MethodHooks, check_cotangents, check_keep
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.pace import Pace, TrainConfig
+from ambiguous_wild.splat.pace import Pace
 from ambiguous_wild.splat.rendered import (
     Cotangents,
     Gradients,
@@ -36,7 +36,8 @@ from ambiguous_wild.splat.rendered import (
     check_needs,
     with_visible,
 )
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS, TrainConfig
 from ambiguous_wild.splat.training_records import Clock, RunObserver, Timeline, clock_for
 from ambiguous_wild.splat.watchdog import DeviceFiniteCheck, Watchdog
 

@@ -35,8 +35,8 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss
 from ambiguous_wild.splat.rendered import Cotangents, Gradients
 from ambiguous_wild.splat.step import Step
+from ambiguous_wild.splat.train_config import OnNonFinite
 
-OnNonFinite = Literal["stop", "rollback"]
 Kind = Literal["loss", "gradient", "parameter"]
 FOLDER = "nonfinite"
 REPORT, GOOD, STEP = "report.json", "good.safetensors", "step.safetensors"

@@ -23,8 +23,8 @@ from ambiguous_wild.methods.entry import MethodEntry
 from ambiguous_wild.methods.references import error_location
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.splat import checkpoint
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import TrainData
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.stress.case import Case, CaseResult
 

@@ -10,9 +10,6 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial import QhullError
 
 from ambiguous_wild.core import Camera
 
@@ -36,6 +33,9 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
 
     The map covers the camera's frame with at most about 20 000 pixels. None if the frame has too few points.
     """
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import QhullError
+
     h, w = map_size(camera)
     xyz = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     x, y = in_map(camera, xyz, (h, w))
@@ -73,6 +73,8 @@ def seldom_seen(
     Returns:
         bool maps of about 1000 pixels, spread evenly over each frame; None where a surface is None.
     """
+    from scipy.ndimage import distance_transform_edt
+
     least = min(least, len(cameras) - 1)
     centres = np.stack([c.center for c in cameras])
     maps: list[np.ndarray | None] = []

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from ambiguous_wild.harness.grid import cell_folder, grouped, plan_cells
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.command_line import aw
 from tests.report.fake_cost import cost_run
 from tests.tiny_scene import write_tiny_scene

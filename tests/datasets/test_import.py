@@ -20,7 +20,7 @@ from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.command_line import aw
 from tests.datasets import layouts
 

@@ -9,7 +9,7 @@ import pytest
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.harness.ablation_study import plan_study, read_outcomes
+from ambiguous_wild.harness.ablation_study import plan_study, read_outcomes, report
 from ambiguous_wild.harness.cell import reproduce
 from ambiguous_wild.harness.grid import cell_folder, run_cells
 from ambiguous_wild.harness.result_file import write_result
@@ -17,10 +17,10 @@ from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.methods import MethodEntry, get_method, register, registry
 from ambiguous_wild.methods.ablation_groups import Group, Variant, check_groups, choose_groups
 from ambiguous_wild.report import ablation_report
-from ambiguous_wild.report.ablation_report import markdown_of, report, write_report
+from ambiguous_wild.report.ablation_report import markdown_of, write_report
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.command_line import aw
 from tests.harness.fake_runs import fake_result
 

@@ -31,7 +31,7 @@ from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.io.model_maker import write_scene
 from tests.tiny_scene import write_tiny_scene
 

@@ -22,7 +22,7 @@ from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.io.mask_reasons import read_reasons
 from ambiguous_wild.io.ply import splat_count
 from ambiguous_wild.report.board_verify import verify
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH
 
 LEFT, RIGHT = slice(0, WIDTH // 2 - 4), slice(WIDTH // 2 + 4, WIDTH)

@@ -20,7 +20,7 @@ from ambiguous_wild.harness.ray_cluster import receive, run_sent, send_scene
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.harness.session import run_in_processes
 from ambiguous_wild.methods import registry
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=40)

@@ -24,7 +24,7 @@ from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.external_process import end_left_over
 from ambiguous_wild.metrics.image import psnr
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 PROGRAM = Path(__file__).parents[1] / "methods" / "external_program.py"

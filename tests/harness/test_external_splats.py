@@ -16,7 +16,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.external import PACKAGED, load_description
 from ambiguous_wild.methods.external_process import stage
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.methods.baselines import parts_of, trained
 from tests.tiny_scene import TEST, TRAIN
 

@@ -9,7 +9,7 @@ from ambiguous_wild.harness.cell import RunOptions
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.harness.run_cost import is_out_of_gpu_memory, out_of_gpu_memory
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from tests.tiny_scene import write_tiny_scene
 

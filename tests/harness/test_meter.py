@@ -20,7 +20,7 @@ from ambiguous_wild.splat.calibration import KERNELS, Calibration, Reading, Size
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 

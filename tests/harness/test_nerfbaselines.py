@@ -15,7 +15,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods import nerfbaselines_methods, registry
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 SHORT = TrainConfig(iterations=5)

@@ -26,7 +26,7 @@ from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.viewing.video import labelled

@@ -28,7 +28,7 @@ from ambiguous_wild.harness.mask_plan import Occlusion, residual_mask, summarise
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 VIEWS, POINTS, WIDTH, HEIGHT, FOCAL = 12, 150, 160, 90, 200.0

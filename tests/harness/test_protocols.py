@@ -11,7 +11,7 @@ from ambiguous_wild.harness.ablation_study import plan_study
 from ambiguous_wild.harness.store import Runs, read_runs
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.report.notes import _fitted
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 
 SMALL = ("gs-w.side=16", "gs-w.width=2", "wildgaussians.width=8")
 

@@ -22,7 +22,7 @@ from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.metrics.image import flip, psnr, psnr_affine
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.command_line import aw
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 

@@ -97,7 +97,7 @@ def test_it_goes_on_in_either_pass_with_the_same_bits(scene, whole, tmp_path, mo
 def test_half_of_a_budget_is_each_passes(scene, tmp_path):
     from types import SimpleNamespace
 
-    from ambiguous_wild.splat.pace import TrainConfig
+    from ambiguous_wild.splat.train_config import TrainConfig
 
     cell = SimpleNamespace(method=get_method("dronesplat+2passes"), train=TrainConfig(budget_s=30.0))
     assert passes.config_of_one_pass(cell).budget_s == 15.0

@@ -23,7 +23,7 @@ from ambiguous_wild.metrics.image import psnr
 from ambiguous_wild.report.notes import unequal
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import START_SHARE, MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.viewing.model import Renderer, RenderSettings
 from tests.io.test_scene_transform import UTM, moved
 from tests.viewing.wall_runs import wall_model

@@ -23,7 +23,7 @@ from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.colour import AffineExposure
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.methods.baselines import bits, parts_of, trained
 
 TRUE_3DGS = "3dgs@mask=truth"

@@ -17,8 +17,8 @@ from ambiguous_wild.methods.wildgaussians import (
 )
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects.autograd_effect import Visible
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.step import ViewContext
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 from tests.methods.baselines import masked_more_inside, parts_of, trainer_of

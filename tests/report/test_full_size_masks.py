@@ -18,7 +18,7 @@ from ambiguous_wild.io.original_photos import OriginalPhoto
 from ambiguous_wild.report import full_size_masks, inpainting
 from ambiguous_wild.report.full_size_masks import full_size, masks_of_run, write_full_size_masks
 from ambiguous_wild.report.inpainting import Inpainting
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.builder.capture_maker import HEIGHT, WIDTH, render
 from tests.command_line import aw
 from tests.faults.compare import state

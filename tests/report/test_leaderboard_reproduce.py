@@ -23,7 +23,7 @@ from ambiguous_wild.report.board import read_board
 from ambiguous_wild.report.board_reproduce import command, preparation
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec_file import parse_spec, plain_spec
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 SETTINGS = {"factor": 2, "camera": "auto", "matcher": "auto", "seed": 0, "strict": False, "sfm": "auto"}

@@ -7,15 +7,15 @@ from typing import Any
 
 import yaml
 
-from ambiguous_wild.harness.ablation_study import plan_study
+from ambiguous_wild.harness.ablation_study import plan_study, report
 from ambiguous_wild.harness.store import read_runs
 from ambiguous_wild.methods import MethodEntry, register, registry
 from ambiguous_wild.report import papers
-from ambiguous_wild.report.ablation_report import markdown_of, report
+from ambiguous_wild.report.ablation_report import markdown_of
 from ambiguous_wild.report.comparison import comparison
 from ambiguous_wild.report.plain_formats import fitted, to_long_csv, to_wide_csv
 from ambiguous_wild.report.typeset import to_html as html_of
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.harness.fake_runs import fake_result, save
 from tests.report.test_tables import RENDERERS, cell, keys, table_of, to_latex
 from tests.tiny_scene import write_tiny_scene

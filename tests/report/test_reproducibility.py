@@ -12,7 +12,7 @@ import yaml
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.result_file import config_identity, write_result
 from ambiguous_wild.report.reproducibility import statement, to_latex, to_markdown, to_text
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.command_line import aw
 from tests.harness.fake_runs import fake_result
 

@@ -15,9 +15,10 @@ from ambiguous_wild.io.photos import Exif
 from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.composite_photos import _write_jpeg, composite_photos
 from ambiguous_wild.simulate.composite_scene import composite
-from ambiguous_wild.simulate.fixed_things import FixedThing, fixed_layer, laid_over
+from ambiguous_wild.simulate.fixed_things import fixed_layer, laid_over
 from ambiguous_wild.simulate.placement import CompositeConfig
 from ambiguous_wild.simulate.presets import PRESETS, resized
+from ambiguous_wild.simulate.spec import FixedThing
 
 HEIGHT, WIDTH = 90, 120
 

@@ -8,8 +8,8 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 

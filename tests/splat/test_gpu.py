@@ -12,8 +12,8 @@ from ambiguous_wild.splat import gsplat_seam
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.losses import photometric
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.render import render
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 

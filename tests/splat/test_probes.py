@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from ambiguous_wild.splat.method_hooks import Schedule
-from ambiguous_wild.splat.pace import Pace, TrainConfig
+from ambiguous_wild.splat.pace import Pace
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import advance, train
 from ambiguous_wild.splat.training_records import ROWS, Timeline

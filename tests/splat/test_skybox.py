@@ -16,8 +16,8 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.skybox import COUNT, MIN_SPHERE_POINTS, Skybox, fibonacci_sphere, sphere_of
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
 from ambiguous_wild.splat.rendered import Gradients
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 from tests.tiny_scene import write_tiny_scene

@@ -22,8 +22,9 @@ from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.pace import Level, TrainConfig, ceiling_at, coarse_to_fine, factor_at
+from ambiguous_wild.splat.pace import Level, ceiling_at, coarse_to_fine, factor_at
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import bits, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
@@ -75,7 +76,7 @@ from pathlib import Path
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 scene, folder = load_scene(sys.argv[1]), Path(sys.argv[2])
@@ -371,7 +372,7 @@ import sys
 from pathlib import Path
 import torch
 from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.io.scene_folder import load_scene

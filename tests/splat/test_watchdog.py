@@ -10,7 +10,7 @@ import torch
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MAX_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
 from tests.splat.scenes import bits, trained, trainer_for

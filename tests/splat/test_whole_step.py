@@ -9,7 +9,8 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.pace import Level, TrainConfig
+from ambiguous_wild.splat.pace import Level
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from tests.host_reads import READ, moved, no_transfers
 from tests.tiny_scene import TRAIN, with_points

@@ -11,7 +11,7 @@ from ambiguous_wild.builder.workspace import Workspace
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.images import write_png
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from tests.faults.compare import half_written, state
 from tests.faults.small_disks import grow, small_disk
 

@@ -25,7 +25,7 @@ from ambiguous_wild.splat.calibration import warm_up
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
-from ambiguous_wild.splat.pace import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 
 WIDTH, HEIGHT, FOCAL = 48, 27, 41.0

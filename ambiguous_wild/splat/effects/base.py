@@ -28,7 +28,8 @@ from ambiguous_wild.splat.rendered import (
     ShadeVjp,
     Vjp,
 )
-from ambiguous_wild.splat.step import NOMINAL_ITERATIONS, Step, TrainData, ViewContext
+from ambiguous_wild.splat.step import Step, TrainData, ViewContext
+from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS
 
 
 class Effect:

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates, uniform_filter
 
 from ambiguous_wild.core import Scene
 
@@ -38,6 +37,8 @@ def track_colours(scene: Scene, photos: Iterable[np.ndarray]) -> TrackColours:
         scene: scene with tracks.
         photos: photos of the train views, [H, W, 3] in [0, 1], of any size.
     """
+    from scipy.ndimage import map_coordinates, uniform_filter
+
     points = scene.points
     of_point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
     train = {index: k for k, index in enumerate(i for i, v in enumerate(scene.views) if v.split == "train")}

@@ -234,18 +234,17 @@ def _opencv() -> SystemCheck:
 def _numba(probed: Probe) -> list[SystemCheck]:
     if probed.facts is None:
         return [_core("numba", False, probed.error, _install_again("numba llvmlite"))]
-    from ambiguous_wild.io.numba_cache import kernel_cache
+    from ambiguous_wild.io.numba_cache import cache_in_use, is_writable
 
-    folder = kernel_cache()
-    existing = next(p for p in (folder, *folder.parents) if p.exists())
+    folder = cache_in_use()
     compiled = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
     wait = "not compiled yet: the first run takes 1 minute longer"
     state = f"{compiled} kernels compiled" if compiled else wait
-    writable = os.access(existing, os.W_OK)
-    where = f"in {folder}" if writable else f"{folder} is not writable"
+    useful = bool(compiled) or is_writable(folder)
+    where = f"in {folder}" if useful else f"{folder} is not writable"
     return [
         _core("numba", True, f"{probed.facts['threads']} threads, threading layer {probed.facts['layer']}"),
-        _core("kernel cache", writable, f"{state}, {where}", "export NUMBA_CACHE_DIR=$HOME/.cache/numba"),
+        _core("kernel cache", useful, f"{state}, {where}", "export NUMBA_CACHE_DIR=$HOME/.cache/numba"),
     ]
 
 
@@ -358,24 +357,32 @@ def _git() -> SystemCheck:
     return _optional("git", version is not None, version or "not installed", fix)
 
 
+def _warm() -> str:
+    """Compile the kernels; return what is wrong, for after the checks, which may say why."""
+    try:
+        from ambiguous_wild.simulate.photo_render import compile_tracer
+        from ambiguous_wild.splat.calibration import warm_up
+
+        warm_up(lambda line: click.echo(line, err=True), helper=True)
+        compile_tracer()
+    except Exception as error:  # whatever a damaged installation raises
+        return f"the kernels could not be compiled: {type(error).__name__}: {error}"
+    return ""
+
+
 @click.command(name="doctor")
 @json_option
 @click.option(
     "--warm", is_flag=True,
-    help="First compile the CPU kernels, into $NUMBA_CACHE_DIR if that is set: a folder that can be copied, "
-    "also read-only, to containers and machines with such a processor.",
+    help="First compile the CPU kernels of 3dgs, refinesplat and the simulator, into $NUMBA_CACHE_DIR if that "
+    "is set: a folder that containers and machines with such a processor can use, also read-only.",
 )  # fmt: skip
 def command(as_json: bool, warm: bool) -> None:
     """Check this machine: packages, CPU, GPU, kernels, weights; with a command to install what is missing.
 
     Exit code 0 if the core works (optional parts may be missing), else 2.
     """
-    if warm:
-        from ambiguous_wild.simulate.photo_render import compile_tracer
-        from ambiguous_wild.splat.calibration import warm_up
-
-        warm_up(lambda line: click.echo(line, err=True), helper=True)
-        compile_tracer()
+    problem = _warm() if warm else ""
     checks = all_checks()
     broken = [c for c in checks if c.group == "core" and not c.ok]
     if as_json:
@@ -387,6 +394,8 @@ def command(as_json: bool, warm: bool) -> None:
     if broken:
         names = ", ".join(c.name for c in broken)
         raise AwError(f"the core does not work on this machine: {names}; first run: {broken[0].fix}")
+    if problem:
+        raise AwError(problem)
     if not as_json:
         missing = sum(c.group == "optional" and not c.ok for c in checks)
         click.echo()

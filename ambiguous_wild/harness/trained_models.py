@@ -20,6 +20,7 @@ from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.labels import shown_names
 from ambiguous_wild.harness.result_file import (
     CONFIG,
+    FAILED,
     MODEL,
     RESULT,
     STOPPED,
@@ -214,14 +215,25 @@ def open_scene(run: Path, folder: Path | None = None, *, opened: Opened | None =
     return scene
 
 
+def finished_result(run: Path) -> RunResult:
+    """Read the result of a run that ended well.
+
+    Raises:
+        AwError: it failed, or has not ended.
+    """
+    for path in (run / RESULT, run / FAILED):
+        if path.is_file():
+            result = read_result(path)
+            if result["status"] != "ok":
+                raise AwError(f"{run} failed: {result['error']}")
+            return result
+    stopped = run / STOPPED / MODEL
+    shown = f"; its model is {stopped}" if stopped.is_file() else ""
+    raise AwError(f"{run} is not finished: the command that began it continues it{shown}")
+
+
 def _read_model(run: Path) -> TrainedModel:
-    if not (run / RESULT).is_file():
-        stopped = run / STOPPED / MODEL
-        shown = f"; its model is {stopped}" if stopped.is_file() else ""
-        raise AwError(f"{run} is not finished: the command that began it continues it{shown}")
-    result = read_result(run / RESULT)
-    if result["status"] != "ok":
-        raise AwError(f"{run} failed: {result['error']}")
+    result = finished_result(run)
     ply = run / MODEL
     if not ply.is_file():
         raise AwError(f"{run} has no {MODEL}: an external program may keep its model elsewhere")

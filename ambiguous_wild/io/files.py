@@ -267,12 +267,12 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
     target = Path(os.path.realpath(place_of(path)[0]))
     refuse_file(path)
     above = [folder for folder in target.parents if not folder.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    start = target.parent / f".{target.name}."
+    start, temporary = target.parent / f".{target.name}.", None
     with _named_errors(start, target):
-        temporary = Path(tempfile.mkdtemp(prefix=f"{start.name}tmp-", dir=target.parent))
-        share(temporary)
         try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary = Path(tempfile.mkdtemp(prefix=f"{start.name}tmp-", dir=target.parent))
+            share(temporary)
             yield temporary
             if not replace:
                 try:
@@ -286,7 +286,8 @@ def atomic_dir(path: Path | str, *, replace: bool = True) -> Iterator[Path]:
             else:
                 replace_folder(temporary, target)
         except BaseException:
-            shutil.rmtree(temporary, ignore_errors=True)
+            if temporary is not None:
+                shutil.rmtree(temporary, ignore_errors=True)
             for folder in above:
                 with contextlib.suppress(OSError):  # another command has written into it
                     folder.rmdir()

@@ -2,8 +2,8 @@
 
 Numba's own cache depends on the path of the source, and compares only a kernel's own file, so that a change
 in another file that the kernel uses would go unnoticed. Here all kernels lie in one folder, whose name is a
-hash over the source of all of them: a copy of the package elsewhere, or another machine with the same kind of
-processor, can use it.
+hash over the source of all of them, the compiler and the processor: copies of the package and machines with
+such a processor share it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,18 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import llvmlite
+import llvmlite.binding
 import numba
+from filelock import FileLock, Timeout
 
 _PACKAGE = Path(__file__).parent.parent
 _KERNEL = re.compile(rb"^@(\w*kernel|intrinsic)\b", re.MULTILINE)
 _FOLDERS = ("splat/cpu", "simulate")  # kernels use those of other files in them
+_OPTIONS = ("io/numba_cache.py", "splat/cpu/compile.py")  # files that say how kernels are compiled
 _TEMPORARY = "ambiguous_wild-"  # folder for kernels of a user without a writable home
-_ONCE = f"{_TEMPORARY}once-"  # where that folder belongs to somebody else, too: one for each process
+_OF_A_PROCESS = f"{_TEMPORARY}once-"  # where that folder belongs to somebody else, too: one for each process
+_PATIENCE_S = 60.0  # another process may write a kernel meanwhile
 _config: Any = numba.config
 
 
@@ -37,8 +42,8 @@ def kernel_files() -> list[Path]:
 
 def kernel_cache() -> Path:
     """Return the folder of compiled kernels: in NUMBA_CACHE_DIR, else in the home cache, else temporary."""
-    digest = hashlib.sha256()
-    for path in kernel_files():
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {_processor()}".encode())
+    for path in [*kernel_files(), *(_PACKAGE / name for name in _OPTIONS)]:
         digest.update(path.read_bytes())
     name = f"kernels-{digest.hexdigest()[:12]}"
     if explicit := os.environ.get("NUMBA_CACHE_DIR"):
@@ -59,13 +64,28 @@ def cache_in_use() -> Path:
     return kernel_cache()
 
 
-def how_often(folder: Path) -> str:
-    """Return how often kernels are compiled that are kept in a folder, for the line that announces it."""
-    if not folder.parent.name.startswith(_TEMPORARY):
-        return "once per machine"
+def is_writable(folder: Path) -> bool:
+    """Whether kernels can be written into a folder, which need not exist yet."""
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    return os.access(existing, os.W_OK)
+
+
+def lifetime(folder: Path) -> str:
+    """Return how often kernels of a folder are compiled, for the line that announces it."""
     place = folder.parent
-    when = "at every command" if place.name.startswith(_ONCE) else f"again when {place} is emptied"
-    return f"{when}, as no cache in the home folder can be written: set NUMBA_CACHE_DIR to a folder that can"
+    if not is_writable(folder):
+        when = f"at every command, as {place} cannot be written"
+    elif "NUMBA_CACHE_DIR" in os.environ or not place.name.startswith(_TEMPORARY):
+        return "once per machine"
+    else:
+        own = place.name.startswith(_OF_A_PROCESS)
+        when = "at every command" if own else f"again when {place} is emptied"
+        when += ", as no cache in the home folder can be written"
+    return f"{when}: set NUMBA_CACHE_DIR to a folder that can"
+
+
+def _processor() -> str:
+    return f"{llvmlite.binding.get_host_cpu_name()} {llvmlite.binding.get_host_cpu_features().flatten()}"
 
 
 def _private_temporary() -> Path:
@@ -76,10 +96,10 @@ def _private_temporary() -> Path:
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
     except OSError:
-        return Path(tempfile.mkdtemp(prefix=_ONCE))
+        return Path(tempfile.mkdtemp(prefix=_OF_A_PROCESS))
     mine = user is None or (status.st_uid == user and not status.st_mode & 0o022)
     mine = mine and stat.S_ISDIR(status.st_mode)
-    return folder if mine else Path(tempfile.mkdtemp(prefix=_ONCE))
+    return folder if mine else Path(tempfile.mkdtemp(prefix=_OF_A_PROCESS))
 
 
 class KernelLocator:
@@ -88,6 +108,7 @@ class KernelLocator:
     def __init__(self, function: Any, file: str) -> None:
         self._py_file = file
         self._line = function.__code__.co_firstlineno
+        self._stamp = hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> KernelLocator:
@@ -95,8 +116,7 @@ class KernelLocator:
         return cls(function, file)
 
     def ensure_cache_path(self) -> None:
-        """Make the folder, before a kernel is written."""
-        cache_in_use().mkdir(parents=True, exist_ok=True)
+        """Do nothing: the folder is made before a kernel is written."""
 
     def get_cache_path(self) -> str:
         """Return the folder."""
@@ -104,23 +124,26 @@ class KernelLocator:
 
     def get_source_stamp(self) -> str:
         """Return the hash of the kernel's own file, which need not be one of `kernel_files`."""
-        return hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
+        return self._stamp
 
     def get_disambiguator(self) -> str:
-        """Return what tells kernels of one name in one file apart."""
-        return str(self._line)
+        """Return what tells kernels of one name apart: a plug-in's file may be called like another's."""
+        return f"{self._line}-{self._stamp[:8]}"
 
 
-def kept_on_disk(function: Callable[..., Any], **options: Any) -> Any:
+def cached_njit(function: Callable[..., Any], **options: Any) -> Any:
     """Compile with these options of `numba.njit`, and keep the result in the folder of kernels.
 
     A damaged file, as a full disk or a power failure leaves it, is compiled again; Numba would fail on it
-    every time. What cannot be written is compiled in every process.
+    every time. What cannot be written is compiled in every process, and so is a kernel in a notebook.
     """
-    before = getattr(_config, "CACHE_LOCATOR_CLASSES", "")
+    options = {"error_model": "numpy", **options}
+    if not Path(function.__code__.co_filename).is_file():
+        return numba.njit(**options)(function)
+    before = _config.CACHE_LOCATOR_CLASSES
     _config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"
     try:
-        dispatcher: Any = numba.njit(cache=True, error_model="numpy", **options)(function)
+        dispatcher: Any = numba.njit(cache=True, **options)(function)
     finally:
         _config.CACHE_LOCATOR_CLASSES = before
     cache: Any = getattr(dispatcher, "_cache", None)
@@ -137,8 +160,11 @@ def kept_on_disk(function: Callable[..., Any], **options: Any) -> Any:
             return None
 
     def save_overload(*args: Any) -> None:
-        with contextlib.suppress(OSError):
-            save(*args)
+        # One process at a time: Numba writes the index before the code that it names.
+        with contextlib.suppress(OSError, Timeout):
+            cache_in_use().mkdir(parents=True, exist_ok=True)
+            with FileLock(cache_in_use() / ".lock", timeout=_PATIENCE_S):
+                save(*args)
 
     cache.load_overload, cache.save_overload = load_overload, save_overload
     return dispatcher

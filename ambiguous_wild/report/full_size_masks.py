@@ -23,9 +23,8 @@ from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.core.machine import photo_threads
 from ambiguous_wild.core.names import spelling_key
-from ambiguous_wild.harness.result_file import RESULT, read_result
 from ambiguous_wild.harness.store import run_folders
-from ambiguous_wild.harness.trained_models import MASKS, open_scene
+from ambiguous_wild.harness.trained_models import MASKS, finished_result, open_scene
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.files import atomic_dir, check_output, sha256_file
 from ambiguous_wild.io.images import (
@@ -318,9 +317,7 @@ def _finished_run(folder: Path) -> tuple[Path, str]:
         several = f"{len(runs)} runs, give one of them: {shortlist(map(str, runs), 3)}"
         raise AwError(f"{folder} holds {several if runs else 'no run'}")
     run = runs[0]
-    if not (run / RESULT).is_file():
-        raise AwError(f"{run} is not finished: the command that began it continues it")
-    return run, read_result(run / RESULT)["method"]
+    return run, finished_result(run)["method"]
 
 
 def _check_size(path: Path, view: View) -> None:

@@ -112,19 +112,18 @@ def _grid(runs: Sequence[_Run]) -> list[str]:
     seeds = _differing(runs, lambda run: run.result["method"], lambda of: _listed(_seeds(of), "seed"))
     lengths = _said(runs, _length, "they trained for {}", "they trained for different lengths: {}")
     sentences = [f"The results are those of {of}, with {seeds}; {lengths}."]
-    files, masks = {}, {}
+    files: dict[str, None] = {}  # an ordered set: one name can have several hashes
+    masks: dict[str, None] = {}
     for run in runs:
         if run.config and (source := str(run.config.get("source") or "")[:HASH]):
             if "--mask" in run.words:
-                masks[run.words[run.words.index("--mask") + 1]] = source
+                masks[f"{run.words[run.words.index('--mask') + 1]} {source}"] = None
             else:
-                files[run.result["method"]] = source
+                files[f"{run.result['method']} {source}"] = None
     if files:
-        named = _listed(map(" ".join, files.items()))
-        sentences.append(f"Methods in files of their own, with the SHA-256 of the file: {named}.")
+        sentences.append(f"Methods in files of their own, with the SHA-256 of the file: {_listed(files)}.")
     if masks:
-        named = _listed(map(" ".join, masks.items()))
-        sentences.append(f"Masks given as files, with the SHA-256 of all in a folder: {named}.")
+        sentences.append(f"Masks given as files, with the SHA-256 of all in a folder: {_listed(masks)}.")
     if corrected := [run for run in runs if run.config and run.config.get("corrections")]:
         sentences.append(f"Masks of {_which(corrected, runs)} were corrected by hand.")
     effects = _said(
@@ -196,20 +195,26 @@ def _data(runs: Sequence[_Run]) -> list[str]:
 
 
 def _repeats(runs: Sequence[_Run]) -> str:
-    def repeats(run: _Run) -> bool:
-        train = section(dict(run.config), "train") if run.config else {}
-        cpu = str(run.result["cost"].get("device", "")).startswith("cpu")
-        continued = run.config is not None and run.config.get("continued")
-        return cpu and bool(train) and train.get("budget_s") is None and not continued
-
-    exact = [run for run in runs if repeats(run)]
+    exact = [run for run in runs if not _why_not(run)]
     if len(exact) == len(runs):
         return "The commands repeat bit for bit on a processor of this kind, for any number of threads."
-    others = "end by the clock, went on from shorter ones, or are of a GPU or another program"
+    rest = [run for run in runs if _why_not(run)]
+    because = " or ".join(dict.fromkeys(map(_why_not, rest)))
     if not exact:
-        return f"The runs {others}, and do not repeat bit for bit."
-    rest = [run for run in runs if not repeats(run)]
-    return f"{_which(exact, runs)} repeat bit for bit; {_which(rest, runs)} {others}, and do not."
+        return f"The runs do not repeat bit for bit, as they {because}."
+    return f"{_which(exact, runs)} repeat bit for bit; {_which(rest, runs)} do not, as they {because}."
+
+
+def _why_not(run: _Run) -> str:
+    """Return why a run does not repeat bit for bit, of "they ..."; empty if it does."""
+    train = section(dict(run.config), "train") if run.config else {}
+    if not train:
+        return "are of another program"
+    if not str(run.result["cost"].get("device", "")).startswith("cpu"):
+        return "were trained on a GPU"
+    if train.get("budget_s") is not None:
+        return "end by the clock"
+    return "went on from shorter ones" if run.config and run.config.get("continued") else ""
 
 
 def _later(runs: Sequence[_Run]) -> list[str]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from ambiguous_wild.io.numba_cache import kept_on_disk
+from ambiguous_wild.io.numba_cache import cached_njit
 
 QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER, VOLUME = range(6)
 PLANAR, BY_FACE, DOME = range(3)  # texture mapping
@@ -21,7 +21,7 @@ _NEAR_M = 4e-4  # distance at which a ray has reached the surface
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles with these options of Numba."""
-    return lambda function: kept_on_disk(function, **options)
+    return lambda function: cached_njit(function, **options)
 
 
 @kernel(inline="never")

@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from functools import lru_cache
 
 import cv2
 import numba
@@ -22,6 +21,7 @@ from ambiguous_wild.simulate.kernels import FAR, kernel, nearest, shade
 
 _TILE = 16
 _MAX_LEVELS = 12
+_FEW_RAYS = 20_000  # of which one thread is as fast
 
 
 @dataclass(frozen=True)
@@ -145,14 +145,15 @@ def trace(
         (light.sun, light.sun_colour, light.sky_colour, light.ground_colour),
         (clean, distracted, owner, depth, darkened),
     )
-    # Threads of Python, as a kernel with threads of its own takes twice as long to compile.
-    list(_pool(numba.get_num_threads()).map(lambda top: _tiles(top, *world), range(0, camera.height, _TILE)))
+    tops = range(0, camera.height, _TILE)
+    if camera.height * camera.width * len(light.sun) < _FEW_RAYS:
+        for top in tops:
+            _tiles(top, *world)
+    else:
+        # Threads of Python, as a kernel with threads of its own takes twice as long to compile.
+        with ThreadPoolExecutor(numba.get_num_threads()) as threads:
+            list(threads.map(lambda top: _tiles(top, *world), tops))
     return TracedPhoto(clean, distracted, None if shadow_casters is None else darkened, owner, depth)
-
-
-@lru_cache(maxsize=1)
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads)
 
 
 @kernel(inline="never")

@@ -29,11 +29,15 @@ from ambiguous_wild.simulate.kernels import (
     VOLUME,
 )
 from ambiguous_wild.simulate.shapes import SHEET_M, Axes, Shape, between, figure, placed, shape_table, vector
-from ambiguous_wild.simulate.spec import POSTERS, STATUES, TEXTURES, GroundPlan, Thing, WorldSpec
+from ambiguous_wild.simulate.spec import POSTERS, STATUES, GroundPlan, Thing, WorldSpec
 from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable, build_atlas
 
 OVERHEAD_M = 2.0  # foot of a thing that hangs above the distractors
-SHEETS = {name: getattr(tx if hasattr(tx, name) else built, name) for name in TEXTURES}
+SHEETS = {
+    "stone": tx.stone, "foliage": tx.foliage, "timber": tx.timber, "clay": tx.clay, "skin": tx.skin,
+    "brick": tx.brick, "gravel": tx.gravel, "vivid": tx.vivid, "cloth": tx.cloth, "plaster": built.plaster,
+    "asphalt": built.asphalt, "enamel": built.enamel,
+}  # fmt: skip
 # These have random streams of their own, so that adding a sheet changes no bit of other captures.
 _LATER_SHEETS = ("cloth", "plaster", "asphalt", "enamel")
 # Local axes of the walls: along the wall, up, inwards.

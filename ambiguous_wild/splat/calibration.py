@@ -19,7 +19,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.processes import python_meanwhile
-from ambiguous_wild.io.numba_cache import cache_in_use, how_often
+from ambiguous_wild.io.numba_cache import cache_in_use, lifetime
 from ambiguous_wild.io.terminal import clock
 from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.cpu.compile import one_thread
@@ -144,8 +144,11 @@ def _cached() -> bool:
     """Whether the last kernel that `warm_up` compiles is on disk for this machine and this source."""
     from ambiguous_wild.splat.cpu import adam
 
-    # The dispatcher's index file lists the signatures compiled from this very source for this machine.
-    return bool(adam.catch_up_all.compiled._cache._cache_file._load_index())
+    # The dispatcher's index file lists the signatures compiled from this very source for this processor.
+    try:
+        return bool(adam.catch_up_all.compiled._cache._cache_file._load_index())
+    except Exception:  # pickle raises any exception on a damaged file, which is written anew
+        return False
 
 
 def _compile_sample() -> float:
@@ -179,7 +182,7 @@ def warm_up(announce: Callable[[str], None] | None = None, helper: bool = False)
         if not _cached():
             if announce is not None:
                 expected_s = COLD_IN_SAMPLES * _compile_sample()
-                announce(f"compiling CPU kernels (about {expected_s:.0f} s, {how_often(cache_in_use())})...")
+                announce(f"compiling CPU kernels (about {expected_s:.0f} s, {lifetime(cache_in_use())})...")
                 stack.enter_context(clock("compiling", expected_s))
             if helper:
                 code = f"from {__name__} import warm_losses; warm_losses()"

@@ -5,11 +5,10 @@ import io
 import os
 import zipfile
 
-import numba
 import numpy as np
 import pytest
 
-import ambiguous_wild.splat.cpu.compile  # noqa: F401  sets where kernels are kept, once
+from ambiguous_wild.io import numba_cache
 from ambiguous_wild.vision.precompute import cached
 
 
@@ -53,7 +52,7 @@ def test_features_and_instance_masks_are_computed_anew(tmp_path, how):
 @pytest.mark.parametrize("how", ["empty", "cut", "garbage"])
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 def test_compiled_kernels_are_compiled_anew(tmp_path, monkeypatch, how, suffix):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kernels"))
+    monkeypatch.setattr(numba_cache, "cache_in_use", lambda: tmp_path / "kernels")
     source = tmp_path / "doubling.py"
     source.write_text(
         "from ambiguous_wild.splat.cpu.compile import kernel\n@kernel\ndef double(x):\n    return 2 * x\n"
@@ -72,3 +71,13 @@ def test_compiled_kernels_are_compiled_anew(tmp_path, monkeypatch, how, suffix):
     entry.write_bytes(DAMAGE[how](entry.read_bytes()))
     assert double() == 0
     assert double() == 1
+
+
+def test_kernels_run_where_nothing_can_be_kept(tmp_path, monkeypatch):
+    (tmp_path / "kernels").write_text("a file where the folder should be")
+    monkeypatch.setattr(numba_cache, "cache_in_use", lambda: tmp_path / "kernels")
+    assert numba_cache.cached_njit(_triple)(2) == 6
+
+
+def _triple(x):
+    return 3 * x

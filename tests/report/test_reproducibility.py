@@ -98,7 +98,7 @@ def test_where_runs_differ_it_says_which_have_what(runs) -> None:
     )
     assert f"commit {'cd' * 20}" in text and "The code differs between runs" in text
     assert "70 iterations for 3dgs and absgs; 60 s for gs-w" in text
-    assert "3dgs and absgs repeat bit for bit; gs-w end by the clock" in text
+    assert "3dgs and absgs repeat bit for bit; gs-w do not, as they end by the clock" in text
     assert len(said.commands) == 2 and "--budget 60s" in said.commands[1]
 
 
@@ -114,7 +114,7 @@ def test_runs_that_went_on_with_corrections_do_not_repeat(runs) -> None:
     said = statement([folder])
     text = " ".join(said.sentences)
     assert "Masks of 3dgs were corrected by hand." in text
-    assert "absgs repeat bit for bit; 3dgs end by the clock, went on from shorter ones" in text
+    assert "absgs repeat bit for bit; 3dgs do not, as they went on from shorter ones" in text
     assert ["--corrections CORRECTIONS.json" in line for line in said.commands] == [True, False]
 
 

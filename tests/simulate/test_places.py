@@ -13,10 +13,10 @@ from ambiguous_wild.simulate import capture_writer
 from ambiguous_wild.simulate.capture_writer import look_at
 from ambiguous_wild.simulate.distractors import movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
-from ambiguous_wild.simulate.spec import PLANS, CaptureSpec
+from ambiguous_wild.simulate.spec import PLANS, TEXTURES, CaptureSpec
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec
 from ambiguous_wild.simulate.tracer import trace
-from ambiguous_wild.simulate.world import WALL_AXES, on_wall, wall
+from ambiguous_wild.simulate.world import SHEETS, WALL_AXES, on_wall, wall
 
 PLACES = [name for name in PRESETS if name.startswith(("room", "yard"))]
 
@@ -104,3 +104,7 @@ def test_a_place_is_named_in_the_file_and_has_limits_of_its_own():
         parse_spec("world: {place: beach}")
     with pytest.raises(AwError, match="into a wall of the room"):
         capture_writer.plan(parse_spec("world: {place: room}\ndetail_px_per_m: 5"), 0)
+
+
+def test_every_texture_that_a_spec_may_name_is_painted():
+    assert tuple(SHEETS) == TEXTURES

@@ -9,8 +9,12 @@ import pytest
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.srgb import linear_to_srgb, srgb_to_linear
-from ambiguous_wild.simulate.capture_writer import look_at
+from ambiguous_wild.simulate import tracer
+from ambiguous_wild.simulate.capture_writer import look_at, plan
+from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import BOX, CAPSULE, CYLINDER, ELLIPSOID, FAR, PLANAR, QUAD, _intersect
+from ambiguous_wild.simulate.photo_render import compile_tracer, prepare_photo, trace_photo
+from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, between, bounding_radius, placed, shape_table
 from ambiguous_wild.simulate.tracer import Light, build_atlas, trace
 
@@ -145,3 +149,12 @@ def test_placing_keeps_distances() -> None:
     for shape in moved:
         axes = np.array(shape.axes)
         np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+
+
+def test_the_kernels_that_are_compiled_ahead_are_those_of_a_capture():
+    compile_tracer()
+    spec = resized(preset("tiny"), views=3, width=64)
+    world, photos = plan(spec, 0)
+    random = PhotoRandom(0, 0, 0.0)
+    trace_photo(world, prepare_photo(spec, world, photos[0], random))
+    assert len(tracer._tiles.signatures) == 1

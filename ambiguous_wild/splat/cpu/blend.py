@@ -180,7 +180,7 @@ def forward(
             `_forward_tile`), last index drawn.
         touched: [I] uint16 out: blocks of the tile in which each entry of the lists was drawn, as bits.
     """
-    for worker in numba.prange(workers):  # unsigned; 0 + makes it signed, so that one variant is compiled
+    for worker in numba.prange(workers):
         _forward_worker(
             0 + worker, records, tile_slots, starts, tile_order, workers, width, height, background, image,
             alpha, depth, kept, touched,

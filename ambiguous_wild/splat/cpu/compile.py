@@ -17,7 +17,7 @@ from typing import Any
 import numba
 from numba.extending import intrinsic as _intrinsic
 
-from ambiguous_wild.io.numba_cache import kept_on_disk
+from ambiguous_wild.io.numba_cache import cached_njit
 
 LAYERS = ["omp", "tbb", "workqueue"]  # threading layers; the first that is installed is used
 _config: Any = numba.config
@@ -40,7 +40,7 @@ def intrinsic(function: Callable[..., Any]) -> Any:
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile for one thread. Every operation is rounded as written."""
-    return kept_on_disk(function)
+    return cached_njit(function)
 
 
 def inner_kernel(function: Callable[..., Any]) -> Any:
@@ -48,7 +48,7 @@ def inner_kernel(function: Callable[..., Any]) -> Any:
 
     References to arrays are not counted: two atomic operations for each array of a call took 40 % of Adam.
     """
-    return kept_on_disk(function, _nrt=False)
+    return cached_njit(function, _nrt=False)
 
 
 def fused_kernel(function: Callable[..., Any]) -> Any:
@@ -56,19 +56,19 @@ def fused_kernel(function: Callable[..., Any]) -> Any:
 
     NaN and infinity keep their meaning. Do not use it for values that must round alike in two kernels.
     """
-    return kept_on_disk(function, fastmath=_FUSED)
+    return cached_njit(function, fastmath=_FUSED)
 
 
 def fused_inner_kernel(function: Callable[..., Any]) -> Any:
     """Like `fused_kernel` and `inner_kernel`, and compiled into its caller."""
-    return kept_on_disk(function, fastmath=_FUSED, _nrt=False, forceinline=True)
+    return cached_njit(function, fastmath=_FUSED, _nrt=False, forceinline=True)
 
 
 class _Serialized:
     """A parallel kernel that only one thread of the process runs at a time."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self.compiled = kept_on_disk(function, parallel=True)
+        self.compiled = cached_njit(function, parallel=True)
         self.__doc__ = function.__doc__
         self.__name__ = function.__name__
 
@@ -78,7 +78,11 @@ class _Serialized:
 
 
 def parallel_kernel(function: Callable[..., Any]) -> Any:
-    """Compile with `numba.prange` over threads."""
+    """Compile with `numba.prange` over threads.
+
+    Its index is unsigned. Where an inner kernel gets it as it is, `0 + index` makes it signed, because Numba
+    would compile the inner kernel for both.
+    """
     return _Serialized(function)
 
 

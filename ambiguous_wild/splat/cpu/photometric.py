@@ -21,7 +21,7 @@ RADIUS = 5
 C1 = 0.01**2
 C2 = 0.03**2
 PAD = 16  # floats on either side of a row buffer, at least 3 * RADIUS
-_NONE = np.empty((0, 0), np.float32)  # of the type of what it stands for, as each type is compiled anew
+_NONE = np.empty((0, 0), np.float32)  # not given; None would compile another variant
 
 
 def window() -> np.ndarray:

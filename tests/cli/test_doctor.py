@@ -13,7 +13,7 @@ import pytest
 
 from ambiguous_wild.cli import doctor
 from ambiguous_wild.cli.doctor import PROBES, Probe, SystemCheck, all_checks, other_versions, probe, unmet
-from ambiguous_wild.io.numba_cache import kernel_cache
+from ambiguous_wild.io import numba_cache
 from tests.command_line import aw
 
 
@@ -157,12 +157,15 @@ def test_a_broken_torchvision_is_named_and_an_absent_one_is_fine() -> None:
 
 def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     probe_ok = Probe({"threads": 2, "layer": "omp"})
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "new" / "cache"))
+    folder = tmp_path / "new" / "cache"
+    monkeypatch.setattr(numba_cache, "cache_in_use", lambda: folder)
     fresh = doctor._numba(probe_ok)[1]
     assert fresh.ok and "not compiled yet" in fresh.detail
-    kernel_cache().mkdir(parents=True)
-    (kernel_cache() / "a.nbi").touch()
-    assert "1 kernels compiled" in doctor._numba(probe_ok)[1].detail
-    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    folder.mkdir(parents=True)
+    (folder / "a.nbi").touch()
+    monkeypatch.setattr(numba_cache.os, "access", lambda path, mode: False)
+    complete = doctor._numba(probe_ok)[1]
+    assert complete.ok and "1 kernels compiled" in complete.detail
+    (folder / "a.nbi").unlink()
     refused = doctor._numba(probe_ok)[1]
     assert not refused.ok and "NUMBA_CACHE_DIR" in refused.fix

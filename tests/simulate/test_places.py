@@ -107,4 +107,4 @@ def test_a_place_is_named_in_the_file_and_has_limits_of_its_own():
 
 
 def test_every_texture_that_a_spec_may_name_is_painted():
-    assert tuple(SHEETS) == TEXTURES
+    assert set(SHEETS) == set(TEXTURES)

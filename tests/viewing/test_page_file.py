@@ -433,5 +433,5 @@ def test_runs_with_masks_of_a_folder_are_drawn_as_their_method(tmp_path: Path) -
     look, note = read_render_settings(config)
     own, _ = read_render_settings({"method": "mip-splatting"})
     assert (look, note) == (own, "")
-    assert "unknown method" in read_render_settings({"method": "mine@mask=sam"})[1]
-    assert "unknown method" in read_render_settings({"method": "3dgs@effects=sam"})[1]
+    assert "unknown method" in read_render_settings({"method": "nobodys@mask=sam"})[1]
+    assert "unknown method" in read_render_settings({"method": "3dgs@effects=nobodys"})[1]

@@ -52,7 +52,7 @@ def _compiled() -> bool:
     """Tell whether the kernel that is compiled last is on disk for the present source."""
     from ambiguous_wild.io.numba_cache import kernel_cache
 
-    return any(kernel_cache().rglob("*catch_up_all*.nbi"))
+    return any(kernel_cache().rglob("adam.catch_up-*.nbi"))
 
 
 @click.command("build-scene", cls=SectionedCommand)

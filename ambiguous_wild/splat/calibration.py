@@ -29,9 +29,8 @@ from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Cotangents
 
-COLD_IN_SAMPLES = (
-    77  # time to compile all kernels, in those of `_compile_sample`; 31.6 s of 0.41 s, two cores
-)
+# time to compile all kernels, in those of `_compile_sample`: 19.1 s of 0.36 s on two idle cores
+COLD_IN_SAMPLES = 53
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,7 @@ def _cached() -> bool:
 
     # The dispatcher's index file lists the signatures compiled from this very source for this processor.
     try:
-        return bool(adam.catch_up_all.compiled._cache._cache_file._load_index())
+        return bool(adam.catch_up.compiled._cache._cache_file._load_index())
     except Exception:  # pickle raises any exception on a damaged file, which is written anew
         return False
 

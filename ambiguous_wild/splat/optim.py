@@ -182,12 +182,11 @@ class SplatAdam:
         from ambiguous_wild.splat.cpu.compile import threads
 
         p = self.gaussians.sh_rest
-        arrays = 3 * p.shape[1], *adam.flat(p, self._moments[_LAZY])
-        tail = self._taken, self.steps, *self._history, 8 * threads()
-        if rows is None:
-            adam.catch_up_all(*arrays, *tail)
-        else:
-            adam.catch_up(np.ascontiguousarray(rows), *arrays, *tail)
+        rows = np.arange(len(p), dtype=np.int32) if rows is None else np.ascontiguousarray(rows)
+        adam.catch_up(
+            rows, 3 * p.shape[1], *adam.flat(p, self._moments[_LAZY]), self._taken, self.steps,
+            *self._history, 8 * threads(),
+        )  # fmt: skip
 
     def flush(self) -> None:
         """Bring every row up to date."""

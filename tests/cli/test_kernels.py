@@ -32,7 +32,7 @@ def test_nothing_is_left_behind_even_after_an_error(cache):
 
 def test_what_is_compiled_already_is_left_alone(cache):
     kernel_cache().mkdir()
-    (kernel_cache() / "adam.catch_up_all-128.py311.nbi").touch()
+    (kernel_cache() / "adam.catch_up-128.py311.nbi").touch()
     with kernels.kernels_meanwhile():
         subprocess.Popen.assert_not_called()
 

@@ -134,16 +134,7 @@ def catch_up(rows, width, p, m, v, last, now, rates, roots, parts):
     n = rows.shape[0]
     for part in numba.prange(parts):
         for k in range(part * n // parts, (part + 1) * n // parts):
-            _row_catch_up(rows[k], width, p, m, v, last, now, rates, roots)
-
-
-@parallel_kernel
-def catch_up_all(width, p, m, v, last, now, rates, roots, parts):
-    """Do as `catch_up` for every row."""
-    n = last.shape[0]
-    for part in numba.prange(parts):
-        for row in range(part * n // parts, (part + 1) * n // parts):
-            _row_catch_up(row, width, p, m, v, last, now, rates, roots)
+            _row_catch_up(np.int64(rows[k]), width, p, m, v, last, now, rates, roots)
 
 
 @parallel_kernel

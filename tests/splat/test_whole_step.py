@@ -88,7 +88,7 @@ def test_nothing_is_read_and_nothing_sent(scene, tmp_path, fake, method, effects
     trainer.step()  # what is made at the first step needs numbers
     trainer.iteration -= 1
     trainer = moved(trainer)
-    steps(trainer, PHOTOS)  # what is copied once, as cameras are, is
+    steps(trainer, 2 * PHOTOS)  # what is copied once, as cameras are, is; that of a pose at its second visit
     mask, reset = trainer.hooks.mask, trainer.make_step(trainer.iteration, 0)
     with no_transfers():
         steps(trainer, PHOTOS)

@@ -190,11 +190,13 @@ def verdict(info: SceneRecord, size: tuple[int, int], scene: Path | None) -> str
         ready = (
             f"not whole: what the {out} photos left out show is missing ('aw screen' says where to take more)"
         )
-    command = "" if scene is None else f"aw bench --method refinesplat --scene {shlex.quote(str(scene))}"
+    after = ""
+    if scene is not None:
+        after = f"; next: aw bench --method refinesplat --scene {shlex.quote(str(scene))} -o runs"
     return (
         f"registered {counts['registered']} of {counts['photos']}{named}, {points} points, "
-        f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: {ready}"
-        + (f"; next: {command} -o runs" if command else "")
+        f"{info['reprojection_error_px']:.2f} px, {size[0]}x{size[1]} at factor {info['factor']}: "
+        f"{ready}{after}"
     )
 
 

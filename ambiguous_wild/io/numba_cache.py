@@ -24,6 +24,8 @@ import llvmlite.binding
 import numba
 from filelock import FileLock, Timeout
 
+from ambiguous_wild.io.files import sha256_file
+
 _PACKAGE = Path(__file__).parent.parent
 _KERNEL = re.compile(rb"^@(\w*kernel|intrinsic)\b", re.MULTILINE)
 _FOLDERS = ("splat/cpu", "simulate")  # kernels use those of other files in them
@@ -67,7 +69,7 @@ def cache_in_use() -> Path:
 def is_writable(folder: Path) -> bool:
     """Whether kernels can be written into a folder, which need not exist yet."""
     existing = next(place for place in (folder, *folder.parents) if place.exists())
-    return os.access(existing, os.W_OK)
+    return existing.is_dir() and os.access(existing, os.W_OK)
 
 
 def lifetime(folder: Path) -> str:
@@ -108,7 +110,7 @@ class KernelLocator:
     def __init__(self, function: Any, file: str) -> None:
         self._py_file = file
         self._line = function.__code__.co_firstlineno
-        self._stamp = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+        self._stamp = sha256_file(file)
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> KernelLocator:

@@ -159,6 +159,9 @@ def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch
     probe_ok = Probe({"threads": 2, "layer": "omp"})
     folder = tmp_path / "new" / "cache"
     monkeypatch.setattr(numba_cache, "cache_in_use", lambda: folder)
+    (tmp_path / "new").write_text("a file where the folder should be")
+    assert not doctor._numba(probe_ok)[1].ok
+    (tmp_path / "new").unlink()
     fresh = doctor._numba(probe_ok)[1]
     assert fresh.ok and "not compiled yet" in fresh.detail
     folder.mkdir(parents=True)

@@ -25,12 +25,8 @@ _lock = threading.RLock()
 _FUSED = {"contract", "arcp"}  # a product into a sum, a division into a product
 
 
-def _prepare() -> None:
-    if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-        _config.THREADING_LAYER_PRIORITY = LAYERS
-
-
-_prepare()
+if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
+    _config.THREADING_LAYER_PRIORITY = LAYERS
 
 
 def intrinsic(function: Callable[..., Any]) -> Any:

@@ -146,13 +146,18 @@ def trace(
         (clean, distracted, owner, depth, darkened),
     )
     tops = range(0, camera.height, _TILE)
+
+    def row(top: int) -> None:
+        near = np.empty(len(static.kind), np.int32), np.empty(len(movers.kind), np.int32)
+        _tiles(top, near, *world)
+
     if camera.height * camera.width * len(light.sun) < _FEW_RAYS:
         for top in tops:
-            _tiles(top, *world)
+            row(top)
     else:
         # Threads of Python, as a kernel with threads of its own takes twice as long to compile.
         with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-            list(threads.map(lambda top: _tiles(top, *world), tops))
+            list(threads.map(row, tops))
     return TracedPhoto(clean, distracted, None if shadow_casters is None else darkened, owner, depth)
 
 
@@ -189,16 +194,16 @@ def _ray(rotation, k, u, v):
 
 
 @kernel(nogil=True)
-def _tiles(y0, view, static, movers, shadow_casters, atlas, light, frame):
-    """Render a row of tiles."""
+def _tiles(y0, near, view, static, movers, shadow_casters, atlas, light, frame):
+    """Render a row of tiles; `near` is room for the numbers of the static and the moving shapes of a tile."""
     height, width = frame[2].shape
     for x0 in range(0, width, _TILE):
         box = (x0, y0, min(x0 + _TILE, width), min(y0 + _TILE, height))
-        _tile(view, box, static, movers, shadow_casters, atlas, light, frame)
+        _tile(view, box, near, static, movers, shadow_casters, atlas, light, frame)
 
 
 @kernel(inline="never")
-def _tile(view, box, static, movers, shadow_casters, atlas, light, frame):
+def _tile(view, box, near, static, movers, shadow_casters, atlas, light, frame):
     rotation, eye, k, side = view
     x0, y0, x1, y1 = box
     clean, distracted, owner, depth, darkened = frame
@@ -212,8 +217,7 @@ def _tile(view, box, static, movers, shadow_casters, atlas, light, frame):
         cosine = axis[0] * edge[0] + axis[1] * edge[1] + axis[2] * edge[2]
         cone = max(cone, math.acos(min(max(cosine, -1.0), 1.0)))
     cone += 1e-6  # acos near 1 is coarse; a sphere that touches the corner must stay in the list
-    near_static = np.empty(len(static[0]), np.int32)
-    near_movers = np.empty(len(movers[0]), np.int32)
+    near_static, near_movers = near
     static_count = _cull(static, o, axis, cone, near_static)
     mover_count = _cull(movers, o, axis, cone, near_movers)
     for i in range(y0, y1):
